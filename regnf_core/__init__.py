@@ -1,0 +1,60 @@
+"""regnf_core: registration of neural signed distance fields.
+
+    from regnf_core import OrientedBox, RegistrationOptions, open_field, register
+
+    result = register(open_field("room.safetensors"), open_field("chair.safetensors"),
+                      OrientedBox.from_corners([-0.4, -0.3, 0.0], [0.1, 0.2, 0.4]))
+    result.T_object_scene.matrix()   # (4, 4): scene coordinates to object coordinates
+
+Names are resolved on first use, so that importing a torch-free part (options, errors) does not load torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from regnf_core.box import OrientedBox
+    from regnf_core.errors import RegnfError
+    from regnf_core.fields.base import SdfField
+    from regnf_core.fields.safe_format import open_field
+    from regnf_core.options import RegistrationOptions
+    from regnf_core.registration import register
+    from regnf_core.result import RegistrationResult
+    from regnf_core.sim3 import Sim3
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "OrientedBox": "regnf_core.box",
+    "RegistrationOptions": "regnf_core.options",
+    "RegistrationResult": "regnf_core.result",
+    "RegnfError": "regnf_core.errors",
+    "SdfField": "regnf_core.fields.base",
+    "Sim3": "regnf_core.sim3",
+    "open_field": "regnf_core.fields.safe_format",
+    "register": "regnf_core.registration",
+}
+
+__all__ = [
+    "OrientedBox",
+    "RegistrationOptions",
+    "RegistrationResult",
+    "RegnfError",
+    "SdfField",
+    "Sim3",
+    "__version__",
+    "open_field",
+    "register",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name in _HOMES:
+        return getattr(importlib.import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,102 @@
+"""The detection: an oriented box in the scene's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidDetectionError
+
+
+@dataclass(frozen=True)
+class OrientedBox:
+    """A box with full edge lengths ``size`` about ``centre``, its axes the columns of ``rotation``.
+
+    centre: (3,) scene frame, scene units · size: (3,) scene units, all > 0 · rotation: (3, 3), box axes to scene axes.
+    All float64 on the CPU: a box is a handful of numbers, never a batch.
+    """
+
+    centre: Tensor
+    size: Tensor
+    rotation: Tensor
+    label: str | None = None
+    score: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in (("centre", (3,)), ("size", (3,)), ("rotation", (3, 3))):
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            if tuple(value.shape) != shape:
+                raise InvalidDetectionError(f"box {name} has shape {tuple(value.shape)}, expected {shape}")
+            if not torch.isfinite(value).all():
+                raise InvalidDetectionError(f"box {name} holds a number that is not finite")
+            object.__setattr__(self, name, value)
+        if not (self.size > 0).all():
+            raise InvalidDetectionError("box size must be positive along every axis")
+        identity = torch.eye(3, dtype=torch.float64)
+        if not torch.allclose(self.rotation @ self.rotation.T, identity, atol=1e-5) or torch.det(self.rotation) < 0:
+            raise InvalidDetectionError("box rotation is not a proper rotation matrix")
+        if self.score is not None and not 0.0 <= self.score <= 1.0:
+            raise InvalidDetectionError("box score must lie within 0 and 1")
+
+    @classmethod
+    def from_corners(
+        cls, lower: Sequence[float], upper: Sequence[float], label: str | None = None, score: float | None = None
+    ) -> OrientedBox:
+        """An axis-aligned box from its lowest and highest corner, (3,) each, scene frame."""
+        low = torch.as_tensor(lower, dtype=torch.float64)
+        high = torch.as_tensor(upper, dtype=torch.float64)
+        return cls((low + high) / 2, high - low, torch.eye(3, dtype=torch.float64), label, score)
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        centre: Sequence[float],
+        size: Sequence[float],
+        rotation_quaternion_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        label: str | None = None,
+        score: float | None = None,
+    ) -> OrientedBox:
+        """A box from centre (3,), full edge lengths (3,) and a quaternion (x, y, z, w) that need not be normalised."""
+        q = torch.as_tensor(rotation_quaternion_xyzw, dtype=torch.float64)
+        norm = q.norm()
+        if q.shape != (4,) or not torch.isfinite(q).all() or norm < 1e-9:
+            raise InvalidDetectionError("box rotation quaternion must be four finite numbers, not all zero")
+        x, y, z, w = (q / norm).tolist()
+        rotation = torch.tensor(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ],
+            dtype=torch.float64,
+        )
+        return cls(
+            torch.as_tensor(centre, dtype=torch.float64),
+            torch.as_tensor(size, dtype=torch.float64),
+            rotation,
+            label,
+            score,
+        )
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the space diagonal, scene units."""
+        return float(self.size.norm())
+
+    def corners(self) -> Tensor:
+        """The eight corners, (8, 3), scene frame."""
+        signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)  # (8, 3)
+        return self.centre + (signs * self.size) @ self.rotation.T
+
+    def to_local(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the scene in the box's own frame: each coordinate within ±size/2 for points inside."""
+        rotation = self.rotation.to(points)
+        return (points - self.centre.to(points)) @ rotation
+
+    def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
+        """(N,) bool: which of the points (N, 3), scene frame, lie in the box grown by ``margin`` (a share of its size)."""
+        half = self.size.to(points) * (0.5 * (1.0 + margin))
+        return (self.to_local(points).abs() <= half).all(dim=-1)

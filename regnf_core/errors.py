@@ -1,0 +1,71 @@
+"""Every error regnf raises on purpose, each with a stable ``reason`` that programs may switch on.
+
+    RegnfError
+    ├── InvalidInputError            the caller can mend it
+    │   ├── InvalidOptionsError      INVALID_OPTIONS
+    │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
+    │   └── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
+    ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
+    ├── InitialisationError          NO_INITIAL_TRANSFORM
+    └── CancelledError               CANCELLED
+
+This module imports nothing heavy: the HTTP front end uses it without loading torch.
+"""
+
+from __future__ import annotations
+
+
+class RegnfError(Exception):
+    """Base of all errors raised by regnf.
+
+    ``reason`` is a stable UPPER_SNAKE word; the message is for people and may change.
+    """
+
+    reason: str = "INTERNAL"
+
+    def __init__(self, message: str, *, reason: str | None = None) -> None:
+        super().__init__(message)
+        if reason is not None:
+            self.reason = reason
+
+
+class InvalidInputError(RegnfError):
+    """Something the caller gave cannot be used."""
+
+    reason = "INVALID_INPUT"
+
+
+class InvalidOptionsError(InvalidInputError):
+    """An option is unknown, of the wrong type or out of its range."""
+
+    reason = "INVALID_OPTIONS"
+
+
+class InvalidDetectionError(InvalidInputError):
+    """A detection box is malformed, or lies outside the scene's bounds."""
+
+    reason = "INVALID_DETECTION"
+
+
+class FieldFormatError(InvalidInputError):
+    """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault."""
+
+    reason = "FIELD_NOT_RECOGNISED"
+
+
+class NoSurfaceError(RegnfError):
+    """Too few surface points were found where the object should be."""
+
+    reason = "NO_SURFACE_IN_DETECTION"
+
+
+class InitialisationError(RegnfError):
+    """No initial transform could be estimated from the surface points."""
+
+    reason = "NO_INITIAL_TRANSFORM"
+
+
+class CancelledError(RegnfError):
+    """The caller asked for the work to stop."""
+
+    reason = "CANCELLED"

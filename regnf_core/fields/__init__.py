@@ -1,0 +1,1 @@
+"""Signed distance fields: the protocol, the neural families, exact meshes, and the safe file format."""

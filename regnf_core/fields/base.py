@@ -1,0 +1,96 @@
+"""What every field offers, whatever made it: signed distance, its gradient, its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+
+@runtime_checkable
+class SdfField(Protocol):
+    """A signed distance field: positive in free space, negative inside matter, in units of its own frame.
+
+    Implementations evaluate without building an autograd graph, in chunks that bound memory, in float32, on ``device``.
+    Use :func:`differentiable_signed_distance` where a loss must flow back to the points.
+    """
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU: lowest and highest corner of the region where the field has meaning, own frame."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field's parameters live; points are moved there."""
+        ...
+
+    def to(self, device: torch.device | str) -> SdfField:
+        """The same field with its parameters on another device."""
+        ...
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3) in the field's frame."""
+        ...
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) with respect to the points (N, 3)."""
+        ...
+
+
+def evaluate_in_chunks(evaluate: Callable[[Tensor], Tensor], points: Tensor, chunk: int) -> Tensor:
+    """Apply ``evaluate`` to slices of at most ``chunk`` points and join the results along the first axis."""
+    if points.shape[0] <= chunk:
+        return evaluate(points)
+    return torch.cat([evaluate(part) for part in points.split(chunk)])
+
+
+class _SignedDistance(torch.autograd.Function):
+    """Signed distance whose backward pass uses the field's own gradient: no graph through the network is kept."""
+
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, points: Tensor, field: SdfField) -> Tensor:
+        distance, gradient = field.signed_distance_and_gradient(points.detach())
+        ctx.save_for_backward(gradient)
+        return distance.to(points)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, *grad_outputs: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return grad_outputs[0].unsqueeze(-1) * gradient.to(grad_outputs[0]), None
+
+
+def differentiable_signed_distance(field: SdfField, points: Tensor) -> Tensor:
+    """Signed distance (N,) at points (N, 3) that autograd can differentiate once with respect to the points."""
+    return _SignedDistance.apply(points, field)  # type: ignore[no-untyped-call, no-any-return]
+
+
+class CountingField:
+    """A field that counts the points it was asked for (a gradient counts as one evaluation), for reports and tests."""
+
+    def __init__(self, field: SdfField) -> None:
+        self.field = field
+        self.evaluations = 0
+
+    @property
+    def bounds(self) -> Tensor:
+        return self.field.bounds
+
+    @property
+    def device(self) -> torch.device:
+        return self.field.device
+
+    def to(self, device: torch.device | str) -> CountingField:
+        moved = CountingField(self.field.to(device))
+        moved.evaluations = self.evaluations
+        return moved
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        self.evaluations += points.shape[0]
+        return self.field.signed_distance(points)
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        self.evaluations += points.shape[0]
+        return self.field.signed_distance_and_gradient(points)

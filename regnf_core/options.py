@@ -1,0 +1,127 @@
+"""Options of a registration, grouped by the stage they steer. Torch-free: the HTTP contract is derived from them.
+
+Every length is in normalised field units unless its name says otherwise, as in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Gt, Le
+from pydantic import TypeAdapter, ValidationError
+
+from regnf_core.errors import InvalidOptionsError
+
+Preset = Literal["paper"]
+_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
+_Ratio = Annotated[float, Gt(0), Le(1)]
+
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Multi-view surface sampling (paper, section III-C.1)."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    views: Annotated[int, Ge(1), Le(64)] = 5
+    """Cameras round the box, all looking at its centre. More views cover hollow shapes better."""
+    scene_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.9
+    """Distance of the scene's cameras from the box's centre, scene units."""
+    object_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.7
+    """Distance of the object's cameras from its centre, object units."""
+    image_size: Annotated[int, Ge(8), Le(4096)] = 512
+    """Edge of the virtual image, pixels."""
+    pixel_stride: Annotated[int, Ge(1), Le(512)] = 8
+    """Every how many pixels a ray is cast, along both axes."""
+    ground_fraction: Annotated[float, Ge(0), Le(0.5)] = 0.025
+    """Lowest share of the box's height whose points are dropped as ground."""
+    up_axis: Literal["x", "y", "z"] = "z"
+    """The scene's vertical axis: where the ground is, and from which side cameras look."""
+
+
+@dataclass(frozen=True)
+class InitialisationOptions:
+    """FPFH features, RANSAC and ICP (paper, section III-C.2)."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    voxel_size: Annotated[float, Gt(0), Le(10)] = 0.025
+    """Voxel edge of the downsampling before the features, field units."""
+    ransac_distance_voxels: Annotated[float, Gt(0), Le(100)] = 1.5
+    """Largest distance of a RANSAC inlier, in voxels."""
+    edge_length_ratio: _Ratio = 0.9
+    """RANSAC drops a draw of correspondences whose edge lengths differ by more than this ratio."""
+    ransac_iterations: Annotated[int, Ge(1), Le(10_000_000)] = 100_000
+    icp_distance_voxels: Annotated[float, Gt(0), Le(100)] = 0.4
+    """Largest distance of an ICP correspondence, in voxels."""
+
+
+@dataclass(frozen=True)
+class OptimisationOptions:
+    """The bidirectional loss and its minimisation (paper, sections III-D and III-E)."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    iterations: Annotated[int, Ge(1), Le(10_000)] = 200
+    translation_rate: Annotated[float, Gt(0), Le(1)] = 0.01
+    rotation_rate: Annotated[float, Gt(0), Le(1)] = 0.02
+    scale_rate: Annotated[float, Gt(0), Le(1)] = 0.01
+    kernel_rate: Annotated[float, Gt(0), Le(1)] = 0.005
+    regulariser_weight: Annotated[float, Ge(0), Le(1000)] = 1.0
+    """w, the weight of the nearest-neighbour regulariser. The paper gives no value."""
+    stop_residual: Annotated[float, Ge(0), Le(1)] = 0.0005
+    """Stop once the mean residuals of both directions are at most this."""
+
+
+@dataclass(frozen=True)
+class ResamplingOptions:
+    """Algorithm 1: new samples near both surfaces."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    every: Annotated[int, Ge(1), Le(10_000)] = 10
+    """Iterations between resamplings."""
+    own_distance: Annotated[float, Gt(0), Le(10)] = 0.01
+    """omega_1: largest |distance| to the sampled field's surface."""
+    other_distance: Annotated[float, Gt(0), Le(10)] = 0.02
+    """omega_2: largest |distance| to the other field's surface."""
+    residual: Annotated[float, Gt(0), Le(10)] = 0.02
+    """xi: largest residual."""
+    radius_fraction: Annotated[float, Gt(0), Le(1)] = 0.05
+    """rho as a share of the scene's radius."""
+    max_samples: Annotated[int, Ge(16), Le(1_000_000)] = 5000
+
+
+@dataclass(frozen=True)
+class RegistrationOptions:
+    """All options of one registration, grouped by stage. The defaults are the published values."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    preset: Preset = "paper"
+    sampling: SamplingOptions = field(default_factory=SamplingOptions)
+    initialisation: InitialisationOptions = field(default_factory=InitialisationOptions)
+    optimisation: OptimisationOptions = field(default_factory=OptimisationOptions)
+    resampling: ResamplingOptions = field(default_factory=ResamplingOptions)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> RegistrationOptions:
+        """Options from plain (JSON) values; what is left out keeps its default.
+
+        Raises InvalidOptionsError naming the first faulty option.
+        """
+        try:
+            return _ADAPTER.validate_python(values, strict=False)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_input=False)[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise InvalidOptionsError(f"options.{where}: {first['msg']}") from error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values of every option, defaults included, in a fixed order."""
+        values: dict[str, Any] = _ADAPTER.dump_python(self)
+        return values
+
+
+_ADAPTER = TypeAdapter(RegistrationOptions)

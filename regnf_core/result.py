@@ -1,0 +1,75 @@
+"""What a registration returns: the transform, how well it explains the data, and what is needed to look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from torch import Tensor
+
+from regnf_core.sim3 import Sim3
+
+Verdict = Literal["registered", "ambiguous", "rejected"]
+Phase = Literal["loading", "sampling", "initialising", "optimising", "verifying", "exporting"]
+
+ProgressCallback = Callable[[Phase, float], None]
+"""Called with the phase and the overall progress 0..1. May raise CancelledError to stop the work."""
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """Points on a field's zero level with the field's unit normals there. points, normals: (N, 3) float32, field frame."""
+
+    points: Tensor
+    normals: Tensor
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """One iteration of the optimiser: everything that trace.json shows."""
+
+    iteration: int
+    loss: float
+    residual_scene: float
+    """Mean |r| over the scene's samples, object units."""
+    residual_object: float
+    """Mean |r| over the object's samples, scene units, as the paper has it."""
+    regulariser: float
+    kernel_shape: float
+    kernel_scale: float
+    scene_samples: int
+    object_samples: int
+    T_object_scene: Sim3
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another pose that explains the data, e.g. a table's twin under its symmetry."""
+
+    T_object_scene: Sim3
+    score: float
+    relation: str
+
+
+@dataclass(frozen=True)
+class RegistrationResult:
+    """The outcome of one registration. Transforms carry scene coordinates to object coordinates."""
+
+    verdict: Verdict
+    verdict_reason: str
+    """One stable UPPER_SNAKE word, e.g. SURFACES_AGREE, LOW_OVERLAP."""
+    T_object_scene: Sim3
+    T_object_scene_initial: Sim3
+    scene_samples: SurfaceSamples
+    object_samples: SurfaceSamples
+    metrics: dict[str, float]
+    """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
+    field_evaluations, and seconds by phase as seconds_<phase>."""
+    trace: list[IterationRecord]
+    residuals: dict[str, Tensor]
+    """Per sample: scene_points, scene_residuals, object_points, object_residuals; residuals in object units."""
+    seed: int
+    options: dict[str, Any]
+    alternatives: list[Alternative] = field(default_factory=list)
+    covariance: Tensor | None = None

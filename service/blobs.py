@@ -1,0 +1,52 @@
+"""Where bytes live: uploads, safe fields, results. Keys are relative, '/'-separated and never leave the store.
+
+Keys in use:
+    fields/{sha256}/original               the upload, until its import has ended
+    fields/{sha256}/field.safetensors      the safe field that workers open
+    fields/{sha256}/preview.png            a picture of it, when one could be made
+    jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
+    jobs/{id}/manifest.json                written last, atomically: the job's result is exactly what it lists
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+
+class StorageFullError(OSError):
+    """No space is left for the bytes."""
+
+
+class BlobWriter(Protocol):
+    """An open, unnamed blob. It gets its name, whole, with ``commit``; without it nothing stays behind."""
+
+    def write(self, data: bytes) -> int: ...
+
+    def commit(self, key: str) -> None: ...
+
+
+class BlobStore(Protocol):
+    """Blobs by key. Missing keys raise FileNotFoundError, malformed ones ValueError. Every method is blocking."""
+
+    def writer(self) -> AbstractContextManager[BlobWriter]: ...
+
+    def put(self, key: str, data: bytes) -> None: ...
+
+    def open(self, key: str) -> BinaryIO: ...
+
+    def local_copy(self, key: str) -> AbstractContextManager[Path]:
+        """A readable file with the blob's bytes: the file itself where the store is local."""
+        ...
+
+    def exists(self, key: str) -> bool: ...
+
+    def size(self, key: str) -> int: ...
+
+    def list(self, prefix: str) -> Iterator[str]: ...
+
+    def delete(self, key: str) -> None: ...
+
+    def delete_prefix(self, prefix: str) -> None: ...

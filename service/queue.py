@@ -1,0 +1,25 @@
+"""The transport to the workers. A job's only argument is an id; what it must do is in its record."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+QUEUE_NAME = "regnf"
+REGISTER_FUNCTION = "worker.jobs.run_registration"
+IMPORT_FUNCTION = "worker.jobs.run_import"
+
+
+class JobQueue(Protocol):
+    """Hands ids to workers, each at most once per attempt."""
+
+    def enqueue_registration(self, job_id: str, attempt: int) -> None: ...
+
+    def enqueue_import(self, sha256: str) -> None: ...
+
+    def stop(self, job_id: str, attempt: int) -> None:
+        """Take a waiting job out of the queue, or tell the worker to end a running one."""
+        ...
+
+    def live_workers(self) -> int:
+        """How many workers have reported lately."""
+        ...

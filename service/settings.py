@@ -1,0 +1,55 @@
+"""Settings of API and worker: one frozen class, read from the environment with the prefix REGNF_."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+MIB = 1024 * 1024
+
+
+def _default_state_dir() -> Path:
+    base = os.environ.get("XDG_STATE_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "state") / "regnf"
+
+
+class Settings(BaseSettings):
+    """Every setting has a default that works on one machine; each is REGNF_<NAME> in the environment."""
+
+    model_config = SettingsConfigDict(env_prefix="REGNF_", frozen=True, extra="ignore")
+
+    host: str = "127.0.0.1"
+    port: int = Field(8080, ge=0, le=65535)
+    """0 asks the system for a free port; the address is printed once it listens."""
+    state_dir: Path = Field(default_factory=_default_state_dir)
+    """Blobs, the embedded Redis' files and temporary uploads live under it."""
+    redis_url: str | None = None
+    """Unset: `regnf serve` starts a private server of its own."""
+    workers: int = Field(1, ge=0, le=64)
+    threads: int | None = Field(None, ge=1, le=256)
+    """Threads of each job's process; unset: cores / workers."""
+    api_tokens: frozenset[str] = frozenset()
+    """JSON list. Empty: no token needed, which is allowed on loopback only."""
+    allow_unauthenticated: bool = False
+    """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
+    max_upload_bytes: int = Field(4096 * MIB, ge=1)
+    max_request_bytes: int = Field(1 * MIB, ge=1024)
+    """Largest JSON body."""
+    upload_stall_s: float = Field(30.0, gt=0)
+    """An upload that sends nothing for this long is refused with 408."""
+    max_queued_jobs: int = Field(1000, ge=1)
+    job_timeout_s: int = Field(900, ge=1)
+    import_timeout_s: int = Field(120, ge=1)
+    import_memory_bytes: int = Field(8192 * MIB, ge=256 * MIB)
+    heartbeat_s: float = Field(5.0, gt=0)
+    lost_after_s: float = Field(90.0, gt=0)
+    """A running job whose heartbeat is older than this is taken for lost."""
+    retention_s: int = Field(7 * 24 * 3600, ge=60)
+    """How long finished jobs and their artifacts are kept."""
+
+    @property
+    def blob_dir(self) -> Path:
+        return self.state_dir / "blobs"
