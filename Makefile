@@ -1,0 +1,20 @@
+# Two commands matter: `make demo` and `make test`. Each sets up what it needs.
+.PHONY: setup demo test lint clean
+
+setup:
+	@scripts/setup.sh
+
+demo: setup
+	@.venv/bin/python scripts/demo.py
+
+test: setup lint
+	@scripts/system-packages.sh test
+	@.venv/bin/python -m pytest
+
+lint: setup
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+
+clean:
+	rm -rf .venv .demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache

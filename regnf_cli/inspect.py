@@ -1,0 +1,42 @@
+"""``regnf inspect``: what a file holds, and whether it looks like a signed distance field."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from regnf_cli.console import out, read_json
+
+
+def inspect(
+    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", exists=True)],
+    description: Annotated[Path | None, typer.Option(help="JSON: what the checkpoint does not carry.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+) -> None:
+    """Say what a field file is: family, why, bounds, parameters, plausibility.
+
+    Example: **regnf inspect step-000030000.ckpt**
+    """
+    import tempfile
+
+    from regnf_core.importing.gate import ImportLimits, import_field
+
+    given = read_json(description, "description") if description else None
+    with tempfile.TemporaryDirectory() as folder:
+        report = import_field(field, Path(folder), given, ImportLimits()).to_dict()
+    if as_json:
+        out.print_json(json.dumps(report))
+    else:
+        _show(report)
+
+
+def _show(values: dict[str, Any], indent: int = 0) -> None:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            out.print(f"{'  ' * indent}{name}:")
+            _show(value, indent + 1)
+        else:
+            out.print(f"{'  ' * indent}{name:<24} {value}", markup=False)

@@ -1,0 +1,56 @@
+"""The command ``regnf``: gathers the sub-commands and turns errors into exit codes.
+
+Exit codes: 0 registered (or done) · 1 ambiguous or rejected · 2 bad input · 3 service unavailable · 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
+from regnf_cli.fit import fit
+from regnf_cli.inspect import inspect
+from regnf_cli.register import register
+from regnf_cli.serve import serve
+from regnf_cli.worker import worker
+from regnf_core import __version__
+from regnf_core.errors import RegnfError
+
+app = typer.Typer(
+    name="regnf",
+    help="Register neural signed distance fields: find the transform that lays a scene's object onto a library's.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False,
+) -> None:
+    if version:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+for command in (register, serve, worker, inspect, fit):
+    app.command(command.__name__)(command)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app(standalone_mode=True)
+    except RegnfError as error:
+        code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
+        sys.exit(fail(error.reason, str(error), code))
+    except FileNotFoundError as error:
+        sys.exit(fail("FILE_NOT_FOUND", f"no such file: {error.filename}"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Registration through a regnf service: upload what it lacks, post, follow, fetch."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from regnf_cli.console import EXIT_UNAVAILABLE, err, fail, phase_progress
+from regnf_core.errors import RegnfError
+
+_BLOCK = 1 << 20
+_FINISHED = ("successful", "failed", "dismissed")
+_POLL_S = 20
+Report = Callable[[str, float], None]
+"""Called with a phase and a share 0..1."""
+
+
+class ServiceError(RegnfError):
+    """The service refused, or could not do, what was asked; ``reason`` is the one it gave."""
+
+    reason = "SERVICE_ERROR"
+    unavailable = False
+    """Whether asking again later may help: the service is up but cannot take work now."""
+
+
+class RemoteService:
+    """The few calls of the HTTP contract that a registration needs."""
+
+    def __init__(self, address: str, token: str | None = None) -> None:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self._http = httpx.Client(base_url=address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
+
+    def __enter__(self) -> RemoteService:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._http.close()
+
+    def upload_field(self, path: Path, report: Report = lambda phase, share: None) -> str:
+        """Send a field unless the service holds it; returns its SHA-256 once the service has found it good."""
+        sha256 = _sha256(path)
+        known = self._http.get(f"/fields/{sha256}")
+        if known.status_code != 200 or known.json()["state"] == "rejected":
+            size = max(path.stat().st_size, 1)
+
+            def body() -> Iterator[bytes]:
+                sent = 0
+                with path.open("rb") as file:
+                    while block := file.read(_BLOCK):
+                        yield block
+                        sent += len(block)
+                        report("uploading", sent / size)
+
+            length = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
+            _check(self._http.put(f"/fields/{sha256}", content=body(), headers=length))
+        self._wait_until_ready(sha256)
+        return sha256
+
+    def _wait_until_ready(self, sha256: str) -> None:
+        while True:
+            document = _check(self._http.get(f"/fields/{sha256}", params={"wait": _POLL_S}))
+            if document["state"] == "ready":
+                return
+            if document["state"] == "rejected":
+                raise _problem(document.get("error") or {})
+
+    def submit(self, request: dict[str, Any]) -> dict[str, Any]:
+        """POST /register; returns the job document."""
+        return _check(self._http.post("/register", json=request))
+
+    def follow(self, job_id: str, report: Report = lambda phase, share: None) -> dict[str, Any]:
+        """Poll a job until it has finished; returns its last document."""
+        while True:
+            job = _check(self._http.get(f"/jobs/{job_id}"))
+            report(job.get("phase") or job["status"], job.get("progress") or 0.0)
+            if job["status"] in _FINISHED:
+                return job
+            job = _check(self._http.get(f"/jobs/{job_id}", params={"wait": 1}))
+
+    def result(self, job_id: str) -> dict[str, Any]:
+        """The result document of a successful job; raises ServiceError with the job's own reason otherwise."""
+        return _check(self._http.get(f"/jobs/{job_id}/result"))
+
+    def fetch_artifact(self, job_id: str, name: str, target: Path) -> None:
+        """Download one artifact to a file."""
+        with self._http.stream("GET", f"/jobs/{job_id}/artifacts/{name}") as response:
+            if response.status_code != 200:
+                response.read()
+                raise _problem(response.json())
+            with target.open("wb") as file:
+                for block in response.iter_bytes(_BLOCK):
+                    file.write(block)
+
+
+def register_remotely(
+    address: str, token: str | None, scene: Path, object_: Path, request: dict[str, Any], output: Path | None
+) -> dict[str, Any]:
+    """The whole exchange for one registration, with progress on stderr; returns the result document.
+
+    Raises ServiceError; leaves with exit code 3 when the service cannot be reached.
+    """
+    try:
+        with RemoteService(address, token) as service, phase_progress() as bar:
+            task = bar.add_task("uploading", total=1.0)
+
+            def report(phase: str, share: float) -> None:
+                bar.update(task, description=phase, completed=share)
+
+            fields = {"scene": service.upload_field(scene, report), "object": service.upload_field(object_, report)}
+            body = {name: value for name, value in request.items() if value is not None}
+            job = service.follow(service.submit({**fields, **body})["id"], report)
+            document = service.result(job["id"])
+            if output is not None:
+                output.mkdir(parents=True, exist_ok=True)
+                for artifact in document["artifacts"]:
+                    service.fetch_artifact(job["id"], artifact["name"], output / artifact["name"])
+            return document
+    except httpx.TransportError as error:
+        err.print()
+        raise SystemExit(
+            fail("SERVICE_UNAVAILABLE", f"{address} does not answer: {error}", EXIT_UNAVAILABLE)
+        ) from error
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check(response: httpx.Response) -> dict[str, Any]:
+    if response.is_success:
+        document: dict[str, Any] = response.json()
+        return document
+    try:
+        problem = response.json()
+    except ValueError:
+        problem = {"detail": f"HTTP status {response.status_code}"}
+    error = _problem(problem)
+    error.unavailable = response.status_code in (502, 503, 504)
+    raise error
+
+
+def _problem(problem: dict[str, Any]) -> ServiceError:
+    detail = problem.get("detail") or problem.get("title") or "the service gave no detail"
+    return ServiceError(str(detail), reason=str(problem.get("reason", ServiceError.reason)))

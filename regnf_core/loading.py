@@ -1,0 +1,76 @@
+"""Open whatever file a user has as a field: a safe field, a trainer's checkpoint, or a mesh."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from regnf_core.errors import FieldFormatError
+
+if TYPE_CHECKING:
+    from regnf_core.fields.base import SdfField
+
+MESH_SUFFIXES = frozenset({".glb", ".gltf", ".obj", ".ply", ".stl", ".off"})
+_READ_BYTES = 1 << 20
+
+
+def load_field(
+    path: str | Path, description: dict[str, Any] | None = None, device: str = "cpu", cache_dir: Path | None = None
+) -> SdfField:
+    """The field in a file, on ``device``.
+
+    A safe field is opened as it is; a mesh (by its suffix) becomes an exact distance field; anything else is taken for
+    a checkpoint and goes through the import gate, whose outcome is kept in ``cache_dir`` under the file's SHA-256.
+    ``description`` says what a checkpoint does not carry (contraction, level mask, label).
+
+    Raises FieldFormatError (with the gate's reason) and FileNotFoundError.
+    """
+    from regnf_core.fields.mesh import MeshField
+    from regnf_core.fields.safe_format import open_field
+
+    path = Path(path)
+    if path.suffix.lower() in MESH_SUFFIXES:
+        return MeshField.from_file(path).to(device)
+    return open_field(safe_field_path(path, description, cache_dir), device)
+
+
+def safe_field_path(path: Path, description: dict[str, Any] | None = None, cache_dir: Path | None = None) -> Path:
+    """The safe field for a file: the file itself when it is one already, else what the import gate made of it."""
+    from regnf_core.fields.safe_format import read_description
+
+    if path.suffix.lower() == ".safetensors":
+        try:
+            read_description(path)
+        except FieldFormatError:
+            if description is None:
+                raise
+        else:
+            if not description:
+                return path
+    return _imported(path, description, cache_dir or default_cache_dir())
+
+
+def default_cache_dir() -> Path:
+    """Where imported checkpoints are kept between runs: under XDG_CACHE_HOME or ~/.cache."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "regnf" / "fields"
+
+
+def _imported(path: Path, description: dict[str, Any] | None, cache_dir: Path) -> Path:
+    from regnf_core.importing.gate import ImportLimits, import_field
+
+    key = hashlib.sha256(repr(sorted((description or {}).items())).encode())
+    with path.open("rb") as file:
+        while block := file.read(_READ_BYTES):
+            key.update(block)
+    kept = cache_dir / f"{key.hexdigest()}.safetensors"
+    if kept.exists():
+        return kept
+    cache_dir.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache_dir) as folder:
+        import_field(path, Path(folder), description, ImportLimits())
+        os.replace(Path(folder) / "field.safetensors", kept)
+    return kept

@@ -1,0 +1,127 @@
+"""The demo: a library chair laid onto the chair in a room, through the real service.
+
+Starts `regnf serve` with its state in .demo/, uploads two fields that ship with the repository, posts a detection,
+follows the job and prints the transform, its error against the truth and the address of the page. In a terminal the
+service then stays up for you to look; otherwise it ends. Exit status 0 only if the errors stay within the bounds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from regnf_cli.console import phase_progress
+from regnf_cli.remote import RemoteService
+
+ROOT = Path(__file__).resolve().parents[1]
+DATA = ROOT / "examples" / "data"
+STATE = ROOT / ".demo"
+START_DEADLINE_S = 30
+MAX_ROTATION_RAD = 0.03
+MAX_TRANSLATION_SHARE = 0.03
+MAX_SCALE_SHARE = 0.02
+console = Console(highlight=False)
+
+
+def main() -> int:
+    started = time.monotonic()
+    shutil.rmtree(STATE, ignore_errors=True)
+    server, address = start_service()
+    try:
+        console.print(f"service      {address}  (state in {STATE.name}/, its log in {STATE.name}/serve.log)")
+        job, result = run(address)
+        good = show(result)
+        console.print(f"page         [bold]{address}/jobs/{job['id']}/view[/]")
+        console.print(f"total        {time.monotonic() - started:.1f} s")
+        if good and sys.stdin.isatty():
+            console.print("\nOpen the page; press Enter here to stop the service.")
+            input()
+        return 0 if good else 1
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        server.send_signal(signal.SIGTERM)
+        server.wait(timeout=30)
+
+
+def start_service() -> tuple[subprocess.Popen[str], str]:
+    """`regnf serve` on a free port of the loopback; returns it and its address once it listens."""
+    STATE.mkdir(parents=True)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    with (STATE / "serve.log").open("w") as log:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(STATE)],
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+            env=environment,
+        )
+    assert server.stdout is not None
+    deadline = time.monotonic() + START_DEADLINE_S
+    while time.monotonic() < deadline and server.poll() is None:
+        if not select.select([server.stdout], [], [], 0.2)[0]:
+            continue
+        for word in server.stdout.readline().split():
+            if word.startswith("http://"):
+                return server, word.rstrip("/")
+    server.kill()
+    sys.exit(f"The service did not start; see {STATE.name}/serve.log")
+
+
+def run(address: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Upload, register, follow; returns the job and its result."""
+    with RemoteService(address) as service, phase_progress() as bar:
+        task = bar.add_task("uploading", total=1.0)
+
+        def report(phase: str, share: float) -> None:
+            bar.update(task, description=phase, completed=share)
+
+        job = service.submit(
+            {
+                "scene": service.upload_field(DATA / "mix-room.safetensors", report),
+                "object": service.upload_field(DATA / "armchair.safetensors", report),
+                "detection": json.loads((DATA / "detection.json").read_text()),
+                "ground_truth": {"T_object_scene": truth()["T_object_scene"]["matrix"]},
+                "seed": 0,
+            }
+        )
+        service.follow(job["id"], report)
+        return job, service.result(job["id"])
+
+
+def truth() -> dict[str, Any]:
+    values: dict[str, Any] = json.loads((DATA / "truth.json").read_text())
+    return values
+
+
+def show(result: dict[str, Any]) -> bool:
+    """Print the transform and its errors; whether they are within the demo's bounds."""
+    console.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
+    console.print("T_object_scene, from the scene's coordinates to the library object's:")
+    for row in result["T_object_scene"]["matrix"]:
+        console.print("   " + " ".join(f"{value:10.6f}" for value in row))
+    metrics = result["metrics"]
+    errors = [
+        ("rotation", metrics["rotation_error_rad"], MAX_ROTATION_RAD, "rad"),
+        ("translation", 100 * metrics["translation_error_share"], 100 * MAX_TRANSLATION_SHARE, "% of the diameter"),
+        ("scale", 100 * metrics["scale_error_share"], 100 * MAX_SCALE_SHARE, "%"),
+    ]
+    console.print("error against the truth")
+    for name, value, bound, unit in errors:
+        colour = "green" if value <= bound else "red"
+        console.print(f"   {name:<12} [{colour}]{value:.4f}[/] {unit} (at most {bound:g})")
+    return result["verdict"] == "registered" and all(value <= bound for _, value, bound, _ in errors)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

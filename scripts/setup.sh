@@ -1,0 +1,31 @@
+#!/usr/bin/env bash
+# Makes .venv with everything in it. Quick when nothing has changed since the last time.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+python=${PYTHON:-python3}
+if ! "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+    echo "regnf needs Python 3.11 or newer; set PYTHON to one." >&2
+    exit 1
+fi
+scripts/system-packages.sh runtime
+
+stamp=.venv/.regnf-setup
+state=$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum)
+if [[ -f $stamp && $(cat "$stamp") == "$state" ]]; then
+    exit 0
+fi
+
+[[ -x .venv/bin/python ]] || "$python" -m venv .venv
+pip=(.venv/bin/python -m pip --disable-pip-version-check --quiet)
+echo "Installing into .venv (the first time takes a few minutes) ..."
+# torch first and by its pinned version: an open range may resolve to a build with gigabytes of GPU libraries.
+"${pip[@]}" install -c constraints.txt torch
+"${pip[@]}" install -c constraints.txt -e '.[dev]'
+if ! .venv/bin/python -c 'import open3d' 2>.venv/open3d-error.txt; then
+    echo "open3d does not load; a system library is missing:" >&2
+    tail -n 1 .venv/open3d-error.txt >&2
+    echo "On Debian or Ubuntu, as root: scripts/system-packages.sh runtime" >&2
+    exit 1
+fi
+echo "$state" >"$stamp"

@@ -1,0 +1,56 @@
+"""The import rules of the house: who may know whom."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FORBIDDEN = {
+    "regnf_core": {"fastapi", "starlette", "uvicorn", "rq", "redis", "service", "worker", "regnf_cli"},
+    "service": {"torch", "open3d", "igl", "trimesh", "worker", "regnf_cli"},
+    "worker": {"fastapi", "regnf_cli"},
+}
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Every module a file imports, at whatever depth of the code; ``from a import b`` names both a and a.b."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("package", sorted(FORBIDDEN))
+def test_no_package_imports_what_it_must_not_know(package: str) -> None:
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files
+    broken = {
+        f"{path.relative_to(ROOT)} imports {name}"
+        for path in files
+        for name in imports_of(path)
+        if name.split(".")[0] in FORBIDDEN[package]
+    }
+    assert not broken
+
+
+@pytest.mark.parametrize("module", ["service.app", "worker.main", "worker.jobs", "regnf_core", "regnf_cli.main"])
+def test_light_modules_load_without_torch(module: str) -> None:
+    code = f"import sys, {module}; heavy = {{'torch', 'open3d'}} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_public_names_exist() -> None:
+    import regnf_core
+
+    assert sorted(regnf_core.__all__) == regnf_core.__all__
+    for name in regnf_core.__all__:
+        assert getattr(regnf_core, name) is not None
