@@ -20,6 +20,20 @@ class StorageFullError(OSError):
     """No space is left for the bytes."""
 
 
+def check_key(key: str) -> str:
+    """The key itself. Raises ValueError for one that is malformed or tries to leave the store."""
+    parts = key.split("/")
+    if (
+        not key
+        or len(key) > 512
+        or "\\" in key
+        or any(part in ("", ".", "..") or len(part) > 200 for part in parts)
+        or any(ord(character) < 32 or ord(character) > 126 for character in key)
+    ):
+        raise ValueError("malformed blob key")
+    return key
+
+
 class BlobWriter(Protocol):
     """An open, unnamed blob. It gets its name, whole, with ``commit``; without it nothing stays behind."""
 
@@ -35,6 +49,10 @@ class BlobStore(Protocol):
 
     def put(self, key: str, data: bytes) -> None: ...
 
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        """Atomic: of several writers one wins (True), the others change nothing (False)."""
+        ...
+
     def open(self, key: str) -> BinaryIO: ...
 
     def local_copy(self, key: str) -> AbstractContextManager[Path]:
@@ -45,8 +63,14 @@ class BlobStore(Protocol):
 
     def size(self, key: str) -> int: ...
 
-    def list(self, prefix: str) -> Iterator[str]: ...
+    def list(self, prefix: str) -> Iterator[str]:
+        """Keys below the folder ``prefix`` ("jobs/{id}"), sorted; "" lists all."""
+        ...
 
-    def delete(self, key: str) -> None: ...
+    def delete(self, key: str) -> None:
+        """Delete one blob; a missing one is no error."""
+        ...
 
-    def delete_prefix(self, prefix: str) -> None: ...
+    def delete_prefix(self, prefix: str) -> None:
+        """Delete every blob below the folder ``prefix``."""
+        ...

@@ -10,11 +10,17 @@ IMPORT_FUNCTION = "worker.jobs.run_import"
 
 
 class JobQueue(Protocol):
-    """Hands ids to workers, each at most once per attempt."""
+    """Hands ids to workers, each at most once per attempt: enqueueing what is known already changes nothing."""
 
     def enqueue_registration(self, job_id: str, attempt: int) -> None: ...
 
-    def enqueue_import(self, sha256: str) -> None: ...
+    def enqueue_import(self, sha256: str, attempt: int = 1) -> None: ...
+
+    def holds_registration(self, job_id: str, attempt: int) -> bool:
+        """Whether the transport still knows of this attempt, waiting or running."""
+        ...
+
+    def holds_import(self, sha256: str, attempt: int) -> bool: ...
 
     def stop(self, job_id: str, attempt: int) -> None:
         """Take a waiting job out of the queue, or tell the worker to end a running one."""

@@ -2,6 +2,7 @@
 
 A job's state machine is monotonic: accepted -> running -> successful | failed | dismissed. Every change names the
 attempt it belongs to; a writer of an older attempt loses (StaleAttemptError). RQ is transport, never truth.
+Times are the store's own: one clock for every machine that shares it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,10 @@ FINISHED: frozenset[str] = frozenset({"successful", "failed", "dismissed"})
 
 class RecordError(Exception):
     """Base of the store's refusals."""
+
+
+class QueueFullError(RecordError):
+    """As many jobs are active as the service takes."""
 
 
 class StaleAttemptError(RecordError):
@@ -45,6 +50,8 @@ class JobRecord:
     cancel_requested: bool = False
     engine: dict[str, Any] = field(default_factory=dict)
     error: dict[str, Any] | None = None
+    requeues: int = 0
+    """How often this request was handed out again because its worker vanished."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +70,16 @@ class FieldRecord:
     report: dict[str, Any] = field(default_factory=dict)
     """What the import found: family, bounds, parameters, plausibility, warnings."""
     error: dict[str, Any] | None = None
+    attempt: int = 1
+    """Grows each time the import starts anew; fences off the writer of an older one."""
 
 
 @dataclass(frozen=True)
 class JobEvent:
-    """One line of a job's event stream; ``id`` orders them and resumes a broken stream."""
+    """One line of a job's event stream; ``id`` orders them and resumes a broken stream.
+
+    ``name`` is ``status`` or ``progress``; ``data`` holds status, phase, progress, attempt, updated, error if failed.
+    """
 
     id: str
     name: str
@@ -77,16 +89,28 @@ class JobEvent:
 class RecordStore(Protocol):
     """Where records live. Every method is blocking; the API calls them off the event loop or through short threads."""
 
+    def now(self) -> float:
+        """The store's clock, seconds since the epoch."""
+        ...
+
+    def remember(self, key: str, value: str, ttl_s: int) -> str:
+        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic."""
+        ...
+
     # jobs
     def create_job(self, record: JobRecord, max_active: int) -> tuple[JobRecord, bool]:
         """Store a new job, or return the one that exists under its id (False).
 
-        A finished job that failed or was dismissed is started anew as the next attempt (True). Atomic.
-        Raises QueueFullError when ``max_active`` jobs are active already.
+        A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
+        returned, with its attempt. Atomic. Raises QueueFullError when ``max_active`` jobs are active already.
         """
         ...
 
     def get_job(self, job_id: str) -> JobRecord | None: ...
+
+    def job_expired(self, job_id: str) -> bool:
+        """Whether a job of this id was kept once and has outlived its retention."""
+        ...
 
     def list_jobs(self, status: str | None, limit: int, before: tuple[float, str] | None) -> list[JobRecord]:
         """Newest first, older than ``before`` = (created, id)."""
@@ -95,39 +119,77 @@ class RecordStore(Protocol):
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
         """Compare-and-set: applies ``changes`` if ``attempt`` is current and the state machine allows it.
 
+        A change of status must be a move: whoever sets ``running`` second loses, so it serves as a claim.
         Raises StaleAttemptError. Publishes an event whenever status, phase or progress changes.
         """
+        ...
+
+    def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        """Say that the running attempt lives; the record returned tells whether to stop. Raises StaleAttemptError."""
+        ...
+
+    def requeue_job(self, job_id: str, attempt: int) -> JobRecord:
+        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError."""
         ...
 
     def request_cancel(self, job_id: str) -> JobRecord | None:
         """Set cancel_requested; an accepted job is dismissed at once, a running one when its worker notices."""
         ...
 
-    def delete_job(self, job_id: str) -> bool: ...
+    def delete_job(self, job_id: str) -> bool:
+        """Forget a finished job wholly; False when there is none. Raises StaleAttemptError while it is active."""
+        ...
 
-    def queue_position(self, job_id: str) -> int | None: ...
+    def active_jobs(self) -> list[JobRecord]:
+        """Every accepted or running job."""
+        ...
+
+    def expire_jobs(self) -> list[str]:
+        """Drop what is left of finished jobs that have outlived their retention; their ids, for whoever holds more."""
+        ...
+
+    def queue_position(self, job_id: str) -> int | None:
+        """1 for the accepted job that is next; None for a job that does not wait."""
+        ...
 
     def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
-        """Events after the given id (None: from the start), waiting at most ``wait_s`` for the first."""
+        """Events after the given id (None: from the start), waiting at most ``wait_s`` for the first.
+
+        Raises ValueError when ``after`` is no event id.
+        """
         ...
 
     # fields
-    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]: ...
+    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+        """Store a new field, or return the one that exists (False).
+
+        A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        """
+        ...
 
     def get_field(self, sha256: str) -> FieldRecord | None: ...
 
     def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]: ...
 
-    def update_field(self, sha256: str, **changes: Any) -> FieldRecord: ...
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).
+
+        ready and rejected are final within an attempt.
+        """
+        ...
 
     def delete_field(self, sha256: str) -> bool: ...
+
+    def validating_fields(self) -> list[FieldRecord]:
+        """Every field whose import has not ended."""
+        ...
+
+    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
+        """Start a lost import anew as the next attempt. Raises StaleAttemptError."""
+        ...
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         """Ids of active jobs that need this field."""
         ...
 
     def ping(self) -> bool: ...
-
-
-class QueueFullError(RecordError):
-    """As many jobs are active as the service takes."""

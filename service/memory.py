@@ -1,0 +1,312 @@
+"""Records, blobs and queue in memory: doubles for unit tests that keep the same promises as the real ones."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
+
+from service import transitions
+from service.blobs import check_key
+from service.records import ACTIVE, FieldRecord, JobEvent, JobRecord, QueueFullError, StaleAttemptError
+
+_Record = TypeVar("_Record", JobRecord, FieldRecord)
+
+
+def _page(records: list[_Record], name: str, limit: int, before: tuple[float, str] | None) -> list[_Record]:
+    def order(record: _Record) -> tuple[float, str]:
+        return record.created, getattr(record, name)
+
+    older = [record for record in records if before is None or order(record) < before]
+    return sorted(older, key=order, reverse=True)[:limit]
+
+
+class InMemoryRecordStore:
+    """A RecordStore in one process. ``clock`` may be replaced to move time by hand."""
+
+    def __init__(self, retention_s: float = 7 * 24 * 3600, clock: Callable[[], float] = time.time) -> None:
+        self._retention_s = retention_s
+        self._clock = clock
+        self._changed = threading.Condition(threading.RLock())
+        self._jobs: dict[str, JobRecord] = {}
+        self._waiting: list[str] = []
+        self._events: dict[str, list[JobEvent]] = {}
+        self._tombstones: set[str] = set()
+        self._fields: dict[str, FieldRecord] = {}
+        self._remembered: dict[str, tuple[str, float]] = {}
+
+    def now(self) -> float:
+        return self._clock()
+
+    def ping(self) -> bool:
+        return True
+
+    def remember(self, key: str, value: str, ttl_s: int) -> str:
+        with self._changed:
+            known = self._remembered.get(key)
+            if known is None or known[1] <= self.now():
+                known = self._remembered[key] = (value, self.now() + ttl_s)
+            return known[0]
+
+    # jobs
+
+    def _live(self, job_id: str) -> JobRecord | None:
+        record = self._jobs.get(job_id)
+        if record is not None and record.finished is not None and record.finished + self._retention_s <= self.now():
+            return None
+        return record
+
+    def _require_job(self, job_id: str) -> JobRecord:
+        record = self._live(job_id)
+        if record is None:
+            raise StaleAttemptError("there is no such job")
+        return record
+
+    def _save(self, record: JobRecord) -> JobRecord:
+        before = self._jobs.get(record.id)
+        self._jobs[record.id] = record
+        if record.status != "accepted":
+            self._waiting = [job_id for job_id in self._waiting if job_id != record.id]
+        elif record.id not in self._waiting:
+            self._waiting.append(record.id)
+        event = transitions.event_of(before, record)
+        if event is not None:
+            stream = self._events.setdefault(record.id, [])
+            last = transitions.parse_event_id(stream[-1].id)[0] if stream else 0
+            stream.append(JobEvent(f"{last + 1}-0", event[0], dict(event[1])))
+        self._changed.notify_all()
+        return record
+
+    def create_job(self, record: JobRecord, max_active: int) -> tuple[JobRecord, bool]:
+        with self._changed:
+            known = self._live(record.id)
+            fresh = record if known is None else transitions.restarted_job(known, self.now())
+            if fresh is None:
+                assert known is not None
+                return known, False
+            if len(self.active_jobs()) >= max_active:
+                raise QueueFullError(f"{max_active} jobs are active already")
+            self._tombstones.discard(record.id)
+            return self._save(fresh), True
+
+    def get_job(self, job_id: str) -> JobRecord | None:
+        with self._changed:
+            return self._live(job_id)
+
+    def job_expired(self, job_id: str) -> bool:
+        with self._changed:
+            return job_id in self._tombstones or (job_id in self._jobs and self._live(job_id) is None)
+
+    def list_jobs(self, status: str | None, limit: int, before: tuple[float, str] | None) -> list[JobRecord]:
+        with self._changed:
+            live = [record for job_id in self._jobs if (record := self._live(job_id)) is not None]
+            return _page([record for record in live if status in (None, record.status)], "id", limit, before)
+
+    def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        with self._changed:
+            return self._save(transitions.changed_job(self._require_job(job_id), attempt, changes, self.now()))
+
+    def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        with self._changed:
+            return self._save(transitions.beaten_job(self._require_job(job_id), attempt, self.now()))
+
+    def requeue_job(self, job_id: str, attempt: int) -> JobRecord:
+        with self._changed:
+            return self._save(transitions.requeued_job(self._require_job(job_id), attempt, self.now()))
+
+    def request_cancel(self, job_id: str) -> JobRecord | None:
+        with self._changed:
+            record = self._live(job_id)
+            return None if record is None else self._save(transitions.cancelled_job(record, self.now()))
+
+    def delete_job(self, job_id: str) -> bool:
+        with self._changed:
+            record = self._live(job_id)
+            if record is not None and record.status in ACTIVE:
+                raise StaleAttemptError(f"a job that is {record.status} is not deleted")
+            self._jobs.pop(job_id, None)
+            self._events.pop(job_id, None)
+            self._tombstones.discard(job_id)
+            return record is not None
+
+    def active_jobs(self) -> list[JobRecord]:
+        with self._changed:
+            return [record for record in self._jobs.values() if record.status in ACTIVE]
+
+    def expire_jobs(self) -> list[str]:
+        with self._changed:
+            expired = [job_id for job_id in self._jobs if self._live(job_id) is None]
+            for job_id in expired:
+                del self._jobs[job_id]
+                self._events.pop(job_id, None)
+                self._tombstones.add(job_id)
+            return expired
+
+    def queue_position(self, job_id: str) -> int | None:
+        with self._changed:
+            return self._waiting.index(job_id) + 1 if job_id in self._waiting else None
+
+    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
+        bound = (0, 0) if after is None else transitions.parse_event_id(after)
+
+        def newer() -> list[JobEvent]:
+            stream = self._events.get(job_id, [])
+            return [event for event in stream if transitions.parse_event_id(event.id) > bound]
+
+        with self._changed:
+            self._changed.wait_for(lambda: bool(newer()), timeout=wait_s)
+            return newer()
+
+    # fields
+
+    def _require_field(self, sha256: str) -> FieldRecord:
+        record = self._fields.get(sha256)
+        if record is None:
+            raise StaleAttemptError("there is no such field")
+        return record
+
+    def _save_field(self, record: FieldRecord) -> FieldRecord:
+        self._fields[record.sha256] = record
+        return record
+
+    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+        with self._changed:
+            known = self._fields.get(record.sha256)
+            fresh = record if known is None else transitions.restarted_field(known, record, self.now())
+            if fresh is None:
+                assert known is not None
+                return known, False
+            return self._save_field(fresh), True
+
+    def get_field(self, sha256: str) -> FieldRecord | None:
+        with self._changed:
+            return self._fields.get(sha256)
+
+    def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]:
+        with self._changed:
+            chosen = [record for record in self._fields.values() if label in (None, record.label)]
+            return _page(chosen, "sha256", limit, before)
+
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        with self._changed:
+            known = self._require_field(sha256)
+            return self._save_field(transitions.changed_field(known, attempt, changes, self.now()))
+
+    def validating_fields(self) -> list[FieldRecord]:
+        with self._changed:
+            return [record for record in self._fields.values() if record.state == "validating"]
+
+    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
+        with self._changed:
+            return self._save_field(transitions.retried_field(self._require_field(sha256), attempt, self.now()))
+
+    def delete_field(self, sha256: str) -> bool:
+        with self._changed:
+            return self._fields.pop(sha256, None) is not None
+
+    def jobs_using_field(self, sha256: str) -> Iterator[str]:
+        return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
+
+
+class InMemoryJobQueue:
+    """A JobQueue that only notes what it was told; tests read ``registrations``, ``imports`` and ``stopped``."""
+
+    def __init__(self, workers: int = 1) -> None:
+        self.workers = workers
+        self.registrations: list[tuple[str, int]] = []
+        self.imports: list[tuple[str, int]] = []
+        self.stopped: list[tuple[str, int]] = []
+
+    def enqueue_registration(self, job_id: str, attempt: int) -> None:
+        if (job_id, attempt) not in self.registrations:
+            self.registrations.append((job_id, attempt))
+
+    def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
+        if (sha256, attempt) not in self.imports:
+            self.imports.append((sha256, attempt))
+
+    def holds_registration(self, job_id: str, attempt: int) -> bool:
+        return (job_id, attempt) in self.registrations
+
+    def holds_import(self, sha256: str, attempt: int) -> bool:
+        return (sha256, attempt) in self.imports
+
+    def stop(self, job_id: str, attempt: int) -> None:
+        self.stopped.append((job_id, attempt))
+        if (job_id, attempt) in self.registrations:
+            self.registrations.remove((job_id, attempt))
+
+    def live_workers(self) -> int:
+        return self.workers
+
+
+class _MemoryBlobWriter:
+    def __init__(self, store: InMemoryBlobStore) -> None:
+        self._store = store
+        self._data = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._data += data
+        return len(data)
+
+    def commit(self, key: str) -> None:
+        self._store.put(key, bytes(self._data))
+
+
+class InMemoryBlobStore:
+    """A BlobStore in a dictionary, ``blobs``."""
+
+    def __init__(self) -> None:
+        self.blobs: dict[str, bytes] = {}
+
+    @contextmanager
+    def writer(self) -> Iterator[_MemoryBlobWriter]:
+        yield _MemoryBlobWriter(self)
+
+    def put(self, key: str, data: bytes) -> None:
+        self.blobs[check_key(key)] = data
+
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        if self.exists(key):
+            return False
+        self.put(key, data)
+        return True
+
+    def _get(self, key: str) -> bytes:
+        try:
+            return self.blobs[check_key(key)]
+        except KeyError:
+            raise FileNotFoundError(key) from None
+
+    def open(self, key: str) -> BinaryIO:
+        return io.BytesIO(self._get(key))
+
+    @contextmanager
+    def local_copy(self, key: str) -> Iterator[Path]:
+        data = self._get(key)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / key.rsplit("/", 1)[-1]
+            path.write_bytes(data)
+            yield path
+
+    def exists(self, key: str) -> bool:
+        return check_key(key) in self.blobs
+
+    def size(self, key: str) -> int:
+        return len(self._get(key))
+
+    def list(self, prefix: str) -> Iterator[str]:
+        below = f"{check_key(prefix)}/" if prefix else ""
+        return iter(sorted(key for key in self.blobs if key.startswith(below)))
+
+    def delete(self, key: str) -> None:
+        self.blobs.pop(check_key(key), None)
+
+    def delete_prefix(self, prefix: str) -> None:
+        for key in list(self.list(prefix)):
+            del self.blobs[key]

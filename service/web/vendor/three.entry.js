@@ -1,0 +1,31 @@
+// What the result page uses of three.js. scripts/vendor_three.sh bundles it; the page imports the bundle.
+export {
+  AdditiveBlending,
+  Box3,
+  BoxGeometry,
+  BufferAttribute,
+  BufferGeometry,
+  Color,
+  DoubleSide,
+  EdgesGeometry,
+  Group,
+  LineBasicMaterial,
+  LineSegments,
+  Matrix4,
+  Mesh,
+  NormalBlending,
+  PerspectiveCamera,
+  PlaneGeometry,
+  Points,
+  Quaternion,
+  Scene,
+  ShaderMaterial,
+  Sphere,
+  Spherical,
+  SRGBColorSpace,
+  Vector2,
+  Vector3,
+  WebGLRenderer,
+} from 'three';
+export { OrbitControls } from 'three/addons/controls/OrbitControls.js';
+export { PLYLoader } from 'three/addons/loaders/PLYLoader.js';
