@@ -5,7 +5,7 @@ setup:
 	@scripts/setup.sh
 
 demo: setup
-	@.venv/bin/python scripts/demo.py
+	@.venv/bin/python -m scripts.demo
 
 test: setup lint
 	@scripts/system-packages.sh test

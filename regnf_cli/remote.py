@@ -42,6 +42,12 @@ class RemoteService:
 
     def upload_field(self, path: Path, report: Report = lambda phase, share: None) -> str:
         """Send a field unless the service holds it; returns its SHA-256 once the service has found it good."""
+        sha256 = self.send(path, report)
+        self.wait_until_ready(sha256)
+        return sha256
+
+    def send(self, path: Path, report: Report = lambda phase, share: None) -> str:
+        """Send a field unless the service holds it; returns its SHA-256 while its import may still run."""
         sha256 = _sha256(path)
         known = self._http.get(f"/fields/{sha256}")
         if known.status_code != 200 or known.json()["state"] == "rejected":
@@ -57,10 +63,10 @@ class RemoteService:
 
             length = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
             _check(self._http.put(f"/fields/{sha256}", content=body(), headers=length))
-        self._wait_until_ready(sha256)
         return sha256
 
-    def _wait_until_ready(self, sha256: str) -> None:
+    def wait_until_ready(self, sha256: str) -> None:
+        """Wait for a field's import to end; raises ServiceError with the gate's reason when it was rejected."""
         while True:
             document = _check(self._http.get(f"/fields/{sha256}", params={"wait": _POLL_S}))
             if document["state"] == "ready":

@@ -7,12 +7,9 @@ service then stays up for you to look; otherwise it ends. Exit status 0 only if 
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
-import select
 import shutil
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -21,12 +18,12 @@ from typing import Any
 from rich.console import Console
 
 from regnf_cli.console import phase_progress
+from regnf_cli.local_service import running_service
 from regnf_cli.remote import RemoteService
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT / "examples" / "data"
 STATE = ROOT / ".demo"
-START_DEADLINE_S = 30
 MAX_ROTATION_RAD = 0.03
 MAX_TRANSLATION_SHARE = 0.03
 MAX_SCALE_SHARE = 0.02
@@ -36,8 +33,7 @@ console = Console(highlight=False)
 def main() -> int:
     started = time.monotonic()
     shutil.rmtree(STATE, ignore_errors=True)
-    server, address = start_service()
-    try:
+    with running_service(STATE) as address:
         console.print(f"service      {address}  (state in {STATE.name}/, its log in {STATE.name}/serve.log)")
         job, result = run(address)
         good = show(result)
@@ -45,37 +41,9 @@ def main() -> int:
         console.print(f"total        {time.monotonic() - started:.1f} s")
         if good and sys.stdin.isatty():
             console.print("\nOpen the page; press Enter here to stop the service.")
-            input()
+            with contextlib.suppress(KeyboardInterrupt, EOFError):
+                input()
         return 0 if good else 1
-    except KeyboardInterrupt:
-        return 0
-    finally:
-        server.send_signal(signal.SIGTERM)
-        server.wait(timeout=30)
-
-
-def start_service() -> tuple[subprocess.Popen[str], str]:
-    """`regnf serve` on a free port of the loopback; returns it and its address once it listens."""
-    STATE.mkdir(parents=True)
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
-    with (STATE / "serve.log").open("w") as log:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(STATE)],
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            env=environment,
-        )
-    assert server.stdout is not None
-    deadline = time.monotonic() + START_DEADLINE_S
-    while time.monotonic() < deadline and server.poll() is None:
-        if not select.select([server.stdout], [], [], 0.2)[0]:
-            continue
-        for word in server.stdout.readline().split():
-            if word.startswith("http://"):
-                return server, word.rstrip("/")
-    server.kill()
-    sys.exit(f"The service did not start; see {STATE.name}/serve.log")
 
 
 def run(address: str) -> tuple[dict[str, Any], dict[str, Any]]:

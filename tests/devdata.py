@@ -1,4 +1,4 @@
-"""The development data (open meshes, room layouts, reference checkpoints) that lies beside the repository, if it does."""
+"""Where the development data lies (open meshes, room layouts, reference checkpoints), if it does."""
 
 from __future__ import annotations
 
