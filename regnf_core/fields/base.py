@@ -44,7 +44,7 @@ def evaluate_in_chunks(evaluate: Callable[[Tensor], Tensor], points: Tensor, chu
     """Apply ``evaluate`` to slices of at most ``chunk`` points and join the results along the first axis."""
     if points.shape[0] <= chunk:
         return evaluate(points)
-    return torch.cat([evaluate(part) for part in points.split(chunk)])
+    return torch.cat([evaluate(part) for part in torch.split(points, chunk)])
 
 
 class _SignedDistance(torch.autograd.Function):
