@@ -1,0 +1,86 @@
+"""The small network that turns a point's features into its signed distance, and its derivative in closed form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_BETA = 100.0
+_FLAT = 20.0
+"""Beyond this |beta x| softplus is its asymptote to float32; cutting there also keeps denormal numbers out of exp."""
+
+
+class _Softplus(torch.autograd.Function):
+    """log(1 + exp(100 x)) / 100, about twice as fast on a CPU as the built-in one."""
+
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        tail = x.abs().mul_(-_BETA).clamp_min_(-_FLAT).exp_().add_(1.0).log_()
+        return x.clamp_min(0.0).add_(tail, alpha=1.0 / _BETA)
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, *grad_outputs: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors  # type: ignore[attr-defined]
+        return grad_outputs[0] * _slope(x)
+
+
+def _softplus(x: Tensor) -> Tensor:
+    return _Softplus.apply(x)  # type: ignore[no-untyped-call, no-any-return]
+
+
+def _slope(x: Tensor) -> Tensor:
+    """Derivative of the softplus."""
+    return (x * _BETA).clamp(-_FLAT, _FLAT).sigmoid()
+
+
+class GeometryMlp:
+    """Linear layers with softplus(100) between; where there are more than ``skip_at``, that one sees the input again.
+
+    weights[i]: (out_i, in_i), biases[i]: (out_i,), weight normalisation already folded in. Of the last layer only the
+    first row is evaluated: the signed distance. The skip connection feeds [h, input] / sqrt 2.
+    """
+
+    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], skip_at: int = 4) -> None:
+        self.weights = [*weights[:-1], weights[-1][:1]]
+        self.biases = [*biases[:-1], biases[-1][:1]]
+        self.skip_at = skip_at if len(self.weights) > skip_at else None
+
+    def __call__(self, features: Tensor) -> Tensor:
+        """Signed distance (N,) of features (N, in)."""
+        h = features
+        for layer in range(len(self.weights) - 1):
+            h = _softplus(self._linear(layer, h, features))
+        return self._linear(len(self.weights) - 1, h, features).squeeze(-1)
+
+    def with_gradient(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) of features (N, in) and its gradient (N, in) by them, by reverse accumulation."""
+        h, slopes = features, []
+        for layer in range(len(self.weights) - 1):
+            a = self._linear(layer, h, features)
+            slopes.append(_slope(a))
+            h = _softplus(a)
+        distance = self._linear(len(self.weights) - 1, h, features).squeeze(-1)
+        gradient = self.weights[-1].expand(features.shape[0], -1)
+        skipped = None
+        if self.skip_at == len(self.weights) - 1:
+            gradient, skipped = self._split_skip(gradient, features)
+        for layer in reversed(range(len(self.weights) - 1)):
+            gradient = (gradient * slopes[layer]) @ self.weights[layer]
+            if layer == self.skip_at:
+                gradient, skipped = self._split_skip(gradient, features)
+        return distance, gradient if skipped is None else gradient + skipped
+
+    def _linear(self, layer: int, h: Tensor, features: Tensor) -> Tensor:
+        if layer == self.skip_at:
+            h = torch.cat((h, features), dim=-1) / math.sqrt(2.0)
+        return torch.addmm(self.biases[layer], h, self.weights[layer].T)
+
+    @staticmethod
+    def _split_skip(gradient: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        gradient = gradient / math.sqrt(2.0)
+        split = gradient.shape[1] - features.shape[1]
+        return gradient[:, :split], gradient[:, split:]

@@ -1,0 +1,129 @@
+"""The layout of a multi-resolution hash grid: how many entries each level has, and where they lie in the table.
+
+Torch-free, so that a file's shapes can be checked before anything heavy is loaded. The layout is the one that
+tiny-cuda-nn writes (Müller et al. 2022, "Instant neural graphics primitives"), float32 rounding included: scales are
+computed in single precision there, and whether ``ceil`` sees 63.0 or 63.000004 decides a level's row length.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from annotated_types import Ge, Gt, Le
+
+from regnf_core.errors import FieldFormatError
+
+Interpolation = Literal["linear", "smoothstep"]
+_ENTRY_ALIGNMENT = 8
+_ROUNDING_REACH = 1e-3
+"""A scale this close to a whole number may be rounded either way by another machine's exp2f."""
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """A grid of ``levels`` lattices over the unit cube, each with at most 2^log2_table_size entries of features.
+
+    A level whose lattice fits into its part of the table is *dense* (one entry a node), a finer one is *hashed*.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+    levels: Annotated[int, Ge(1), Le(32)] = 16
+    features_per_level: Annotated[int, Ge(1), Le(32)] = 2
+    log2_table_size: Annotated[int, Ge(3), Le(24)] = 19
+    base_resolution: Annotated[int, Ge(2), Le(1024)] = 16
+    per_level_scale: Annotated[float, Ge(1), Le(8)] = 1.3819128799677762
+    """Ratio of the resolutions of neighbouring levels."""
+    resolutions: tuple[Annotated[int, Gt(1), Le(1 << 24)], ...] | None = None
+    """Nodes along an edge, per level, where they must differ from the computed ones (see :meth:`with_entry_count`)."""
+    interpolation: Interpolation = "smoothstep"
+
+    def __post_init__(self) -> None:
+        if self.resolutions is not None and len(self.resolutions) != self.levels:
+            raise FieldFormatError(
+                f"hash grid has {self.levels} levels and {len(self.resolutions)} resolutions",
+                reason="FIELD_SHAPES_MISMATCH",
+            )
+
+    @classmethod
+    def from_top_resolution(cls, top_resolution: int, **values: Any) -> HashGridConfig:
+        """A config whose finest level has ``top_resolution`` nodes along an edge; ``values`` are the other fields."""
+        config = cls(**values)
+        steps = max(config.levels - 1, 1)
+        growth = math.exp((math.log(top_resolution) - math.log(config.base_resolution)) / steps)
+        return replace(config, per_level_scale=growth)
+
+    @property
+    def width(self) -> int:
+        """Number of features of an encoded point: levels x features_per_level."""
+        return self.levels * self.features_per_level
+
+    def scales(self) -> tuple[float, ...]:
+        """Cells along an edge of the unit cube, per level: exp2(l log2(growth)) base - 1, in float32."""
+        log2_growth = np.float32(math.log2(np.float32(self.per_level_scale)))
+        scales = []
+        for level in range(self.levels):
+            growth = np.float32(2.0 ** float(np.float32(level) * log2_growth))
+            scales.append(float(growth * np.float32(self.base_resolution) - np.float32(1.0)))
+        return tuple(scales)
+
+    def level_resolutions(self) -> tuple[int, ...]:
+        """Nodes along an edge, per level."""
+        if self.resolutions is not None:
+            return self.resolutions
+        return tuple(math.ceil(scale) + 1 for scale in self.scales())
+
+    def level_entries(self) -> tuple[int, ...]:
+        """Table entries per level: the lattice's nodes, rounded up to a multiple of 8, at most 2^log2_table_size."""
+        cap = 1 << self.log2_table_size
+        return tuple(min(_round_up(res**3), cap) for res in self.level_resolutions())
+
+    def level_is_dense(self) -> tuple[bool, ...]:
+        """Whether each level keeps one entry a node (else its nodes are hashed)."""
+        pairs = zip(self.level_resolutions(), self.level_entries(), strict=True)
+        return tuple(res**3 <= entries for res, entries in pairs)
+
+    @property
+    def entries(self) -> int:
+        """Rows of the whole table, all levels."""
+        return sum(self.level_entries())
+
+    def with_entry_count(self, entries: int) -> HashGridConfig:
+        """This config with the per-level rounding under which the table has ``entries`` rows.
+
+        Where base x growth^l is a whole number, one machine's exp2f gives r nodes and another's r + 1. The stored
+        table tells which: the pattern with the fewest changes that matches wins.
+
+        Raises FieldFormatError (FIELD_SHAPES_MISMATCH) when no pattern matches.
+        """
+        for candidate in self._rounding_variants():
+            if candidate.entries == entries:
+                return candidate
+        raise FieldFormatError(
+            f"hash table has {entries} entries, its description gives {self.entries}", reason="FIELD_SHAPES_MISMATCH"
+        )
+
+    def _rounding_variants(self) -> Iterator[HashGridConfig]:
+        """This config, then those with other roundings of the doubtful levels, fewest changes first."""
+        yield self
+        usual = self.level_resolutions()
+        doubtful = []
+        for level, scale in enumerate(self.scales()):
+            nearest = round(scale)
+            if abs(scale - nearest) <= _ROUNDING_REACH * max(1.0, scale / 1000):
+                doubtful.append((level, (nearest + 2) if usual[level] == nearest + 1 else (nearest + 1)))
+        for changes in range(1, len(doubtful) + 1):
+            for chosen in itertools.combinations(doubtful, changes):
+                resolutions = list(usual)
+                for level, resolution in chosen:
+                    resolutions[level] = resolution
+                yield replace(self, resolutions=tuple(resolutions))
+
+
+def _round_up(nodes: int) -> int:
+    return -(-nodes // _ENTRY_ALIGNMENT) * _ENTRY_ALIGNMENT

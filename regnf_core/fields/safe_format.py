@@ -1,0 +1,141 @@
+"""regnf's own field file: safetensors with a JSON description. Nothing in it can run, and every shape is checked first.
+
+Writing and reading the description need no torch; :func:`open_field` loads it. docs/safe-format.md lays the format down.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.description import (
+    NeusFactoDescription,
+    TensorSpec,
+    description_to_dict,
+    parse_description,
+)
+
+if TYPE_CHECKING:
+    import torch
+    from numpy.typing import NDArray
+
+    from regnf_core.fields.neus_facto import NeusFactoField
+
+FORMAT_VERSION = "1"
+_TYPE_NAMES = {"float32": "F32", "float16": "F16"}
+_ALIGNMENT = 64
+_MAX_DESCRIPTION = 1 << 20
+
+
+def write_safe_field(
+    path: str | os.PathLike[str], description: dict[str, Any], tensors: Mapping[str, NDArray[Any]]
+) -> None:
+    """Write a field file, whole or not at all: a temporary file beside ``path`` is renamed once it is on the disk.
+
+    The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32 or
+    float16 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH or
+    FIELD_NOT_FINITE.
+    """
+    parsed = parse_description(description)
+    specs = {name: TensorSpec(array.shape, _type_name(name, array)) for name, array in tensors.items()}
+    parsed.check_tensors(specs)
+    for name, array in tensors.items():
+        if not np.isfinite(array).all():
+            raise FieldFormatError(f"{name} holds a number that is not finite", reason="FIELD_NOT_FINITE")
+    # The table first: its rows are read as wide elements, which asks for an aligned start.
+    order = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name != "hash_table", name))
+    header = _header(description_to_dict(parsed), specs, order, tensors)
+    target = Path(path)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.part")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(len(header).to_bytes(8, "little") + header)
+            for name in order:
+                file.write(np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<")).data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The description of the field in ``path``, from the file's header alone, checked against the tensors' shapes.
+
+    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
+    """
+    return description_to_dict(_read_header(path)[0])
+
+
+def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> NeusFactoField:
+    """The field in ``path``, its parameters on ``device``. On a CPU float32 tensors are mapped, not read.
+
+    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
+    """
+    from regnf_core.fields.build import build_neus_facto
+
+    description, names = _read_header(path)
+    with safe_open(os.fspath(path), framework="pt", device=str(device)) as file:
+        return build_neus_facto(description, {name: file.get_tensor(name) for name in names})
+
+
+def _read_header(path: str | os.PathLike[str]) -> tuple[NeusFactoDescription, list[str]]:
+    """The checked description, and the tensors' names."""
+    try:
+        with safe_open(os.fspath(path), framework="numpy") as file:
+            metadata = file.metadata() or {}
+            slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            specs = {name: TensorSpec(tuple(s.get_shape()), s.get_dtype()) for name, s in slices.items()}
+    except SafetensorError as error:
+        raise FieldFormatError(f"not a safetensors file: {error}", reason="SAFE_FORMAT_INVALID") from error
+    description = _parse_metadata(metadata)
+    description.check_tensors(specs)
+    return description, sorted(specs)
+
+
+def _parse_metadata(metadata: Mapping[str, str]) -> NeusFactoDescription:
+    version, text = metadata.get("regnf"), metadata.get("field")
+    if version is None or text is None:
+        raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")
+    if version != FORMAT_VERSION:
+        raise FieldFormatError(f"field format version {version[:20]!r} is not known", reason="SAFE_FORMAT_VERSION")
+    if len(text) > _MAX_DESCRIPTION:
+        raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FieldFormatError("the field's description is not JSON", reason="SAFE_FORMAT_INVALID") from error
+    return parse_description(values)
+
+
+def _header(
+    description: dict[str, Any], specs: dict[str, TensorSpec], order: list[str], tensors: Mapping[str, NDArray[Any]]
+) -> bytes:
+    """The safetensors header, padded so that the data starts aligned."""
+    field = json.dumps(description, allow_nan=False, ensure_ascii=False)
+    if len(field) > _MAX_DESCRIPTION:
+        raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
+    entries: dict[str, Any] = {"__metadata__": {"regnf": FORMAT_VERSION, "field": field}}
+    start = 0
+    for name in order:
+        end = start + tensors[name].nbytes
+        entries[name] = {"dtype": specs[name].dtype, "shape": list(specs[name].shape), "data_offsets": [start, end]}
+        start = end
+    text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+    return text + b" " * (-(len(text) + 8) % _ALIGNMENT)
+
+
+def _type_name(name: str, array: NDArray[Any]) -> str:
+    type_name = _TYPE_NAMES.get(array.dtype.name)
+    if type_name is None:
+        raise FieldFormatError(f"{name} is {array.dtype}, expected float32 or float16", reason="FIELD_SHAPES_MISMATCH")
+    return type_name
