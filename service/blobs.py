@@ -27,7 +27,7 @@ def check_key(key: str) -> str:
         not key
         or len(key) > 512
         or "\\" in key
-        or any(part in ("", ".", "..") or len(part) > 200 for part in parts)
+        or any(not part or part.startswith(".") or len(part) > 200 for part in parts)
         or any(ord(character) < 32 or ord(character) > 126 for character in key)
     ):
         raise ValueError("malformed blob key")

@@ -115,9 +115,9 @@ class InMemoryRecordStore:
         with self._changed:
             return self._save(transitions.beaten_job(self._require_job(job_id), attempt, self.now()))
 
-    def requeue_job(self, job_id: str, attempt: int) -> JobRecord:
+    def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
         with self._changed:
-            return self._save(transitions.requeued_job(self._require_job(job_id), attempt, self.now()))
+            return self._save(transitions.requeued_job(self._require_job(job_id), attempt, self.now(), lost))
 
     def request_cancel(self, job_id: str) -> JobRecord | None:
         with self._changed:

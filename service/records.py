@@ -51,7 +51,7 @@ class JobRecord:
     engine: dict[str, Any] = field(default_factory=dict)
     error: dict[str, Any] | None = None
     requeues: int = 0
-    """How often this request was handed out again because its worker vanished."""
+    """How often this request was handed out again because its worker vanished, since it was last asked for."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,11 @@ class RecordStore(Protocol):
         """Say that the running attempt lives; the record returned tells whether to stop. Raises StaleAttemptError."""
         ...
 
-    def requeue_job(self, job_id: str, attempt: int) -> JobRecord:
-        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError."""
+    def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
+        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError.
+
+        ``lost``: its worker vanished, which counts in ``requeues``; otherwise the worker gave it back in good order.
+        """
         ...
 
     def request_cancel(self, job_id: str) -> JobRecord | None:

@@ -82,12 +82,12 @@ def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
     )
 
 
-def requeued_job(record: JobRecord, attempt: int, now: float) -> JobRecord:
-    """The running job handed out anew because its worker vanished. Raises StaleAttemptError."""
+def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> JobRecord:
+    """The running job handed out anew. Raises StaleAttemptError."""
     _require_attempt(record, attempt)
     if record.status != "running":
         raise StaleAttemptError(f"a job that is {record.status} is not requeued")
-    return _next_attempt(record, now, record.requeues + 1)
+    return _next_attempt(record, now, record.requeues + (1 if lost else 0))
 
 
 def restarted_job(record: JobRecord, now: float) -> JobRecord | None:

@@ -1,0 +1,177 @@
+"""Blobs as files below one folder."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+from uuid import uuid4
+
+from service.blobs import StorageFullError, check_key
+
+_TEMPORARY = ".tmp"
+_FULL = {errno.ENOSPC, errno.EDQUOT}
+
+
+@contextmanager
+def _full_told_apart() -> Iterator[None]:
+    """Turns the system's "no space left" into StorageFullError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise StorageFullError(error.errno, "no space is left in the blob store") from error
+        raise
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class LocalBlobWriter(AbstractContextManager["LocalBlobWriter"]):
+    """A temporary file on the store's volume, locked while its writer lives: a sweep takes what nobody has locked."""
+
+    def __init__(self, store: LocalBlobStore) -> None:
+        self._store = store
+        self._path, self._file = self._create()
+
+    def _create(self) -> tuple[Path, BinaryIO]:
+        while True:
+            path = self._store.temporary / uuid4().hex
+            with _full_told_apart():
+                file = path.open("xb")
+            fcntl.flock(file, fcntl.LOCK_EX)
+            if os.fstat(file.fileno()).st_nlink:
+                return path, file
+            file.close()  # a sweep took it between its creation and its lock
+
+    def write(self, data: bytes) -> int:
+        with _full_told_apart():
+            return self._file.write(data)
+
+    def commit(self, key: str) -> None:
+        if not self._finish(key, replace=True):
+            raise AssertionError("a replacing commit always takes place")
+
+    def commit_if_absent(self, key: str) -> bool:
+        """Commit unless the key is taken."""
+        return self._finish(key, replace=False)
+
+    def _finish(self, key: str, replace: bool) -> bool:
+        target = self._store.path_of(key)
+        with _full_told_apart():
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            while True:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    if replace:
+                        self._path.replace(target)
+                    else:
+                        os.link(self._path, target)
+                    _sync_folder(target.parent)
+                except FileExistsError:
+                    return False
+                except FileNotFoundError:
+                    if not self._path.exists():
+                        raise
+                    continue  # a deletion elsewhere removed the emptied folder: make it again
+                return True
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with suppress(OSError):  # closing flushes, which a full disk refuses; what was committed is flushed already
+            self._file.close()
+        self._path.unlink(missing_ok=True)
+
+
+class LocalBlobStore:
+    """A BlobStore in the folder ``root``, shared by any number of processes of one machine or one network volume."""
+
+    def __init__(self, root: Path) -> None:
+        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self.root = root.resolve()
+        self.temporary = self.root / _TEMPORARY
+        self.temporary.mkdir(exist_ok=True)
+        self.sweep()
+
+    def sweep(self) -> int:
+        """Delete temporary files whose writers have died; how many they were."""
+        swept = 0
+        for path in self.temporary.iterdir():
+            with suppress(FileNotFoundError, BlockingIOError), path.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
+                swept += 1
+        return swept
+
+    def path_of(self, key: str) -> Path:
+        """Where a blob lies. Raises ValueError for a malformed key, or one that a link leads out of the store."""
+        path = self.root / check_key(key)
+        if not path.resolve().is_relative_to(self.root):
+            raise ValueError("the blob key leads out of the store")
+        return path
+
+    def writer(self) -> LocalBlobWriter:
+        return LocalBlobWriter(self)
+
+    def put(self, key: str, data: bytes) -> None:
+        self.path_of(key)
+        with self.writer() as writer:
+            writer.write(data)
+            writer.commit(key)
+
+    def put_if_absent(self, key: str, data: bytes) -> bool:
+        self.path_of(key)
+        with self.writer() as writer:
+            writer.write(data)
+            return writer.commit_if_absent(key)
+
+    def open(self, key: str) -> BinaryIO:
+        return self.path_of(key).open("rb")
+
+    @contextmanager
+    def local_copy(self, key: str) -> Iterator[Path]:
+        path = self.path_of(key)
+        if not path.is_file():
+            raise FileNotFoundError(errno.ENOENT, "no such blob", key)
+        yield path
+
+    def exists(self, key: str) -> bool:
+        return self.path_of(key).is_file()
+
+    def size(self, key: str) -> int:
+        return self.path_of(key).stat().st_size
+
+    def list(self, prefix: str) -> Iterator[str]:
+        top = self.path_of(prefix) if prefix else self.root
+        found = []
+        for folder, folders, files in os.walk(top):
+            folders[:] = [name for name in folders if not name.startswith(".")]
+            found += [(Path(folder) / name).relative_to(self.root).as_posix() for name in files]
+        return iter(sorted(found))
+
+    def delete(self, key: str) -> None:
+        path = self.path_of(key)
+        path.unlink(missing_ok=True)
+        for folder in path.parents:
+            if folder == self.root:
+                break
+            try:
+                folder.rmdir()
+            except OSError:
+                break  # not empty, or somebody else removed it
+
+    def delete_prefix(self, prefix: str) -> None:
+        for key in self.list(prefix):
+            self.delete(key)

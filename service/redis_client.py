@@ -1,0 +1,27 @@
+"""How regnf talks to Redis: explicit time limits, health checks, retries with back-off."""
+
+from __future__ import annotations
+
+from redis import Redis
+from redis.backoff import ExponentialWithJitterBackoff
+from redis.exceptions import ConnectionError as RedisConnectionError
+from redis.exceptions import TimeoutError as RedisTimeoutError
+from redis.retry import Retry
+
+SOCKET_TIMEOUT_S = 10.0
+
+
+def connect(url: str, *, retries: int = 6, socket_timeout_s: float = SOCKET_TIMEOUT_S) -> Redis:
+    """A client for redis://, rediss:// or unix:// addresses. Connects on first use.
+
+    A command is tried again ``retries`` times, about four seconds in all by default. Every script of ours may be
+    repeated without harm. The socket's time limit is stated because the library's own is shorter than some waits.
+    """
+    return Redis.from_url(
+        url,
+        socket_timeout=socket_timeout_s,
+        socket_connect_timeout=5.0,
+        health_check_interval=30,
+        retry=Retry(ExponentialWithJitterBackoff(cap=1.0, base=0.1), retries),
+        retry_on_error=[RedisConnectionError, RedisTimeoutError],
+    )

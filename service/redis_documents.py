@@ -1,0 +1,100 @@
+"""Documents in Redis that change by compare-and-set: the ground under the record store."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+from uuid import uuid4
+
+from redis import Redis
+
+PREFIX = "regnf:"
+_PAGE = 100
+
+# A document is a hash of ``document`` (JSON), ``version`` and ``token``. The token names the write that made it: when a
+# connection breaks after the script ran and the client runs it again, the second run finds its own token.
+_WRITE = """
+if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return 'OK' end
+if (redis.call('HGET', KEYS[1], 'version') or '0') ~= ARGV[2] then return 'CONFLICT' end
+if ARGV[3] ~= '' and redis.call('SCARD', KEYS[2]) >= tonumber(ARGV[3]) then return 'FULL' end
+for i = 4, #ARGV do redis.call(unpack(cjson.decode(ARGV[i]))) end
+return 'OK'
+"""
+
+Command = tuple[str, ...]
+
+
+class RedisDocuments:
+    """Reads documents together with the server's clock, writes them with whatever indexes hang on them, atomically."""
+
+    def __init__(self, redis: Redis) -> None:
+        self._redis = redis
+        self._write = redis.register_script(_WRITE)
+
+    def now(self) -> float:
+        seconds, microseconds = self._redis.time()
+        return seconds + microseconds / 1e6
+
+    def ping(self) -> bool:
+        return bool(self._redis.ping())
+
+    def _read(self, key: str) -> tuple[dict[str, Any] | None, float]:
+        """The document, if there is one, and the time of reading."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            pipeline.hget(key, "document")
+            pipeline.time()
+            document, (seconds, microseconds) = pipeline.execute()
+        return json.loads(document) if document is not None else None, seconds + microseconds / 1e6
+
+    def _read_many(self, keys: Iterable[str]) -> list[dict[str, Any]]:
+        """The documents that exist, in the order of their keys."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for key in keys:
+                pipeline.hget(key, "document")
+            return [json.loads(document) for document in pipeline.execute() if document is not None]
+
+    def _newest_first(
+        self, index: str, key_of: Callable[[str], str], before: tuple[float, str] | None
+    ) -> Iterator[dict[str, Any]]:
+        """Documents listed in the sorted set ``index`` by time of creation, older than ``before`` = (created, name)."""
+        highest: float = before[0] if before is not None else math.inf
+        seen_at_highest = 0
+        while True:
+            answer: Any = self._redis.zrevrangebyscore(index, highest, "-inf", seen_at_highest, _PAGE, withscores=True)
+            page = [(float(score), text(name)) for name, score in answer]
+            yield from self._read_many(key_of(name) for score, name in page if before is None or (score, name) < before)
+            if len(page) < _PAGE:
+                return
+            # go on from the last score rather than by offset: what is created meanwhile would shift the offsets
+            lowest = page[-1][0]
+            seen_at_highest = sum(score == lowest for score, _ in page) + (seen_at_highest if lowest == highest else 0)
+            highest = lowest
+
+    def _compare_and_set(
+        self,
+        key: str,
+        expected_version: int,
+        commands: Iterable[Command],
+        document: dict[str, Any] | None = None,
+        cap: tuple[str, int] | None = None,
+    ) -> str:
+        """Run ``commands`` and store ``document`` if the version is the expected one (0: no document).
+
+        ``cap`` = (key of a set, most members it may have before). Returns OK, CONFLICT or FULL.
+        """
+        token = uuid4().hex
+        writes = list(commands)
+        if document is not None:
+            text = json.dumps(document, separators=(",", ":"))
+            writes.insert(0, ("HSET", key, "document", text, "version", str(document["version"]), "token", token))
+        cap_key, most = cap if cap is not None else (key, "")
+        arguments = [token, expected_version, most, *(json.dumps(command) for command in writes)]
+        answer: bytes | str = self._write(keys=[key, cap_key], args=arguments)
+        return answer.decode() if isinstance(answer, bytes) else answer
+
+
+def text(value: bytes | str) -> str:
+    """What Redis answered, as text, whether or not the client decodes."""
+    return value.decode() if isinstance(value, bytes) else value

@@ -1,0 +1,79 @@
+"""Field records in Redis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from service import transitions
+from service.records import FieldRecord, StaleAttemptError
+from service.redis_documents import PREFIX, Command, RedisDocuments, text
+
+_CREATED = f"{PREFIX}fields:created"
+_VALIDATING = f"{PREFIX}fields:validating"
+
+
+def _key(sha256: str) -> str:
+    return f"{PREFIX}field:{sha256}"
+
+
+class RedisFieldRecords(RedisDocuments):
+    """The half of the record store that is about fields."""
+
+    def _save_field(self, expected_version: int, record: FieldRecord) -> bool:
+        index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
+        created: Command = ("ZADD", _CREATED, repr(record.created), record.sha256)
+        return self._compare_and_set(_key(record.sha256), expected_version, [index, created], asdict(record)) == "OK"
+
+    def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
+        while True:
+            document, now = self._read(_key(sha256))
+            if document is None:
+                raise StaleAttemptError("there is no such field")
+            known = FieldRecord(**document)
+            changed = change(known, now)
+            if self._save_field(known.version, changed):
+                return changed
+
+    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+        while True:
+            document, now = self._read(_key(record.sha256))
+            known = FieldRecord(**document) if document is not None else None
+            fresh = transitions.restarted_field(known, record, now) if known is not None else record
+            if fresh is None:
+                assert known is not None
+                return known, False
+            if self._save_field(known.version if known is not None else 0, fresh):
+                return fresh, True
+
+    def get_field(self, sha256: str) -> FieldRecord | None:
+        document, _ = self._read(_key(sha256))
+        return FieldRecord(**document) if document is not None else None
+
+    def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]:
+        found: list[FieldRecord] = []
+        for document in self._newest_first(_CREATED, _key, before):
+            record = FieldRecord(**document)
+            if label in (None, record.label):
+                found.append(record)
+            if len(found) == limit:
+                break
+        return found
+
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        return self._change_field(sha256, lambda known, now: transitions.changed_field(known, attempt, changes, now))
+
+    def validating_fields(self) -> list[FieldRecord]:
+        names = sorted(text(name) for name in self._redis.smembers(_VALIDATING))
+        return [FieldRecord(**document) for document in self._read_many(map(_key, names))]
+
+    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
+        return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now))
+
+    def delete_field(self, sha256: str) -> bool:
+        with self._redis.pipeline() as pipeline:
+            pipeline.delete(_key(sha256))
+            pipeline.zrem(_CREATED, sha256)
+            pipeline.srem(_VALIDATING, sha256)
+            return bool(pipeline.execute()[0])

@@ -1,0 +1,175 @@
+"""Every blob store keeps the same promises; the local one also keeps its volume clean."""
+
+import errno
+import multiprocessing
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from service.blobs import BlobStore, StorageFullError
+from service.local_blobs import LocalBlobStore
+from service.memory import InMemoryBlobStore
+
+BAD_KEYS = [
+    "",
+    "/",
+    "/etc/passwd",
+    "../x",
+    "a/../b",
+    "a/..",
+    "./a",
+    "a//b",
+    "a/",
+    "a\\b",
+    "a\0b",
+    "a\nb",
+    "ä",
+    ".tmp/x",
+]
+BAD_KEYS += ["a" * 201, "/".join(["a" * 100] * 6)]
+
+
+@pytest.fixture(params=["memory", "local"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> BlobStore:
+    return InMemoryBlobStore() if request.param == "memory" else LocalBlobStore(tmp_path / "blobs")
+
+
+def test_what_is_put_is_read(store: BlobStore) -> None:
+    store.put("jobs/a/manifest.json", b"first")
+    store.put("jobs/a/manifest.json", b"second")
+    with store.open("jobs/a/manifest.json") as file:
+        assert file.read() == b"second"
+    assert store.exists("jobs/a/manifest.json")
+    assert store.size("jobs/a/manifest.json") == 6
+    with store.local_copy("jobs/a/manifest.json") as path:
+        assert path.read_bytes() == b"second"
+
+
+def test_missing_blobs_are_told(store: BlobStore) -> None:
+    assert not store.exists("jobs/a")
+    for read in (store.open, store.size):
+        with pytest.raises(FileNotFoundError):
+            read("jobs/a")
+    with pytest.raises(FileNotFoundError), store.local_copy("jobs/a"):
+        pass
+    store.delete("jobs/a")
+    store.delete_prefix("jobs/a")
+
+
+def test_streamed_blobs_appear_whole_or_not_at_all(store: BlobStore) -> None:
+    with store.writer() as writer:
+        writer.write(b"one ")
+        writer.write(b"two")
+        assert list(store.list("")) == []
+        writer.commit("fields/f/original")
+    with store.writer() as writer:
+        writer.write(b"never named")
+    with pytest.raises(TypeError), store.writer() as writer:
+        writer.write(b"broken off" + None)  # type: ignore[operator]
+    assert list(store.list("")) == ["fields/f/original"]
+    with store.open("fields/f/original") as file:
+        assert file.read() == b"one two"
+
+
+def test_only_the_first_of_several_writers_wins(store: BlobStore) -> None:
+    assert store.put_if_absent("jobs/a/manifest.json", b"")
+    assert not store.put_if_absent("jobs/a/manifest.json", b"")
+    assert not store.put_if_absent("jobs/a/manifest.json", b"second")
+    assert store.size("jobs/a/manifest.json") == 0
+
+
+def test_listing_and_deleting_by_folder(store: BlobStore) -> None:
+    for key in ("jobs/a/1/x", "jobs/a/manifest.json", "jobs/ab/1/x"):
+        store.put(key, b".")
+    assert list(store.list("jobs/a")) == ["jobs/a/1/x", "jobs/a/manifest.json"]
+    store.delete_prefix("jobs/a")
+    assert list(store.list("jobs")) == ["jobs/ab/1/x"]
+    store.delete("jobs/ab/1/x")
+    assert list(store.list("jobs")) == []
+
+
+@pytest.mark.parametrize("key", BAD_KEYS)
+def test_malformed_keys_are_refused_everywhere(store: BlobStore, key: str) -> None:
+    for use in (store.open, store.exists, store.size, store.delete, lambda bad: store.put(bad, b".")):
+        with pytest.raises(ValueError):
+            use(key)
+    with pytest.raises(ValueError), store.writer() as writer:
+        writer.commit(key)
+    assert list(store.list("")) == []
+
+
+def test_links_out_of_the_store_are_refused(tmp_path: Path) -> None:
+    store = LocalBlobStore(tmp_path / "blobs")
+    (tmp_path / "secret").write_bytes(b"secret")
+    (store.root / "file").symlink_to(tmp_path / "secret")
+    (store.root / "folder").symlink_to(tmp_path)
+    for key in ("file", "folder/secret"):
+        for use in (store.open, store.exists, store.delete, lambda bad: store.put(bad, b".")):
+            with pytest.raises(ValueError):
+                use(key)
+    assert (tmp_path / "secret").read_bytes() == b"secret"
+
+
+def test_nothing_is_left_in_the_temporary_folder(tmp_path: Path) -> None:
+    store = LocalBlobStore(tmp_path / "blobs")
+    store.put("a", b".")
+    store.put_if_absent("a", b"..")
+    with store.writer() as writer:
+        writer.write(b"aborted")
+    with pytest.raises(ValueError), store.writer() as writer:
+        writer.commit("../a")
+    assert list(store.temporary.iterdir()) == []
+
+
+def test_emptied_folders_go_too(tmp_path: Path) -> None:
+    store = LocalBlobStore(tmp_path / "blobs")
+    store.put("jobs/a/1/x", b".")
+    store.delete("jobs/a/1/x")
+    assert [path.name for path in store.root.iterdir()] == [".tmp"]
+
+
+def _write_and_wait(root: Path, ready: "multiprocessing.synchronize.Event") -> None:
+    with LocalBlobStore(root).writer() as writer:
+        writer.write(b"half")
+        ready.set()
+        signal.pause()
+
+
+def test_a_sweep_takes_the_leftovers_of_the_dead_and_of_nobody_else(tmp_path: Path) -> None:
+    root = tmp_path / "blobs"
+    store = LocalBlobStore(root)
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    process = context.Process(target=_write_and_wait, args=(root, ready))
+    process.start()
+    try:
+        assert ready.wait(30)
+        with store.writer() as living:
+            living.write(b"alive")
+            assert store.sweep() == 0
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGKILL)
+            process.join()
+            assert len(list(store.temporary.iterdir())) == 2
+            assert LocalBlobStore(root).sweep() == 0, "opening the store has swept already"
+            living.commit("a")
+        assert list(store.temporary.iterdir()) == []
+        assert list(store.list("")) == ["a"]
+    finally:
+        process.kill()
+        process.join()
+
+
+def test_a_full_disk_is_told_apart_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = LocalBlobStore(tmp_path / "blobs")
+
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageFullError):
+        store.put("a", b".")
+    assert list(store.temporary.iterdir()) == []
+    assert not store.exists("a")
