@@ -1,0 +1,29 @@
+"""The same with options, progress, the errors against the truth, and pictures to look at.
+
+python examples/02_follow_and_look.py OUTPUT_FOLDER
+"""
+
+import json
+import sys
+from pathlib import Path
+
+from regnf_core import OrientedBox, RegistrationOptions, Sim3, open_field, register
+from regnf_core.diagnostics import result_document, write_artifacts
+
+data = Path(__file__).parent / "data"
+output = Path(sys.argv[1])
+output.mkdir(parents=True, exist_ok=True)
+box = json.loads((data / "detection.json").read_text())
+truth = Sim3.from_dict(json.loads((data / "truth.json").read_text())["T_object_scene"])
+
+result = register(
+    open_field(data / "mix-room.safetensors"),
+    open_field(data / "armchair.safetensors"),
+    OrientedBox.from_quaternion(box["centre"], box["size"], box["rotation_quaternion_xyzw"]),
+    RegistrationOptions.from_dict({"optimisation": {"iterations": 150}}),
+    seed=3,
+    progress=lambda phase, share: print(f"\r{phase:>14} {share:4.0%}", end="", file=sys.stderr),
+)
+print(file=sys.stderr)
+print(json.dumps(result_document(result, truth=truth)["metrics"], indent=2))
+print("wrote", ", ".join(write_artifacts(result, output, truth=truth)))

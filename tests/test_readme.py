@@ -1,0 +1,55 @@
+"""The README keeps its word: its links lead somewhere, its commands exist, its Python runs."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_local_links_lead_somewhere(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)#\s]+)", text)
+    missing = [
+        target
+        for target in targets
+        if not target.startswith(("http://", "https://")) and not (document.parent / target).exists()
+    ]
+    assert not missing
+
+
+def test_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 120
+
+
+def test_commands_named_in_the_readme_exist() -> None:
+    named = set(re.findall(r"^(?:\.venv/bin/)?regnf (\w+)", README, flags=re.M))
+    assert {"serve", "register", "inspect", "fit"} <= named
+    for command in named:
+        done = subprocess.run(
+            [sys.executable, "-m", "regnf_cli.main", command, "--help"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert "Example" in done.stdout or command in ("serve", "worker")
+
+
+def test_make_targets_named_in_the_readme_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"make (\w+)", README):
+        assert re.search(rf"^{target}:", makefile, flags=re.M)
+
+
+@pytest.mark.slow
+def test_python_of_the_readme_runs() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("registered")
