@@ -1,0 +1,75 @@
+// The job's own part of the HTTP API. Every address is below the job's, taken from the page's own address.
+
+const TOKEN_KEY = 'regnf.token';
+
+/** What the service answers instead of a result: RFC 9457 problem details. */
+export class ApiProblem extends Error {
+  constructor(status, problem = {}) {
+    super(problem.detail || problem.title || `The service answered ${status}`);
+    this.status = status;
+    this.problem = problem;
+    this.reason = problem.reason ?? '';
+  }
+}
+
+/** "/v1/jobs/ab12/view" is the page of the job at "/v1/jobs/ab12". */
+export function jobBase(pathname) {
+  return pathname.replace(/\/view\/?$/, '');
+}
+
+export class JobApi {
+  constructor(base) {
+    this.base = base;
+  }
+
+  /** The job's id, the last part of its address. */
+  get id() {
+    return decodeURIComponent(this.base.split('/').pop());
+  }
+
+  /** Kept for this tab alone: a token opens more than this one job. */
+  get token() {
+    return sessionStorage.getItem(TOKEN_KEY);
+  }
+
+  set token(value) {
+    sessionStorage.setItem(TOKEN_KEY, value);
+  }
+
+  artifactUrl(name) {
+    return `${this.base}/artifacts/${encodeURIComponent(name)}`;
+  }
+
+  async job({ wait = 0, signal } = {}) {
+    const response = await this.open(wait ? `?wait=${wait}` : '', { signal });
+    return response.json();
+  }
+
+  async result() {
+    return (await this.open('/result')).json();
+  }
+
+  async artifact(name) {
+    return (await this.open(`/artifacts/${encodeURIComponent(name)}`)).arrayBuffer();
+  }
+
+  async cancel() {
+    await this.open('/cancel', { method: 'POST' });
+  }
+
+  /** A successful response below the job's address; everything else becomes an ApiProblem. */
+  async open(path, { method = 'GET', headers = {}, signal } = {}) {
+    const authorised = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
+    const response = await fetch(this.base + path, { method, headers: authorised, signal, cache: 'no-cache' });
+    if (response.ok) return response;
+    throw new ApiProblem(response.status, await problemOf(response));
+  }
+}
+
+async function problemOf(response) {
+  try {
+    return await response.json();
+  } catch {
+    return {}; // a proxy in between may answer in HTML; the status still says what happened
+  }
+}

@@ -1,0 +1,118 @@
+// The page of one job: reads it, follows it while it runs, then shows the result.
+
+import { JobApi, jobBase } from './api.js';
+import { artifactsOf, framesOf, isActive } from './documents.js';
+import { announce, byId, copyText, show } from './dom.js';
+import { followJob } from './events.js';
+import {
+  checkPose, showAgreement, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
+} from './panel.js';
+import { Playback, prefersStillness } from './playback.js';
+import { LossPlot } from './plot.js';
+import { inverse, readSim3 } from './sim3.js';
+import { Stage } from './stage.js';
+import {
+  hideCard, showActive, showBadge, showDismissed, showError, showFailed, showFilesOnly, showLoading, showNoView, showTrouble,
+} from './status.js';
+
+const api = new JobApi(jobBase(location.pathname));
+
+async function main() {
+  showLoading('Reading the job');
+  try {
+    let job = await api.job();
+    showJob(job);
+    if (isActive(job)) {
+      showActive(job);
+      job = await followJob(api, job, showActive, showTrouble);
+    }
+    showJob(job);
+    await showFinished(job);
+  } catch (error) {
+    showError(error, main);
+  }
+  document.documentElement.dataset.page = 'ready';
+}
+
+async function showFinished(job) {
+  if (job.status === 'failed') showFailed(job);
+  else if (job.status === 'dismissed') showDismissed(job);
+  else await showResult(job, await api.result());
+}
+
+async function showResult(job, result) {
+  const artifacts = artifactsOf(result);
+  const names = artifacts.map(({ name }) => name);
+  const trace = names.includes('trace.json') ? await readTrace() : [];
+  const frames = framesOf(result, trace);
+  showBadge(result.verdict ?? job.status, job.id);
+  if (result.verdict) showVerdict(result);
+  if (frames.length) showTransform(frames.at(-1).pose);
+  showAgreement(result.metrics);
+  showTimes(result.metrics);
+  showFiles(api, artifacts);
+  showJob(job, result);
+  if (frames.length) await showStage(job, result, frames, names);
+  else showFilesOnly();
+}
+
+async function showStage(job, result, frames, names) {
+  const stage = new Stage(api, names);
+  showLoading('Fetching the point clouds');
+  try {
+    await stage.open(job, result, frames);
+    hideCard();
+  } catch (error) {
+    show(byId('canvas'), false);
+    showNoView(error);
+    return;
+  }
+  const alternatives = (result.alternatives ?? []).filter((one) => readSim3(one?.T_object_scene));
+  const loss = new LossPlot(byId('loss'), frames, (index) => playback.seek(index));
+  const playback = new Playback(frames, (position) => {
+    stage.moveTo(position);
+    loss.moveTo(position);
+    if (checkPose(0)) showTransform(frames.at(-1).pose); // the path leads to the result, not to an alternative
+  });
+  show(byId('convergence'), loss.useful);
+  byId('loss-note').textContent = loss.note;
+  byId('canvas').addEventListener('keydown', (event) => {
+    if (event.key !== ' ') return;
+    event.preventDefault();
+    playback.toggle();
+  });
+  showPoses(alternatives, (index) => {
+    const pose = index === 0 ? frames.at(-1).pose : readSim3(alternatives[index - 1].T_object_scene);
+    playback.seek(frames.length - 1);
+    stage.place(inverse(pose));
+    showTransform(pose);
+    checkPose(index);
+  });
+  announce('The point clouds are shown.');
+  if (!prefersStillness() && frames.length > 1) playback.play();
+}
+
+async function readTrace() {
+  try {
+    return JSON.parse(new TextDecoder().decode(await api.artifact('trace.json')));
+  } catch {
+    return []; // the replay is a courtesy: without the trace it goes straight from the start to the result
+  }
+}
+
+byId('job-id').textContent = api.id;
+byId('copy-id').addEventListener('click', () => copyText(api.id, byId('copy-id')));
+byId('cancel').addEventListener('click', async () => {
+  byId('cancel').disabled = true;
+  try {
+    await api.cancel();
+  } catch {
+    byId('cancel').disabled = false; // finished in the meantime, most likely: the job's own state will say so
+  }
+});
+byId('token-form').addEventListener('submit', (event) => {
+  event.preventDefault();
+  api.token = byId('token').value.trim();
+  main();
+});
+await main();

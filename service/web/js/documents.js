@@ -1,0 +1,75 @@
+// Reading the API's documents: what the page needs from them, or null where a document does not say.
+
+import { readSim3 } from './sim3.js';
+
+export const PHASES = ['loading', 'sampling', 'initialising', 'optimising', 'verifying', 'exporting'];
+
+// What a registration may leave behind, for services whose result does not list it.
+const KNOWN_ARTIFACTS = ['scene_points.ply', 'object_points.ply', 'trace.json', 'residuals.npz', 'preview.png'];
+
+export const isActive = (job) => job.status === 'accepted' || job.status === 'running';
+
+/** The detection box { centre, size, quaternion } in the scene frame, or null. */
+export function detectionOf(job, result) {
+  const sources = [job?.inputs, job?.request, result?.inputs, result, job];
+  const box = sources.map((source) => source?.detection).find((value) => value && typeof value === 'object');
+  if (!box) return null;
+  if (isVector(box.min, 3) && isVector(box.max, 3)) {
+    const centre = box.min.map((low, i) => (low + box.max[i]) / 2);
+    return { centre, size: box.max.map((high, i) => high - box.min[i]), quaternion: [0, 0, 0, 1] };
+  }
+  if (!isVector(box.centre, 3) || !isVector(box.size, 3)) return null;
+  const turn = box.rotation_quaternion_xyzw;
+  return { centre: box.centre, size: box.size, quaternion: isVector(turn, 4) ? turn : [0, 0, 0, 1] };
+}
+
+/** The artifacts as [{ name, bytes }], whether they are listed as names, as objects or as a mapping. */
+export function artifactsOf(result) {
+  const listed = result?.artifacts;
+  if (!listed || typeof listed !== 'object') return KNOWN_ARTIFACTS.map((name) => ({ name, bytes: null }));
+  const entries = Array.isArray(listed)
+    ? listed.map((entry) => (typeof entry === 'string' ? [entry, {}] : [entry?.name, entry]))
+    : Object.entries(listed);
+  return entries
+    .filter(([name]) => typeof name === 'string')
+    .map(([name, entry]) => ({ name, bytes: entry?.bytes ?? entry?.size ?? null }));
+}
+
+/**
+ * The replay: [{ label, iteration, loss, pose }] from the initial transform over the trace to the result.
+ * pose is T_object_scene. Iterations without a readable transform are left out.
+ */
+export function framesOf(result, trace) {
+  const frames = [];
+  const add = (label, iteration, loss, value) => {
+    const pose = readSim3(value);
+    if (pose) frames.push({ label, iteration, loss: Number.isFinite(loss) ? loss : null, pose });
+  };
+  add('Start', null, null, result.T_object_scene_initial);
+  const rows = Array.isArray(trace) ? trace : (trace?.iterations ?? trace?.trace ?? []);
+  rows.forEach((row, i) => {
+    const iteration = row?.iteration ?? i + 1;
+    add(`Iteration ${iteration}`, iteration, row?.loss, row?.T_object_scene);
+  });
+  add('Result', null, null, result.T_object_scene);
+  return frames;
+}
+
+/** [{ phase, seconds }] in the order of the phases, from metrics named seconds_<phase> or a mapping `seconds`. */
+export function secondsByPhase(metrics = {}) {
+  const nested = metrics.seconds ?? metrics.seconds_by_phase ?? {};
+  const found = { ...(typeof nested === 'object' ? nested : {}) };
+  for (const [name, value] of Object.entries(metrics)) {
+    if (name.startsWith('seconds_') && name !== 'seconds_by_phase') found[name.slice('seconds_'.length)] = value;
+  }
+  delete found.total;
+  const rank = (phase) => (PHASES.includes(phase) ? PHASES.indexOf(phase) : PHASES.length);
+  return Object.entries(found)
+    .filter(([, seconds]) => Number.isFinite(seconds) && seconds >= 0)
+    .map(([phase, seconds]) => ({ phase, seconds }))
+    .sort((a, b) => rank(a.phase) - rank(b.phase));
+}
+
+function isVector(value, length) {
+  return Array.isArray(value) && value.length === length && value.every(Number.isFinite);
+}

@@ -1,0 +1,149 @@
+// The numbers beside the view: verdict, transform, agreement, times, downloads, the job itself.
+
+import { secondsByPhase } from './documents.js';
+import { byId, copyText, el, fillFacts, show } from './dom.js';
+import { bytes, fixed, moment, number, percent, seconds, words } from './format.js';
+import { hintFor } from './hints.js';
+import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
+
+const DIRECTIONS = {
+  T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
+  T_scene_object: 'T_scene_object: carries object coordinates to scene coordinates',
+};
+const NAMES = { residual_rms: 'Residual RMS', inlier_share_scene: 'Scene inliers', inlier_share_object: 'Object inliers' };
+
+export function showVerdict(result) {
+  const { verdict, verdict_reason: reason, metrics = {} } = result;
+  byId('verdict').dataset.verdict = verdict;
+  byId('verdict-word').textContent = words(verdict);
+  const why = el('span', {}, words(reason));
+  byId('verdict-reason').replaceChildren(why, ' ', el('code', { title: 'Stable reason, for programs' }, reason ?? ''));
+  const hint = verdict === 'registered' ? '' : hintFor(reason);
+  if (hint) byId('verdict-reason').append(el('span', { className: 'hint' }, hint));
+  const scale = readSim3(result.T_object_scene);
+  const total = totalSeconds(metrics);
+  fillFacts(byId('figures'), [
+    ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
+    ['Scale', figure(scale ? fixed(partsOf(scale).scale, 4) : '–', 'object ← scene')],
+    ['Inliers', figure(percent(Math.min(metrics.inlier_share_scene, metrics.inlier_share_object)), 'weaker side')],
+    ['Time', figure(seconds(total), metrics.iterations ? `${number(metrics.iterations)} iterations` : '')],
+  ]);
+  show(byId('verdict'));
+}
+
+/** The matrix in both directions, as text to read and to copy. */
+export function showTransform(matrix) {
+  const shown = { T_object_scene: matrix, T_scene_object: inverse(matrix) };
+  const direction = () => document.querySelector('input[name="direction"]:checked').value;
+  const draw = () => {
+    const current = shown[direction()];
+    const { position, quaternion, scale } = partsOf(current);
+    byId('matrix-caption').textContent = DIRECTIONS[direction()];
+    byId('matrix').replaceChildren(...rowsOf(current).map((row) => el('tr', {}, ...row.map((value) => el('td', {}, fixed(value))))));
+    fillFacts(byId('sim3'), [
+      ['Scale', mono(fixed(scale, 6))],
+      ['Translation', mono(position.toArray().map((value) => fixed(value, 4)).join('  '))],
+      ['Quaternion xyzw', mono(quaternion.toArray().map((value) => fixed(value, 4)).join('  '))],
+    ]);
+  };
+  for (const input of document.querySelectorAll('input[name="direction"]')) input.onchange = draw;
+  const copy = byId('copy-matrix');
+  copy.onclick = () => copyText(rowsAsText(rowsOf(shown[direction()])), copy);
+  draw();
+  show(byId('transform'));
+}
+
+export function showAgreement(metrics = {}) {
+  const shares = Object.entries(metrics).filter(([name, value]) => /share|overlap/.test(name) && value >= 0 && value <= 1);
+  byId('shares').replaceChildren(...shares.map(([name, value]) => shareBar(NAMES[name] ?? words(name), value)));
+  const others = Object.entries(metrics).filter(
+    ([name, value]) => Number.isFinite(value) && !name.startsWith('seconds') && !shares.some(([share]) => share === name),
+  );
+  fillFacts(byId('metrics'), others.map(([name, value]) => [NAMES[name] ?? words(name), mono(number(value))]));
+  show(byId('agreement'), shares.length + others.length > 0);
+}
+
+export function showTimes(metrics = {}) {
+  const rows = secondsByPhase(metrics);
+  const sum = rows.reduce((total, row) => total + row.seconds, 0);
+  byId('time-total').textContent = `${seconds(sum)} in all`;
+  byId('time-stack').replaceChildren(...rows.map((row, i) => {
+    const part = el('span', { 'data-slot': String(i % 6), title: `${words(row.phase)} ${seconds(row.seconds)}` });
+    part.style.flexGrow = String(Math.max(row.seconds / (sum || 1), 0.004));
+    return part;
+  }));
+  byId('time-key').replaceChildren(...rows.map((row, i) => el(
+    'li', { 'data-slot': String(i % 6) }, el('span', {}, words(row.phase)), el('span', { className: 'mono' }, seconds(row.seconds)),
+  )));
+  show(byId('time'), rows.length > 0);
+}
+
+/** One radio button a pose; onChoose(index) with 0 for the result itself. */
+export function showPoses(alternatives, onChoose) {
+  const poses = [{ relation: 'The result', score: null }, ...alternatives];
+  byId('pose-list').replaceChildren(el('legend', { className: 'unseen' }, 'Pose shown'), ...poses.map((pose, i) => {
+    const input = el('input', { type: 'radio', name: 'pose', value: String(i), checked: i === 0, onchange: () => onChoose(i) });
+    const score = Number.isFinite(pose.score) ? el('span', { className: 'mono' }, number(pose.score, 3)) : '';
+    return el('label', {}, input, el('span', {}, pose.relation || `Pose ${i + 1}`), score);
+  }));
+  show(byId('poses'), alternatives.length > 0);
+}
+
+/** Marks a pose as the one shown; true when that changed something. */
+export function checkPose(index) {
+  const input = byId('pose-list').querySelectorAll('input')[index];
+  if (!input || input.checked) return false;
+  input.checked = true;
+  return true;
+}
+
+export function showFiles(api, artifacts) {
+  byId('files').replaceChildren(...artifacts.map(({ name, bytes: size }) => {
+    const link = el('a', { href: api.artifactUrl(name), download: name }, name);
+    if (api.token) link.onclick = (event) => saveWithToken(event, api, name);
+    return el('li', {}, link, el('span', { className: 'mono note' }, bytes(size)));
+  }));
+  show(byId('downloads'), artifacts.length > 0);
+}
+
+export function showJob(job, result) {
+  const engine = result?.engine ?? job.engine ?? {};
+  const inputs = Object.entries(job.inputs ?? {}).filter(([, value]) => typeof value === 'string' && value !== '');
+  fillFacts(byId('job-facts'), [
+    ['Id', mono(job.id ?? '')],
+    ['Kind', job.kind],
+    ['Attempts', String(job.attempts ?? job.attempt ?? '')],
+    ['Created', moment(job.created)],
+    ['Finished', moment(job.finished)],
+    ['Expires', moment(job.expires_at)],
+    ['Seed', mono(String(result?.seed ?? job.inputs?.seed ?? ''))],
+    ['Engine', typeof engine === 'string' ? engine : Object.values(engine).filter((value) => typeof value !== 'object').join(' · ')],
+    ...inputs.map(([name, value]) => [words(name), mono(value)]),
+  ].map(([term, value]) => [term, value instanceof Node && !value.textContent ? null : value]));
+  show(byId('about'));
+}
+
+// A plain link cannot carry the token, so the bytes come through fetch and are saved from memory.
+async function saveWithToken(event, api, name) {
+  event.preventDefault();
+  const url = URL.createObjectURL(new Blob([await api.artifact(name)]));
+  el('a', { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 60_000);
+}
+
+function totalSeconds(metrics) {
+  if (Number.isFinite(metrics.seconds_total)) return metrics.seconds_total;
+  const rows = secondsByPhase(metrics);
+  return rows.length ? rows.reduce((sum, row) => sum + row.seconds, 0) : NaN;
+}
+
+function shareBar(name, share) {
+  const fill = el('span', {});
+  fill.style.width = `${share * 100}%`;
+  return el('div', { className: 'share' }, el('span', {}, name), el('span', { className: 'mono' }, percent(share)),
+    el('span', { className: 'track', 'aria-hidden': 'true' }, fill));
+}
+
+const rowsAsText = (rows) => `[${rows.map((row) => `[${row.join(', ')}]`).join(',\n ')}]`;
+const mono = (text) => el('span', { className: 'mono' }, text);
+const figure = (value, note) => el('span', {}, el('strong', {}, value), el('small', {}, note));

@@ -1,0 +1,121 @@
+// The 3D view of one result: loads its clouds, wires the view's own controls, moves the object.
+
+import { Cloud, geometryFromPly, isColourful } from './cloud.js';
+import { wireBox } from './box.js';
+import { detectionOf } from './documents.js';
+import { byId, el, show } from './dom.js';
+import { residualHistogram } from './plot.js';
+import { readResiduals } from './residuals.js';
+import { between, inverse } from './sim3.js';
+import { Viewer } from './viewer.js';
+
+const FOCUS = ['after', 'before', 'box'];
+
+export class Stage {
+  constructor(api, names) {
+    this.api = api;
+    this.names = names;
+    this.pose = null; // T_scene_object of the moving object
+    this.residuals = null;
+    this.plain = {};
+  }
+
+  /** Fetches the clouds and shows them; frames as documents.js reads them. */
+  async open(job, result, frames) {
+    const [scene, object] = await Promise.all(['scene_points.ply', 'object_points.ply'].map((name) => this.api.artifact(name)));
+    this.plain.scene = new Cloud(geometryFromPly(scene), { seeThrough: true });
+    this.plain.after = new Cloud(geometryFromPly(object), { nearer: 0.6 });
+    show(byId('canvas'));
+    this.viewer = new Viewer(byId('canvas'), byId('gizmo'));
+    show(byId('gizmo'));
+    this.poses = frames.map((frame) => inverse(frame.pose));
+    this.addCloud('scene', this.plain.scene, 'cloud-scene');
+    this.addCloud('after', this.plain.after, 'cloud-after');
+    this.addBefore(frames.length > 1);
+    this.addBox(detectionOf(job, result));
+    this.moveTo(frames.length - 1);
+    this.wire();
+    this.viewer.look(FOCUS);
+    show(byId('tools'));
+  }
+
+  /** Shows the object at a position along the frames, fractions included. */
+  moveTo(position) {
+    const low = Math.min(Math.floor(position), this.poses.length - 1);
+    const high = Math.min(low + 1, this.poses.length - 1);
+    this.place(position > low ? between(this.poses[low], this.poses[high], position - low) : this.poses[low]);
+  }
+
+  /** T_scene_object: where the object stands in the scene. */
+  place(pose) {
+    this.pose = pose;
+    this.viewer?.layer('after').cloud.place(pose);
+    this.viewer?.invalidate();
+  }
+
+  addBefore(known) {
+    show(byId('before-chip'), known);
+    if (!known) return;
+    const before = new Cloud(this.plain.after.geometry, { opacity: 0.5, discs: 0.5 });
+    before.place(this.poses[0]);
+    this.addCloud('before', before, 'cloud-before');
+  }
+
+  addBox(box) {
+    show(byId('box-chip'), Boolean(box));
+    if (box) this.viewer.setLayer('box', { object: wireBox(box), tint: 'cloud-box' });
+  }
+
+  addCloud(name, cloud, tint) {
+    this.viewer.setLayer(name, { object: cloud.points, cloud, tint });
+  }
+
+  wire() {
+    for (const input of byId('layers').querySelectorAll('input')) {
+      input.onchange = () => this.viewer.setVisible(input.dataset.layer, input.checked);
+    }
+    byId('up').onchange = (event) => {
+      this.viewer.setUp(event.target.value);
+      this.viewer.look(this.viewer.looking);
+    };
+    byId('size').oninput = (event) => this.viewer.setPointFactor(Number(event.target.value));
+    byId('frame-object').onclick = () => this.viewer.look(FOCUS);
+    byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'scene']);
+    byId('colour').onchange = (event) => this.colourBy(event.target.value);
+    this.offer('residual', this.names.includes('residuals.npz'));
+    this.offer('file', Object.values(this.plain).some((cloud) => isColourful(cloud.geometry)));
+  }
+
+  offer(value, available) {
+    const option = byId('colour').querySelector(`option[value="${value}"]`);
+    option.hidden = !available;
+    option.disabled = !available;
+  }
+
+  async colourBy(mode) {
+    const residuals = mode === 'residual' ? await this.loadResiduals() : null;
+    if (mode === 'residual' && !residuals) return;
+    const clouds = residuals ? { scene: residuals.scene, after: residuals.object } : this.plain;
+    for (const [name, cloud] of Object.entries(clouds)) {
+      if (!cloud) continue;
+      if (!residuals) cloud.colourBy(mode);
+      this.addCloud(name, cloud, `cloud-${name}`);
+    }
+    this.place(this.pose);
+    show(byId('legend'), Boolean(residuals));
+  }
+
+  async loadResiduals() {
+    if (this.residuals) return this.residuals;
+    try {
+      this.residuals = await readResiduals(await this.api.artifact('residuals.npz'), this.plain);
+      byId('legend-plot').replaceChildren(residualHistogram(this.residuals.sizes, this.residuals.top));
+      return this.residuals;
+    } catch (error) {
+      this.offer('residual', false);
+      byId('colour').value = 'layer';
+      byId('colour').after(el('span', { className: 'note', role: 'status' }, `No residuals: ${error.message}`));
+      return null;
+    }
+  }
+}
