@@ -1,0 +1,111 @@
+"""A child process that gets a request, a deadline and little room to talk; whatever it does, this side returns."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import selectors
+import signal
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Literal
+
+_MAX_OUTPUT = 64 * 1024
+"""Bytes of standard output and of standard error that are kept; a child that says more is ended."""
+
+
+Stopped = Literal["late", "talkative"]
+
+
+@dataclass(frozen=True)
+class ChildOutcome:
+    """How the child ended: by ``exit_status`` or by ``signal``, and why this side stopped it, if it did."""
+
+    exit_status: int | None
+    signal: int | None
+    stopped: Stopped | None
+    stdout: bytes
+    stderr: bytes
+    cpu_seconds: float
+
+
+def run_child(
+    command: list[str], request: bytes, folder: Path, environment: dict[str, str], wall_s: float
+) -> ChildOutcome:
+    """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds.
+
+    The child leads a process group of its own; at the end the whole group is killed, whatever became of the child.
+    ``request`` must fit into a pipe (64 KiB).
+    """
+    deadline = time.monotonic() + wall_s
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        close_fds=True,
+    )
+    stopped: Stopped | None = "late"
+    said = (bytearray(), bytearray())
+    try:
+        with contextlib.suppress(BrokenPipeError):
+            _pipe(process.stdin).write(request)
+            _pipe(process.stdin).close()
+        stopped = _listen((_pipe(process.stdout), _pipe(process.stderr)), said, deadline)
+        if stopped is None and not _exits_by(process.pid, deadline):
+            stopped = "late"
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = code = os.waitstatus_to_exitcode(status)
+        for stream in (process.stdin, process.stdout, process.stderr):
+            with contextlib.suppress(BrokenPipeError):
+                _pipe(stream).close()
+    return ChildOutcome(
+        exit_status=code if code >= 0 else None,
+        signal=-code if code < 0 else None,
+        stopped=stopped,
+        stdout=bytes(said[0]),
+        stderr=bytes(said[1]),
+        cpu_seconds=usage.ru_utime + usage.ru_stime,
+    )
+
+
+def _listen(streams: tuple[IO[bytes], IO[bytes]], said: tuple[bytearray, bytearray], deadline: float) -> Stopped | None:
+    """Collect in ``said`` what the child says until it closes both streams; otherwise tell why it should be stopped."""
+    with selectors.DefaultSelector() as selector:
+        for stream, words in zip(streams, said, strict=True):
+            selector.register(stream.fileno(), selectors.EVENT_READ, words)
+        while selector.get_map():
+            ready = selector.select(max(deadline - time.monotonic(), 0.0))
+            if not ready:
+                return "late"
+            for key, _ in ready:
+                chunk = os.read(key.fd, _MAX_OUTPUT)
+                key.data.extend(chunk)
+                if len(key.data) > _MAX_OUTPUT:
+                    return "talkative"
+                if not chunk:
+                    selector.unregister(key.fd)
+    return None
+
+
+def _exits_by(pid: int, deadline: float) -> bool:
+    """Whether the child, which has closed its streams, ends by itself in time. Its status stays to be collected."""
+    while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def _pipe(stream: IO[bytes] | None) -> IO[bytes]:
+    if stream is None:
+        raise RuntimeError("the child was started without pipes")
+    return stream

@@ -1,0 +1,127 @@
+"""The conversion itself, run in a throw-away process: ``python -m regnf_core.importing.convert UPLOAD OUT_DIR``.
+
+Standard input holds one JSON object {"description", "limits", "parent_pid"}; standard output gets one JSON line: the
+report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import mmap
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.report import ImportLimits
+from regnf_core.importing.sandbox import confine
+from regnf_core.importing.sniff import HEAD_BYTES, explain_refusal, sniff_format
+
+if TYPE_CHECKING:
+    from regnf_core.importing.families.converted import ConvertedField
+
+FIELD_NAME = "field.safetensors"
+_OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
+
+
+def convert_file(
+    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits
+) -> dict[str, Any]:
+    """Convert ``upload``, write the safe field and evaluate it once. Returns the report's values.
+
+    Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
+    """
+    from regnf_core.fields.safe_format import open_field, write_safe_field
+    from regnf_core.importing.plausibility import check_plausibility
+
+    converted = _convert(upload, description, limits.tensor_bytes)
+    target = out_dir / FIELD_NAME
+    write_safe_field(target, converted.description, converted.tensors)
+    parameters = sum(array.size for array in converted.tensors.values())
+    family, why, warnings = converted.family, converted.why, converted.warnings
+    bounds, label = converted.description["bounds"], converted.description["label"]
+    del converted  # the tensors are on disk: let go of them before the evaluation
+    figures, more = check_plausibility(open_field(target))
+    return {
+        "family": family,
+        "why": why,
+        "bounds": bounds,
+        "parameters": parameters,
+        "plausibility": figures,
+        "warnings": [*warnings, *more],
+        "label": label,
+    }
+
+
+def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int) -> ConvertedField:
+    from regnf_core.importing.container import read_archive
+    from regnf_core.importing.families import convert_checkpoint
+    from regnf_core.importing.families.safe_field import convert_safe_field
+    from regnf_core.importing.pickle_reader import read_pickle
+    from regnf_core.importing.tensors import TensorSource
+    from regnf_core.importing.upload_description import UploadDescription
+
+    wanted = UploadDescription.from_dict(description)
+    data = _mapped(upload)
+    head = bytes(data[:HEAD_BYTES])
+    kind = sniff_format(head)
+    if kind == "torch-zip":
+        archive = read_archive(data)
+        return convert_checkpoint(read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes), wanted)
+    if kind == "safetensors":
+        return convert_safe_field(upload, data, tensor_bytes, wanted)
+    reason, detail = explain_refusal(head)
+    raise FieldFormatError(detail, reason=reason)
+
+
+def _mapped(upload: Path) -> memoryview:
+    with open(upload, "rb") as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            return memoryview(b"")
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+
+def run(upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits) -> dict[str, Any]:
+    """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
+    try:
+        return convert_file(upload, out_dir, description, limits)
+    except FieldFormatError as error:
+        return {"reason": error.reason, "detail": str(error)}
+    except MemoryError:
+        return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": "the conversion needs more memory than it may have"}
+    except OSError as error:
+        if error.errno == errno.ENOMEM:
+            return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": "the conversion needs more memory than it may have"}
+        if error.errno not in _OUTPUT_ERRORS:
+            raise
+        return {"reason": _OUTPUT_ERRORS[error.errno], "detail": os.strerror(error.errno)}
+
+
+def main(arguments: list[str]) -> int:
+    """The process: confine, convert, report."""
+    request = json.load(sys.stdin)
+    limits = ImportLimits(**request["limits"])
+    isolation = confine(limits, request["parent_pid"])
+    upload, out_dir = map(Path, arguments)
+    report = run(upload, out_dir, request["description"], limits)
+    report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
+    sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
+    sys.stdout.flush()
+    return 0
+
+
+def _peak_memory() -> int:
+    """Largest resident size of this process, bytes, the touched part of the mapped upload included.
+
+    Linux's own figure for this program image: getrusage would count what the parent held when it forked.
+    """
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

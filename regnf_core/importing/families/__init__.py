@@ -1,0 +1,46 @@
+"""The families of checkpoints that the gate recognises: one module a family, listed in ``FAMILIES``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families import sdfstudio, unsupported
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.pickle_values import GlobalRef, Placeholder
+from regnf_core.importing.tensors import TensorSource
+from regnf_core.importing.upload_description import UploadDescription
+
+Family = Callable[[dict[Any, Any], TensorSource, UploadDescription], ConvertedField | None]
+"""Takes a checkpoint's top-level dictionary. Returns None unless it is the family's; raises FieldFormatError if it is
+but cannot be taken."""
+
+FAMILIES: tuple[Family, ...] = (sdfstudio.convert, unsupported.refuse)
+
+_SHOWN_KEYS = 8
+
+
+def convert_checkpoint(checkpoint: Any, source: TensorSource, description: UploadDescription) -> ConvertedField:
+    """The checkpoint's signed distance field. Everything the field does not need is left behind.
+
+    Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, FIELD_NOT_RECOGNISED, FAMILY_NOT_SUPPORTED, and what the family
+    raises.
+    """
+    if isinstance(checkpoint, (Placeholder, GlobalRef)):
+        message = f"the file holds an object of {checkpoint.full_name}, not weights; save its state_dict() instead"
+        raise FieldFormatError(message, reason="UNSAFE_GLOBAL_IN_WEIGHTS")
+    if isinstance(checkpoint, dict):
+        for family in FAMILIES:
+            converted = family(checkpoint, source, description)
+            if converted is not None:
+                return converted
+    raise FieldFormatError(f"no known family of fields; {_contents(checkpoint)}", reason="FIELD_NOT_RECOGNISED")
+
+
+def _contents(checkpoint: object) -> str:
+    """A few words on what is there instead, never a value's own text."""
+    if not isinstance(checkpoint, dict):
+        return f"the file holds a {type(checkpoint).__name__}"
+    keys = [key[:40] for key in checkpoint if isinstance(key, str) and key.isprintable()][:_SHOWN_KEYS]
+    return f"its first keys are {keys}"

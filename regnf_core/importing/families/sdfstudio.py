@@ -1,0 +1,160 @@
+"""neus-facto and its kin as sdfstudio and nerfstudio save them: a hash grid and a small network under ``_model.field.``
+
+The two trainers write the same keys and shapes for different functions: nerfstudio multiplies the sines' argument by
+2 pi and contracts space for the grid alone. Only sdfstudio's field has a ``laplace_density``, which decides; the
+uploader may overrule. Training state, colour, background, proposal networks and image losses are left behind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.description import SKIP_LAYER
+from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.geometry_layers import GeometryLayers, count_layers, read_layers
+from regnf_core.importing.families.grid_search import GridHabits, find_grid
+from regnf_core.importing.pickle_values import GlobalRef, Placeholder
+from regnf_core.importing.tensors import TensorSource, as_tensor, lookup, require_shape
+from regnf_core.importing.upload_description import UploadDescription
+
+_PREFIXES = ("_model.field.", "_model.module.field.")
+_DEGREE = 6
+_PLAIN_WIDTH = 3 + 6 * _DEGREE
+_FACTO = GridHabits((2, 4, 8, 1), ((16, 2048), (16, 1024), (16, 4096), (32, 2048), (16, 512), (64, 4096)), "smoothstep")
+_ANGELO = GridHabits((8, 4, 2, 1), ((64, 4096), (32, 4096), (16, 4096), (16, 2048), (32, 2048), (16, 512)), "linear")
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """One function behind the shared keys."""
+
+    name: str
+    two_pi: bool
+    contraction: str
+    habits: GridHabits
+
+
+_VARIANTS = {
+    variant.name: variant
+    for variant in (
+        _Variant("sdfstudio_neus_facto", False, "none", _FACTO),
+        _Variant("sdfstudio_neus_facto_angelo", False, "none", _ANGELO),
+        _Variant("sdfstudio_neus", False, "none", _FACTO),
+        _Variant("nerfstudio_neus_facto", True, "linf_grid", _FACTO),
+    )
+}
+
+
+def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+    """The signed distance field of such a checkpoint, or None where the keys are not theirs.
+
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNISED and what
+    TensorSource raises.
+    """
+    pipeline = checkpoint.get("pipeline")
+    if isinstance(pipeline, (Placeholder, GlobalRef)):
+        as_tensor("pipeline", pipeline)
+    if not isinstance(pipeline, dict):
+        return None
+    prefix = next((p for p in _PREFIXES if any(_has_prefix(key, p + "glin") for key in pipeline)), None)
+    if prefix is None:
+        return None
+    state = {key.removeprefix(prefix): value for key, value in pipeline.items() if _has_prefix(key, prefix)}
+    count = count_layers(state)
+    variant, why = _tell_variant(state, count, wanted)
+    evidence = (f"keys {prefix}glin*, {count} layers", why)
+    return _assemble(state, read_layers(state, source), variant, evidence, source, wanted)
+
+
+def _has_prefix(key: object, prefix: str) -> bool:
+    return isinstance(key, str) and key.startswith(prefix)
+
+
+def _tell_variant(state: dict[str, Any], layers: int, wanted: UploadDescription) -> tuple[_Variant, str]:
+    if wanted.family is not None:
+        if wanted.family not in _VARIANTS:
+            message = f"the file is one of {sorted(_VARIANTS)}, the description says {wanted.family}"
+            raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+        return _VARIANTS[wanted.family], "the description names the family"
+    if not any(key.startswith("laplace_density.") for key in state):
+        return _VARIANTS["nerfstudio_neus_facto"], "no laplace_density: nerfstudio, not sdfstudio"
+    name = "sdfstudio_neus_facto"
+    if layers == 2:
+        name = "sdfstudio_neus_facto_angelo"
+    elif layers > SKIP_LAYER:
+        name = "sdfstudio_neus"
+    return _VARIANTS[name], "laplace_density: sdfstudio, not nerfstudio"
+
+
+def _assemble(
+    state: dict[str, Any],
+    layers: GeometryLayers,
+    variant: _Variant,
+    why: tuple[str, ...],
+    source: TensorSource,
+    wanted: UploadDescription,
+) -> ConvertedField:
+    warnings: list[str] = []
+    if layers.input_width <= _PLAIN_WIDTH:
+        message = f"{layers.input_width} inputs; expected {_PLAIN_WIDTH} of the position and those of a hash grid"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    table = source.array("encoding.params", lookup(state, "encoding.params"))
+    require_shape("encoding.params", table, (None,))
+    uses_grid = layers.uses_columns(_PLAIN_WIDTH, None)
+    grid = _grid(table.size, layers.input_width - _PLAIN_WIDTH, uses_grid, variant, wanted, warnings)
+    tensors = layers.tensors()
+    if uses_grid:
+        tensors["hash_table"] = table.reshape(-1, grid.features_per_level)
+    uses_sines = layers.uses_columns(3, _PLAIN_WIDTH)
+    description = {
+        "family": "neus_facto",
+        "bounds": _bounds(state, source, warnings),
+        "hash": _as_dict(grid),
+        "positional_encoding": {"degree": _DEGREE, "two_pi": variant.two_pi, "used": uses_sines},
+        "use_grid": uses_grid,
+        "contraction": wanted.contraction or variant.contraction,
+        "level_mask": wanted.level_mask,
+        "label": wanted.label,
+        "source": {"family": variant.name},
+    }
+    return ConvertedField(variant.name, why, description, tensors, tuple(warnings))
+
+
+def _grid(
+    size: int, width: int, used: bool, variant: _Variant, wanted: UploadDescription, warnings: list[str]
+) -> HashGridConfig:
+    try:
+        found = find_grid(size, width, variant.habits, wanted.hash)
+    except FieldFormatError:
+        if used or width > 32:
+            raise
+        return HashGridConfig(levels=width, features_per_level=1)  # stands for the columns alone: no table is kept
+    if used and found.ambiguous:
+        warnings.append("HASH_GRID_AMBIGUOUS: other resolutions give a table of this size; describe it under 'hash'")
+    return found.config
+
+
+def _as_dict(grid: HashGridConfig) -> dict[str, Any]:
+    return {
+        "levels": grid.levels,
+        "features_per_level": grid.features_per_level,
+        "log2_table_size": grid.log2_table_size,
+        "base_resolution": grid.base_resolution,
+        "per_level_scale": grid.per_level_scale,
+        "resolutions": list(grid.resolutions) if grid.resolutions is not None else None,
+        "interpolation": grid.interpolation,
+    }
+
+
+def _bounds(state: dict[str, Any], source: TensorSource, warnings: list[str]) -> list[list[float]]:
+    if "aabb" not in state:
+        warnings.append("BOUNDS_ASSUMED: the checkpoint has no aabb; [-1, 1] is assumed along every axis")
+        return [[-1.0] * 3, [1.0] * 3]
+    box = source.array("aabb", state["aabb"])
+    require_shape("aabb", box, (2, 3))
+    if not (box[0] < box[1]).all():
+        raise FieldFormatError("the aabb is empty", reason="BOUNDS_INVALID")
+    return [[float(v) for v in corner] for corner in box]

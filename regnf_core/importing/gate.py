@@ -1,0 +1,156 @@
+"""The gate's outer side: runs one conversion in a process of its own and believes nothing but what it checks itself."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import mmap
+import os
+import re
+import shutil
+import signal
+import stat
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.child import ChildOutcome, run_child
+from regnf_core.importing.report import ImportLimits, ImportReport
+from regnf_core.importing.safetensors_header import read_header
+
+__all__ = ["FIELD_NAME", "ImportLimits", "ImportReport", "import_field"]
+
+FIELD_NAME = "field.safetensors"
+"""The name of the safe field file in the output folder."""
+
+_ROOT = Path(__file__).resolve().parents[2]
+_ENTRY = """
+import sys
+if sys.argv[1] not in sys.path:
+    sys.path.insert(0, sys.argv[1])
+from regnf_core.importing.convert import main
+sys.exit(main(sys.argv[2:]))
+"""
+_REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
+_MAX_DETAIL = 500
+_MAX_DESCRIPTION = 16_384
+_log = logging.getLogger(__name__)
+
+
+def import_field(
+    upload: Path, out_dir: Path, description: dict[str, Any] | None = None, limits: ImportLimits | None = None
+) -> ImportReport:
+    """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
+
+    description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
+    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little.
+
+    Raises FieldFormatError with the reason (docs/import-gate.md lists them), and OSError when the disk is full.
+    """
+    limits = limits or ImportLimits()
+    request = _request(description, limits)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
+    try:
+        started = time.monotonic()
+        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload.resolve()), str(work.resolve())]
+        outcome = run_child(command, request, work, _environment(limits), limits.wall_s)
+        values = _judge(outcome)
+        report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
+        os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
+        return report
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _request(description: dict[str, Any] | None, limits: ImportLimits) -> bytes:
+    try:
+        request = {"description": description, "limits": asdict(limits), "parent_pid": os.getpid()}
+        text = json.dumps(request, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+    if len(text) > _MAX_DESCRIPTION:
+        raise FieldFormatError("the description is too long", reason="INVALID_DESCRIPTION")
+    return text
+
+
+def _environment(limits: ImportLimits) -> dict[str, str]:
+    """All the child gets to see of the environment: no secret lives in these names."""
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, str(limits.threads))}
+
+
+def _judge(outcome: ChildOutcome) -> dict[str, Any]:
+    """The report's values, or the error that the child's end stands for."""
+    if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
+        raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
+    if outcome.stopped is None and outcome.signal == signal.SIGKILL:  # not ours: the kernel's, for want of memory
+        raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY")
+    values = _parse(outcome.stdout) if outcome.exit_status == 0 else None
+    if values is None:
+        if b"MemoryError" in outcome.stderr or b"DefaultCPUAllocator" in outcome.stderr:
+            raise FieldFormatError("the import needs more memory than it may have", reason="IMPORT_OUT_OF_MEMORY")
+        _log.error("import process failed (%s): %s", outcome, outcome.stderr[-4000:].decode("utf-8", "replace"))
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
+    reason = values.get("reason")
+    if reason is None:
+        return values
+    if not isinstance(reason, str) or not _REASON.fullmatch(reason):
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
+    detail = "".join(c for c in str(values.get("detail"))[:_MAX_DETAIL] if c.isprintable())
+    if reason == "STORAGE_FULL":
+        raise OSError(errno.ENOSPC, detail)
+    raise FieldFormatError(detail, reason=reason)
+
+
+def _parse(stdout: bytes) -> dict[str, Any] | None:
+    try:
+        values = json.loads(stdout)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def _report(
+    values: dict[str, Any], outcome: ChildOutcome, limits: ImportLimits, field: Path, seconds: float
+) -> ImportReport:
+    """The report from the child's own words and this side's measurements, after a look at the file it left."""
+    try:
+        size = _checked_size(field, limits.file_bytes)
+        lower, upper = ((float(x), float(y), float(z)) for x, y, z in values["bounds"])
+        return ImportReport(
+            family=str(values["family"]),
+            why=tuple(map(str, values["why"])),
+            bounds=(lower, upper),
+            parameters=int(values["parameters"]),
+            plausibility={str(key): float(value) for key, value in values["plausibility"].items()},
+            warnings=tuple(map(str, values["warnings"])),
+            label=None if values["label"] is None else str(values["label"]),
+            field_bytes=size,
+            seconds=round(seconds, 3),
+            cpu_seconds=round(outcome.cpu_seconds, 3),
+            peak_memory_bytes=int(values["peak_memory_bytes"]),
+            isolation={str(key): bool(value) for key, value in values["isolation"].items()},
+        )
+    except (KeyError, TypeError, ValueError, AttributeError, OSError, FieldFormatError) as error:
+        _log.error("import process left no usable result: %r", error)
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED") from error
+
+
+def _checked_size(field: Path, most: int) -> int:
+    """The file's size, if it is a plain file of its own (no link) with a sound safetensors header."""
+    found = field.lstat()
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= most:
+        raise ValueError("the import left something else than a plain file")
+    with open(field, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        data = memoryview(mapped)
+        try:
+            read_header(data)
+        finally:
+            data.release()
+    return found.st_size

@@ -1,0 +1,89 @@
+"""Does a converted field behave like a signed distance field? Evaluated once; the figures go with the field."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.base import SdfField
+
+_SAMPLES = 16_384
+_NEAREST = 1_024
+_STEPS = 8
+_SURFACE_SHARE = 1e-3
+"""A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
+_GRADIENT_RANGE = (0.5, 2.0)
+
+
+def check_plausibility(field: SdfField, seed: int = 0) -> tuple[dict[str, float], list[str]]:
+    """Figures of the field, and warnings: share_inside, surface_points, gradient_p10, gradient_median, gradient_p90.
+
+    Points are drawn uniformly in the bounds; those of least |distance| walk down to the surface along the gradient.
+    Raises FieldFormatError: FIELD_NOT_FINITE, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
+    """
+    lower, upper = field.bounds[0].float(), field.bounds[1].float()
+    generator = torch.Generator().manual_seed(seed)
+    points = lower + (upper - lower) * torch.rand(_SAMPLES, 3, generator=generator)  # (N, 3)
+    distance = field.signed_distance(points)
+    _require_finite(distance)
+    nearest = points[distance.abs().argsort()[:_NEAREST]]
+    norms, signs = _walk_to_surface(field, nearest, (lower, upper))
+    inside = distance < 0
+    both_sides = bool(inside.any() or (signs < 0).any()) and bool((~inside).any() or (signs > 0).any())
+    if not both_sides or norms.numel() == 0:
+        raise FieldFormatError("the field has no surface within its bounds", reason="NO_ZERO_LEVEL")
+    low, median, high = torch.quantile(norms, torch.tensor([0.1, 0.5, 0.9])).tolist()
+    figures = {
+        "share_inside": float(inside.float().mean()),
+        "surface_points": float(norms.numel()),
+        "gradient_p10": low,
+        "gradient_median": median,
+        "gradient_p90": high,
+    }
+    return figures, _warnings(figures)
+
+
+def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Gradient norms (M,) where the walk ended on the surface, and the signs (K,) that the walk met on its way.
+
+    Newton steps of at most a twentieth of the diagonal, kept within the bounds.
+    """
+    diagonal = float((box[1] - box[0]).norm())
+    signs = []
+    for _ in range(_STEPS):
+        distance, gradient = _evaluate(field, points)
+        signs.append(distance.sign())
+        squared = gradient.square().sum(dim=-1).clamp_min(1e-12)
+        step = gradient * (distance / squared).unsqueeze(-1)
+        too_long = (step.norm(dim=-1, keepdim=True) / (diagonal / 20)).clamp_min(1.0)
+        points = torch.minimum(torch.maximum(points - step / too_long, box[0]), box[1])
+    distance, gradient = _evaluate(field, points)
+    signs.append(distance.sign())
+    norms = gradient.norm(dim=-1)
+    # Where the gradient vanishes |distance| says nothing about how near the surface is.
+    on_surface = (distance.abs() < _SURFACE_SHARE * diagonal * norms.clamp_max(1.0)) & (norms > 1e-6)
+    return norms[on_surface], torch.cat(signs)
+
+
+def _evaluate(field: SdfField, points: Tensor) -> tuple[Tensor, Tensor]:
+    distance, gradient = field.signed_distance_and_gradient(points)
+    _require_finite(distance)
+    _require_finite(gradient)
+    return distance, gradient
+
+
+def _require_finite(values: Tensor) -> None:
+    if not torch.isfinite(values).all():
+        raise FieldFormatError("the field gives numbers that are not finite", reason="FIELD_NOT_FINITE")
+
+
+def _warnings(figures: dict[str, float]) -> list[str]:
+    warnings = []
+    median = figures["gradient_median"]
+    if not _GRADIENT_RANGE[0] <= median <= _GRADIENT_RANGE[1]:
+        text = f"the gradient's norm at the surface is {median:.2f}, not about 1: is the family or the grid another?"
+        warnings.append(f"GRADIENT_NOT_UNIT: {text}")
+    if figures["share_inside"] > 0.9:
+        warnings.append("MOSTLY_INSIDE: over nine tenths of the bounds are inside matter: is the sign swapped?")
+    return warnings
