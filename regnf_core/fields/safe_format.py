@@ -1,6 +1,6 @@
 """regnf's own field file: safetensors with a JSON description. Nothing in it can run, and every shape is checked first.
 
-Writing and reading the description need no torch; :func:`open_field` loads it. docs/safe-format.md lays the format down.
+Writing and reading the description need no torch; :func:`open_field` loads it. The format is in docs/safe-format.md.
 """
 
 from __future__ import annotations

@@ -1,0 +1,1 @@
+"""Fitting a neural field to an exact one."""

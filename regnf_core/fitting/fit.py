@@ -1,0 +1,161 @@
+"""Fitting a neus-facto field to an exact signed distance field."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.safe_format import open_field, write_safe_field
+from regnf_core.fitting.network import DEGREE, TrainableField
+from regnf_core.fitting.options import FitOptions, FitProgress, FitReport
+from regnf_core.fitting.samples import (
+    ExactSamples,
+    diagonal,
+    near_samples,
+    padded_bounds,
+    volume_samples,
+)
+
+_CHECK_POINTS = 20_000
+_REPORT_EVERY = 50
+_GRID_RADIUS = 2.0
+
+
+def fit_mesh(mesh_path: str | os.PathLike[str], path: str | os.PathLike[str], **arguments: Any) -> FitReport:
+    """Fit a field to the mesh in ``mesh_path`` and write it to ``path``; ``arguments`` are those of :func:`fit_field`."""
+    return fit_field(MeshField.load(mesh_path), path, **arguments)
+
+
+def fit_field(
+    target: SdfField,
+    path: str | os.PathLike[str],
+    options: FitOptions | None = None,
+    seed: int = 0,
+    progress: FitProgress | None = None,
+    label: str | None = None,
+    source: dict[str, Any] | None = None,
+) -> FitReport:
+    """Fit a field to ``target``, write it to ``path`` in the safe format, and say how well it agrees.
+
+    The target's frame is kept: its padded bounds must lie within [-2, 2]^3, the hash grid's cube. Deterministic for
+    ``seed`` on one machine. Raises InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET).
+    """
+    options = options or FitOptions()
+    bounds = padded_bounds(target, options.padding)
+    if bounds.abs().max() > _GRID_RADIUS:
+        raise InvalidInputError(
+            "the target with its padding reaches beyond [-2, 2]: scale it down", reason="TARGET_OUTSIDE_GRID"
+        )
+    started = time.monotonic()
+    rng = np.random.default_rng(seed)
+    near = near_samples(target, options.near_points, options.noise, rng)
+    volume = volume_samples(target, options.volume_points, options.padding, rng)
+    trained = _train(target, near, volume, options, seed, progress)
+    write_safe_field(path, _description(options, bounds, label, source or {}), trained.tensors())
+    return measure_fit(open_field(path), target, options, seed + 1, time.monotonic() - started)
+
+
+def measure_fit(field: SdfField, target: SdfField, options: FitOptions, seed: int, seconds: float) -> FitReport:
+    """How well ``field`` agrees with ``target`` on fresh points, drawn as the options say."""
+    rng = np.random.default_rng(seed)
+    near = near_samples(target, _CHECK_POINTS, options.noise, rng)
+    volume = volume_samples(target, _CHECK_POINTS, options.padding, rng)
+    size = diagonal(target)
+    distance, gradient = field.signed_distance_and_gradient(near.points)
+    error = (distance - near.distances).abs() / size
+    norm = gradient.norm(dim=-1)
+    cosine = (gradient * near.gradients).sum(dim=-1) / norm.clamp_min(1e-9)
+    return FitReport(
+        mean_error=float(error.mean()),
+        p95_error=float(error.quantile(0.95)),
+        max_error=float(error.max()),
+        volume_mean_error=float((field.signed_distance(volume.points) - volume.distances).abs().mean()) / size,
+        mean_gradient_norm=float(norm.mean()),
+        mean_normal_cosine=float(cosine.mean()),
+        diagonal=size,
+        iterations=options.iterations,
+        seconds=seconds,
+    )
+
+
+def _train(
+    target: SdfField,
+    near: ExactSamples,
+    volume: ExactSamples,
+    options: FitOptions,
+    seed: int,
+    progress: FitProgress | None,
+) -> TrainableField:
+    generator = torch.Generator().manual_seed(seed)
+    size = diagonal(target)
+    network = TrainableField(options, radius=size / 4.0, generator=generator)
+    optimiser = torch.optim.Adam(
+        [
+            {"params": [network.table], "lr": options.table_rate, "eps": 1e-15},
+            {"params": [*network.weights, *network.biases], "lr": options.network_rate},
+        ],
+        betas=(0.9, 0.99),
+        fused=True,
+    )
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.iterations)
+    for group, base in zip(optimiser.param_groups, schedule.base_lrs, strict=True):
+        group["floor"] = base * options.final_rate
+    started = time.monotonic()
+    for iteration in range(1, options.iterations + 1):
+        loss = _loss(network, near, volume, options, size, generator)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if progress is not None and (iteration % _REPORT_EVERY == 0 or iteration == options.iterations):
+            spent = time.monotonic() - started
+            progress(iteration, float(loss), spent / iteration * (options.iterations - iteration))
+    return network
+
+
+def _loss(
+    network: TrainableField,
+    near: ExactSamples,
+    volume: ExactSamples,
+    options: FitOptions,
+    size: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Mean |distance error| in diagonals, plus the weighted squared error of the gradient near the surface."""
+    function = network.function()
+    shares = (2 * options.batch // 3, options.batch - 2 * options.batch // 3)
+    values = [
+        s.take(torch.randint(len(s), (n,), generator=generator)) for s, n in zip((near, volume), shares, strict=True)
+    ]
+    points = torch.cat([v.points for v in values])
+    expected = torch.cat([v.distances for v in values])
+    loss = (function.value(points) - expected).abs().mean() / size
+    if options.gradient_batch > 0:
+        slopes = near.take(torch.randint(len(near), (options.gradient_batch,), generator=generator))
+        distance, gradient = function.value_and_gradient(slopes.points)
+        loss = loss + (distance - slopes.distances).abs().mean() / size
+        loss = loss + options.gradient_weight * (gradient - slopes.gradients).square().sum(dim=-1).mean()
+    return loss
+
+
+def _description(options: FitOptions, bounds: Tensor, label: str | None, source: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "family": "neus_facto",
+        "hash": asdict(options.grid),
+        "positional_encoding": {"degree": DEGREE, "two_pi": False},
+        "use_grid": True,
+        "contraction": "none",
+        "level_mask": None,
+        "bounds": bounds.tolist(),
+        "label": label,
+        "source": source,
+    }
