@@ -31,7 +31,7 @@ _GRID_RADIUS = 2.0
 
 
 def fit_mesh(mesh_path: str | os.PathLike[str], path: str | os.PathLike[str], **arguments: Any) -> FitReport:
-    """Fit a field to the mesh in ``mesh_path`` and write it to ``path``; ``arguments`` are those of :func:`fit_field`."""
+    """Fit a field to the mesh in ``mesh_path`` and write it to ``path``; the rest as for :func:`fit_field`."""
     return fit_field(MeshField.load(mesh_path), path, **arguments)
 
 
@@ -106,9 +106,7 @@ def _train(
         betas=(0.9, 0.99),
         fused=True,
     )
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, options.iterations)
-    for group, base in zip(optimiser.param_groups, schedule.base_lrs, strict=True):
-        group["floor"] = base * options.final_rate
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, options.rate_share)
     started = time.monotonic()
     for iteration in range(1, options.iterations + 1):
         loss = _loss(network, near, volume, options, size, generator)
@@ -118,7 +116,7 @@ def _train(
         schedule.step()
         if progress is not None and (iteration % _REPORT_EVERY == 0 or iteration == options.iterations):
             spent = time.monotonic() - started
-            progress(iteration, float(loss), spent / iteration * (options.iterations - iteration))
+            progress(iteration, float(loss.detach()), spent / iteration * (options.iterations - iteration))
     return network
 
 
@@ -132,19 +130,21 @@ def _loss(
 ) -> Tensor:
     """Mean |distance error| in diagonals, plus the weighted squared error of the gradient near the surface."""
     function = network.function()
-    shares = (2 * options.batch // 3, options.batch - 2 * options.batch // 3)
-    values = [
-        s.take(torch.randint(len(s), (n,), generator=generator)) for s, n in zip((near, volume), shares, strict=True)
-    ]
-    points = torch.cat([v.points for v in values])
-    expected = torch.cat([v.distances for v in values])
-    loss = (function.value(points) - expected).abs().mean() / size
+    from_volume = options.batch // 3
+    close = _draw(near, options.batch - from_volume, generator)
+    far = _draw(volume, from_volume, generator)
+    values = function.value(torch.cat((close.points, far.points)))
+    loss = (values - torch.cat((close.distances, far.distances))).abs().mean() / size
     if options.gradient_batch > 0:
-        slopes = near.take(torch.randint(len(near), (options.gradient_batch,), generator=generator))
+        slopes = _draw(near, options.gradient_batch, generator)
         distance, gradient = function.value_and_gradient(slopes.points)
         loss = loss + (distance - slopes.distances).abs().mean() / size
         loss = loss + options.gradient_weight * (gradient - slopes.gradients).square().sum(dim=-1).mean()
     return loss
+
+
+def _draw(samples: ExactSamples, count: int, generator: torch.Generator) -> ExactSamples:
+    return samples.take(torch.randint(len(samples), (count,), generator=generator))
 
 
 def _description(options: FitOptions, bounds: Tensor, label: str | None, source: dict[str, Any]) -> dict[str, Any]:

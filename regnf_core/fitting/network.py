@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any
 
@@ -35,7 +36,7 @@ class TrainableField(nn.Module):
         encoding = PositionalEncoding(DEGREE)
         widths = [3 + encoding.width + grid.width] + [options.hidden_width] * options.hidden_layers
         weights, biases = [], []
-        for columns, rows in zip(widths[:-1], widths[1:], strict=True):
+        for columns, rows in itertools.pairwise(widths):
             weights.append(torch.randn(rows, columns, generator=generator) * math.sqrt(2.0 / rows))
             biases.append(torch.zeros(rows))
         weights[0][:, 3 : 3 + encoding.width] = 0.0

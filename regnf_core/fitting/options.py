@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from regnf_core.fields.hash_grid_config import HashGridConfig
 
 FitProgress = Callable[[int, float, float], None]
-"""Called now and then with the iteration, the loss there, and an estimate of the seconds left. May raise to stop the fit."""
+"""Called now and then with the iteration, its loss and an estimate of the seconds left. May raise to stop the fit."""
 
 
 def _default_grid() -> HashGridConfig:
@@ -48,10 +49,15 @@ class FitOptions:
     half_table: bool = True
     """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
 
+    def rate_share(self, iteration: int) -> float:
+        """What is left of the learning rates at ``iteration``: a cosine from 1 down to ``final_rate``."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(iteration / self.iterations, 1.0)))
+        return self.final_rate + (1.0 - self.final_rate) * cosine
+
 
 @dataclass(frozen=True)
 class FitReport:
-    """How well a field agrees with the exact one, on fresh points near the surface. Errors are shares of the diagonal."""
+    """How well a field agrees with the exact one, on fresh points near the surface; errors in diagonals."""
 
     mean_error: float
     p95_error: float

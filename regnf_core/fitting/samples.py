@@ -64,7 +64,7 @@ def _measure(target: SdfField, points: NDArray[np.float64]) -> ExactSamples:
 
 
 def _surface_points(target: SdfField, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Surface points (M, 3): the target's own where it has them, else points of its bounds carried down its gradient."""
+    """Surface points (M, 3): the target's own, or else points of its bounds carried down its gradient."""
     if isinstance(target, SurfaceSource):
         return target.sample_surface(count, rng)
     points = volume_samples(target, count, 0.05, rng).points

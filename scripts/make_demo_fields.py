@@ -1,0 +1,168 @@
+"""Make the demo's two fields from open meshes: a furnished room, and the armchair of the library.
+
+    python scripts/make_demo_fields.py MESHES ROOM.json [--out examples/data] [--only room|chair] [--iterations N]
+
+MESHES holds the meshes that the room's instances name; ROOM.json lists floor, walls and instances (a pose each). Beside
+the two fields it writes the detection of the armchair in the room, the true transform, and what the fits measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.composite import BoxField, UnionField
+from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.fields.mesh import MeshField
+from regnf_core.fitting.fit import fit_field
+from regnf_core.fitting.options import FitOptions
+
+SCENE_UNITS_PER_METRE = 0.5
+SCENE_ORIGIN_M = np.array([0.0, 0.0, 1.0])
+OBJECT_UNITS_PER_METRE = 0.625
+"""1.25 object units a scene unit: the scale that the registration has to find."""
+INSTANCE = "fc"
+ATTRIBUTION = "Poly Haven, https://polyhaven.com, CC0 1.0"
+
+ROOM_OPTIONS = FitOptions(
+    grid=HashGridConfig.from_top_resolution(512, levels=10, log2_table_size=17),
+    iterations=2500,
+    batch=4096,
+    gradient_batch=1024,
+    near_points=900_000,
+    volume_points=150_000,
+    noise=(0.0008, 0.004, 0.02),
+    padding=0.04,
+)
+CHAIR_OPTIONS = FitOptions(
+    grid=HashGridConfig.from_top_resolution(1024, levels=10, log2_table_size=15),
+    iterations=2000,
+    batch=4096,
+    gradient_batch=1024,
+    near_points=500_000,
+    volume_points=100_000,
+)
+
+
+def scale_and_shift(scale: float, shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The (4, 4) matrix of x -> scale x + shift."""
+    matrix = np.diag([scale, scale, scale, 1.0])
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def scene_from_room() -> NDArray[np.float64]:
+    """(4, 4): metres in the room's frame to scene units."""
+    return scale_and_shift(SCENE_UNITS_PER_METRE, -SCENE_UNITS_PER_METRE * SCENE_ORIGIN_M)
+
+
+def object_from_mesh(mesh: MeshField) -> NDArray[np.float64]:
+    """(4, 4): metres in the mesh's frame to object units, the bounding box's centre moved to the origin."""
+    return scale_and_shift(OBJECT_UNITS_PER_METRE, -OBJECT_UNITS_PER_METRE * mesh.bounds.mean(dim=0).numpy())
+
+
+def load_instance(meshes: Path, instance: dict[str, Any]) -> MeshField:
+    """An instance's mesh in its own frame, metres."""
+    return MeshField.load(meshes / Path(instance["mesh"]).name)
+
+
+def compose_room(meshes: Path, room: dict[str, Any]) -> UnionField:
+    """The furnished room in scene units: exact boxes for floor and walls, every instance's mesh at its pose."""
+    to_scene = scene_from_room()
+    parts: list[SdfField] = []
+    weights: list[float] = []
+    floor_bottom = room["floor"]["box_min"][2]
+    for box in [room["floor"], *room["walls"]]:
+        # Walls reach down through the floor: two solids that only touched would have a false surface between them.
+        lower = np.array([*box["box_min"][:2], floor_bottom])
+        corners = (np.stack((lower, box["box_max"])) - SCENE_ORIGIN_M) * SCENE_UNITS_PER_METRE
+        parts.append(BoxField(*(tuple(corner) for corner in corners.tolist())))
+        weights.append(0.1)
+    for instance in room["instances"]:
+        mesh = load_instance(meshes, instance)
+        parts.append(mesh.transformed(to_scene @ np.array(instance["T_room_from_object"])))
+        weights.append(0.25 if instance["class"] == "chair" else 0.1)
+    return UnionField(parts, weights)
+
+
+def detection(instance: dict[str, Any]) -> dict[str, Any]:
+    """The instance's axis-aligned box in scene units."""
+    corners = np.array([instance["aabb_min"], instance["aabb_max"]])
+    lower, upper = (corners - SCENE_ORIGIN_M) * SCENE_UNITS_PER_METRE
+    return {
+        "centre": ((lower + upper) / 2.0).tolist(),
+        "size": (upper - lower).tolist(),
+        "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
+        "label": "chair",
+        "score": 1.0,
+    }
+
+
+def truth(instance: dict[str, Any], mesh: MeshField) -> dict[str, Any]:
+    """The true transform from scene to object, and the object's diameter (largest distance of two vertices)."""
+    T_room_mesh = np.array(instance["T_room_from_object"])
+    matrix = object_from_mesh(mesh) @ np.linalg.inv(scene_from_room() @ T_room_mesh)
+    scale = OBJECT_UNITS_PER_METRE / SCENE_UNITS_PER_METRE
+    rotation = Rotation.from_matrix(matrix[:3, :3] / scale)
+    matrix[:3, :3] = scale * rotation.as_matrix()
+    vertices = mesh.vertices * OBJECT_UNITS_PER_METRE
+    diameter = max(float(np.linalg.norm(vertices - vertex, axis=1).max()) for vertex in vertices)
+    return {
+        "T_object_scene": {
+            "matrix": matrix.tolist(),
+            "scale": scale,
+            "rotation_quaternion_xyzw": rotation.as_quat().tolist(),
+            "translation": matrix[:3, 3].tolist(),
+        },
+        "object_diameter": diameter,
+    }
+
+
+def fit(target: SdfField, path: Path, options: FitOptions, label: str, made_from: list[str]) -> None:
+    """Fit one field, and keep what was measured beside the others' figures."""
+
+    def show(iteration: int, loss: float, seconds_left: float) -> None:
+        print(f"{path.name}: iteration {iteration}, loss {loss:.5f}, {seconds_left:.0f} s left", flush=True)
+
+    source = {"meshes": made_from, "attribution": ATTRIBUTION}
+    report = fit_field(target, path, options, seed=0, progress=show, label=label, source=source)
+    path.with_suffix(".fit.json").write_text(json.dumps(asdict(report), indent=1) + "\n")
+    print(path.name, report, f"{path.stat().st_size / 1e6:.2f} MB")
+
+
+def main() -> None:
+    """Make the fields."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("meshes", type=Path)
+    parser.add_argument("room", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("examples/data"))
+    parser.add_argument("--only", choices=("room", "chair"))
+    parser.add_argument("--iterations", type=int, help="instead of the usual number")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    room = json.loads(arguments.room.read_text())
+    instance = next(i for i in room["instances"] if i["id"] == INSTANCE)
+    chair = load_instance(arguments.meshes, instance)
+    for name, content in (("detection", detection(instance)), ("truth", truth(instance, chair))):
+        (arguments.out / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+    change = {"iterations": arguments.iterations} if arguments.iterations else {}
+    if arguments.only != "room":
+        target = chair.transformed(object_from_mesh(chair))
+        path = arguments.out / "armchair.safetensors"
+        fit(target, path, replace(CHAIR_OPTIONS, **change), "chair", [Path(instance["mesh"]).stem])
+    if arguments.only != "chair":
+        names = sorted({Path(i["mesh"]).stem for i in room["instances"]})
+        path = arguments.out / "mix-room.safetensors"
+        fit(compose_room(arguments.meshes, room), path, replace(ROOM_OPTIONS, **change), "mix-room", names)
+
+
+if __name__ == "__main__":
+    main()
