@@ -4,10 +4,11 @@ import { JobApi, jobBase } from './api.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
 import { announce, byId, copyText, show } from './dom.js';
 import { followJob } from './events.js';
+import { prefersStillness } from './motion.js';
 import {
   checkPose, showAgreement, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
 } from './panel.js';
-import { Playback, prefersStillness } from './playback.js';
+import { Playback } from './playback.js';
 import { LossPlot } from './plot.js';
 import { inverse, readSim3 } from './sim3.js';
 import { Stage } from './stage.js';

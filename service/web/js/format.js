@@ -6,7 +6,7 @@ export function number(value, digits = 4) {
   if (value === 0) return '0';
   const size = Math.abs(value);
   if (Number.isInteger(value) && size < 1e9) return value.toLocaleString('en');
-  if (size < 1e-3 || size >= 1e6) return value.toExponential(Math.max(digits - 2, 1)).replace('-', '−').replace('e+', 'e').replace('e-', 'e−');
+  if (size < 1e-3 || size >= 1e6) return value.toExponential(digits - 1).replace('-', '−').replace('e+', 'e').replace('e-', 'e−');
   return signed(Number(value.toPrecision(digits)).toString());
 }
 
@@ -44,10 +44,10 @@ export function words(name) {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-/** A moment from seconds since the epoch or an ISO string, in the reader's own time zone. */
+/** A moment, given as RFC 3339, in the reader's own time zone. */
 export function moment(value) {
-  if (value === null || value === undefined) return '';
-  const date = new Date(typeof value === 'number' ? value * 1000 : value);
+  if (!value) return '';
+  const date = new Date(value);
   return Number.isNaN(date.getTime()) ? '' : date.toLocaleString();
 }
 

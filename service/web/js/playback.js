@@ -68,5 +68,3 @@ export class Playback {
     this.button.toggleAttribute('data-playing', Boolean(this.playing));
   }
 }
-
-export const prefersStillness = () => matchMedia('(prefers-reduced-motion: reduce)').matches;

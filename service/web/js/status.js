@@ -27,7 +27,7 @@ export function showLoading(text) {
 export function showActive(job) {
   showBadge(job.status, job.id);
   const queued = job.status === 'accepted';
-  const ahead = job.queue_position;
+  const ahead = job.queue_position - 1; // 1 is next
   card({
     eyebrow: queued ? 'Waiting for a worker' : runningText(job.attempts ?? job.attempt ?? 1),
     title: queued ? 'In the queue' : words(job.phase ?? 'starting'),

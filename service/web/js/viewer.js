@@ -7,6 +7,7 @@ import { clearestDirection, frameSphere, moveByKey } from './camera.js';
 import { onThemeChange, themeColour } from './colours.js';
 import { Floor } from './floor.js';
 import { Gizmo } from './gizmo.js';
+import { prefersStillness } from './motion.js';
 
 const UP = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1], '-x': [-1, 0, 0], '-y': [0, -1, 0], '-z': [0, 0, -1] };
 const FIELD_OF_VIEW = 36;
@@ -17,7 +18,7 @@ export class Viewer {
     this.renderer = rendererFor(canvas);
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 1000);
     this.controls = new OrbitControls(this.camera, canvas);
-    this.controls.enableDamping = true;
+    this.controls.enableDamping = !prefersStillness();
     this.controls.dampingFactor = 0.12;
     this.controls.zoomToCursor = true;
     this.root = new Scene();

@@ -1,0 +1,264 @@
+"""A small HTTP server with the page and a pretended job API, for the browser tests and for looking at the page.
+
+    python -m tests.ui.fixture_server        then open the printed addresses
+
+The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
+(live without an event stream), locked (wants a token), bare (a result with little in it) or broken (damaged clouds).
+"""
+
+from __future__ import annotations
+
+import json
+import mimetypes
+import re
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, ClassVar
+
+from tests.ui.synthetic import JOB_ID, Synthetic, rotation, sim3_document, similarity, synthetic
+
+WEB = Path(__file__).resolve().parents[2] / "service" / "web"
+CONTENT_SECURITY_POLICY = "default-src 'self'"
+TOKEN = "open-sesame"
+STORIES = (
+    "done",
+    "ambiguous",
+    "running",
+    "queued",
+    "failed",
+    "dismissed",
+    "live",
+    "polled",
+    "locked",
+    "bare",
+    "broken",
+)
+STEPS: tuple[dict[str, Any], ...] = (
+    {"status": "accepted", "queue_position": 3},
+    {"status": "running", "phase": "loading", "progress": 0.05},
+    {"status": "running", "phase": "optimising", "progress": 0.6},
+    {"status": "successful", "phase": "exporting", "progress": 1.0},
+)
+
+
+class Stage:
+    """The state shared by all requests: how far the moving jobs are. Tests advance it; nothing moves on its own."""
+
+    def __init__(self, data: Synthetic) -> None:
+        self.data = data
+        self.step = 0
+        self.cancelled = False
+        self.closing = False
+        self.changed = threading.Condition()
+
+    def advance(self) -> None:
+        with self.changed:
+            self.step = min(self.step + 1, len(STEPS) - 1)
+            self.changed.notify_all()
+
+    def reset(self) -> None:
+        with self.changed:
+            self.step, self.cancelled = 0, False
+            self.changed.notify_all()
+
+    def close(self) -> None:
+        with self.changed:
+            self.closing = True
+            self.changed.notify_all()
+
+    def job(self, story: str) -> dict[str, Any]:
+        """The job document of a story, as the API would write it at this moment."""
+        document: dict[str, Any] = {
+            "id": JOB_ID,
+            "kind": "registration",
+            "status": "successful",
+            "phase": "exporting",
+            "progress": 1.0,
+            "attempts": 1,
+            "updated_at": "2026-05-28T20:26:54.000Z",
+            "created_at": "2026-05-28T20:26:40.000Z",
+            "started_at": "2026-05-28T20:26:41.000Z",
+            "finished_at": "2026-05-28T20:26:54.000Z",
+            "expires_at": "2026-06-04T20:26:54.000Z",
+            "inputs": {"scene": "a3" * 32, "object": "7c" * 32, "seed": 7, "detection": self.data.detection},
+            "engine": {"version": "0.1.0", "device": "cpu"},
+            "error": None,
+        }
+        still = {"finished_at": None, "expires_at": None}
+        if story == "running":
+            document |= {"status": "running", "phase": "optimising", "progress": 0.62, **still}
+            if self.cancelled:
+                document |= {"status": "dismissed"}
+        elif story == "queued":
+            document |= {"status": "accepted", "phase": None, "progress": 0.0, "queue_position": 4, **still}
+        elif story == "failed":
+            document |= {"status": "failed", "phase": "sampling", "progress": 0.2, "error": FAILURE}
+        elif story == "dismissed":
+            document |= {"status": "dismissed"}
+        elif story in ("live", "polled"):
+            document |= {"phase": None, "progress": 0.0} | STEPS[self.step]
+        return document
+
+    def result(self, story: str) -> dict[str, Any]:
+        if story == "bare":
+            return {k: self.data.result[k] for k in ("verdict", "verdict_reason", "T_object_scene", "metrics")}
+        if story != "ambiguous":
+            return self.data.result
+        half_turn = similarity(1.0, rotation([0, 0, 1], 3.0), [0, 0, 0]) @ self.data.T_object_scene
+        return self.data.result | {
+            "verdict": "ambiguous",
+            "verdict_reason": "SYMMETRIC_ALTERNATIVES",
+            "alternatives": [
+                {"T_object_scene": sim3_document(half_turn), "score": 0.93, "relation": "172 degrees about z"}
+            ],
+        }
+
+
+FAILURE = {
+    "type": "about:blank",
+    "title": "No surface in the detection",
+    "status": 422,
+    "reason": "NO_SURFACE_IN_DETECTION",
+    "detail": "12 surface points were found inside the box <b>chair</b>; 500 are needed.",
+    "request_id": "req-7f3a",
+}
+
+
+class Handler(BaseHTTPRequestHandler):
+    """GET and POST below /jobs/{story}, static files below /static."""
+
+    protocol_version = "HTTP/1.1"
+    stage: ClassVar[Stage]
+
+    def do_GET(self) -> None:
+        path = self.path.split("?")[0]
+        if path.startswith("/static/"):
+            return self._file(WEB / path.removeprefix("/static/"))
+        match = re.fullmatch(r"(?:/v1)?/jobs/(\w+)(/.*)?", path)
+        if not match:
+            return self._problem(404, "NOT_FOUND")
+        story, rest = match[1], match[2] or ""
+        if rest == "/view":
+            return self._file(WEB / "view.html")
+        if story not in STORIES:
+            return self._problem(404, "JOB_NOT_FOUND")
+        if story == "locked" and self.headers.get("Authorization") != f"Bearer {TOKEN}":
+            return self._problem(401, "UNAUTHENTICATED")
+        return self._job(story, rest)
+
+    def do_POST(self) -> None:
+        if not self.path.endswith("/cancel"):
+            return self._problem(404, "NOT_FOUND")
+        with self.stage.changed:
+            self.stage.cancelled = True
+            self.stage.changed.notify_all()
+        return self._json(202, {})
+
+    def _job(self, story: str, rest: str) -> None:
+        if rest == "":
+            return self._json(200, self.stage.job(story))
+        if rest == "/result":
+            return self._json(200, self.stage.result(story))
+        if rest == "/events":
+            return self._problem(404, "NOT_FOUND") if story == "polled" else self._events(story)
+        name = rest.removeprefix("/artifacts/")
+        if name not in self.stage.data.artifacts or (story == "bare" and name == "trace.json"):
+            return self._problem(404, "ARTIFACT_NOT_FOUND")
+        data = self.stage.data.artifacts[name]
+        return self._bytes(200, data[:50] if story == "broken" else data, "application/octet-stream")
+
+    def _events(self, story: str) -> None:
+        """One event a change, until the job has ended or the server closes."""
+        self.send_response(200)
+        self.send_header("Content-Type", "text/event-stream")
+        self.send_header("Connection", "close")
+        self.end_headers()
+        # a stream begins with the past: here an earlier attempt, which failed
+        past = {"status": "failed", "phase": "loading", "progress": 0.1, "attempt": 0, "updated": 1_779_999_000.0}
+        self.wfile.write(f"retry: 2000\n\nid: 0-1\nevent: status\ndata: {json.dumps(past)}\n\n".encode())
+        told: dict[str, Any] = {}
+        number = 0
+        while True:
+            before = told
+            told = self._next_document(story, before)
+            number += told != before
+            data = {name: told[name] for name in ("status", "phase", "progress", "error")} | {"attempt": 1}
+            event = f"id: {number}-0\nevent: progress\ndata: {json.dumps(data)}\n\n"
+            line = event if told != before else ": still here\n\n"
+            try:
+                self.wfile.write(line.encode())
+                self.wfile.flush()
+            except OSError:
+                break
+            if self.stage.closing or told["status"] not in ("accepted", "running"):
+                break
+        self.close_connection = True
+
+    def _next_document(self, story: str, known: dict[str, Any]) -> dict[str, Any]:
+        """The job's document once it differs from the known one, or after half a second."""
+        stage = self.stage
+        with stage.changed:
+            stage.changed.wait_for(lambda: stage.closing or stage.job(story) != known, timeout=0.5)
+            return stage.job(story)
+
+    def _file(self, path: Path) -> None:
+        if not path.is_file() or WEB not in path.resolve().parents:
+            return self._problem(404, "NOT_FOUND")
+        return self._bytes(200, path.read_bytes(), mimetypes.guess_type(path.name)[0] or "text/plain")
+
+    def _problem(self, status: int, reason: str) -> None:
+        self._json(status, {"title": reason.replace("_", " ").capitalize(), "status": status, "reason": reason})
+
+    def _json(self, status: int, document: dict[str, Any]) -> None:
+        self._bytes(status, json.dumps(document).encode(), "application/json")
+
+    def _bytes(self, status: int, data: bytes, media_type: str) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", media_type)
+        self.send_header("Content-Length", str(len(data)))
+        self.send_header("Content-Security-Policy", CONTENT_SECURITY_POLICY)
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, *_: object) -> None:
+        """Tests need no access log."""
+
+
+class FixtureServer:
+    """Serves on a free port of the loopback interface, in a thread of its own, while the context is open."""
+
+    def __init__(self) -> None:
+        self.stage = Stage(synthetic())
+        handler = type("BoundHandler", (Handler,), {"stage": self.stage})
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+        self._server.daemon_threads = True
+        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05})
+        self.origin = f"http://127.0.0.1:{self._server.server_address[1]}"
+
+    def __enter__(self) -> FixtureServer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stage.close()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def view(self, story: str) -> str:
+        return f"{self.origin}/jobs/{story}/view"
+
+
+def main() -> None:
+    with FixtureServer() as server:
+        for story in STORIES:
+            print(server.view(story))  # noqa: T201
+        while True:
+            time.sleep(2)
+            server.stage.advance()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,32 @@
+"""The page's files by themselves: nothing inline, nothing foreign, nothing missing. Needs no browser."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+from tests.ui.fixture_server import WEB
+
+
+def test_files_hold_no_inline_code_and_no_foreign_address() -> None:
+    page = (WEB / "view.html").read_text()
+    assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son\w+=", page)
+    for path in [WEB / "view.html", *(WEB / "js").glob("*.js"), *(WEB / "css").glob("*.css")]:
+        foreign = set(re.findall(r"https?://[^\s'\"]+", path.read_text())) - {"http://www.w3.org/2000/svg"}
+        assert not foreign, path.name
+    assert "innerHTML" not in "".join(path.read_text() for path in (WEB / "js").glob("*.js"))
+
+
+def test_vendored_bundle_is_the_noted_one() -> None:
+    digest = hashlib.sha256((WEB / "vendor" / "three.bundle.min.js").read_bytes()).hexdigest()
+    assert f"`{digest}`" in (WEB / "vendor" / "README.md").read_text()
+
+
+def test_every_import_and_every_id_exists() -> None:
+    page = (WEB / "view.html").read_text()
+    ids = set(re.findall(r'\bid="([^"]+)"', page))
+    for path in (WEB / "js").glob("*.js"):
+        source = path.read_text()
+        for target in re.findall(r"from '(\.[^']+)'", source):
+            assert (path.parent / target).is_file(), f"{path.name}: {target}"
+        assert set(re.findall(r"byId\('([^']+)'\)", source)) <= ids, path.name

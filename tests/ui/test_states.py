@@ -1,0 +1,92 @@
+"""The page while a job is queued or runs, and when it has failed, was dismissed or does not exist."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.ui.conftest import Visit
+
+pytestmark = pytest.mark.browser
+
+
+def test_running_shows_phase_and_progress(visit: Visit) -> None:
+    page = visit.page
+    page.goto(visit.server.view("running"))
+    page.wait_for_selector("#phases [aria-current=step]")
+    assert page.locator("#status").inner_text() == "Running"
+    assert page.locator("#message-title").inner_text() == "Optimising"
+    assert page.locator("#message-text").inner_text() == "62 % done"
+    assert page.locator("#progress").evaluate("bar => bar.value") == pytest.approx(0.62)
+    assert page.locator("#phases [data-state=done]").count() == 3
+    assert visit.complaints == []
+
+
+def test_queued_tells_the_place(visit: Visit) -> None:
+    visit.page.goto(visit.server.view("queued"))
+    visit.page.wait_for_selector("text=3 jobs before it.")
+    assert visit.page.locator("#message-title").inner_text() == "In the queue"
+
+
+@pytest.mark.parametrize("story", ["live", "polled"])
+def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
+    page = visit.page
+    page.goto(visit.server.view(story))
+    page.wait_for_selector("text=2 jobs before it.")
+    for phase in ("Loading", "Optimising"):
+        visit.server.stage.advance()
+        expect(page.locator("#message-title")).to_have_text(phase, timeout=30_000)
+    visit.server.stage.advance()
+    page.wait_for_selector("#tools:not([hidden])")
+    assert page.locator("#status").inner_text() == "Registered"
+    asked = [url for url in visit.requests if url.endswith("/events")]
+    assert len(asked) == 1, asked
+    # Only the refused stream may be complained about, and only where it is refused.
+    assert len(visit.complaints) == (1 if story == "polled" else 0), visit.complaints
+
+
+def test_cancel_ends_the_job(visit: Visit) -> None:
+    page = visit.page
+    page.goto(visit.server.view("running"))
+    page.locator("#cancel").click()
+    page.wait_for_selector("text=The job was dismissed")
+    assert page.locator("#status").inner_text() == "Dismissed"
+
+
+def test_failure_tells_reason_and_detail_as_text(visit: Visit) -> None:
+    page = visit.open("failed")
+    assert page.locator("#status").inner_text() == "Failed"
+    assert page.locator("#message-title").inner_text() == "No surface in the detection"
+    assert "<b>chair</b>" in page.locator("#message-text").inner_text()
+    assert page.locator("#message-text b").count() == 0
+    facts = page.locator("#message-facts").inner_text()
+    assert "NO_SURFACE_IN_DETECTION" in facts
+    assert "req-7f3a" in facts
+    assert page.locator("#message-hint").is_visible()
+    assert not page.locator("#canvas").is_visible()
+    assert visit.complaints == []
+
+
+def test_unknown_job_says_so(visit: Visit) -> None:
+    page = visit.open("unheard_of")
+    assert page.locator("#message-title").inner_text() == "There is no such job"
+    assert "JOB_NOT_FOUND" in page.locator("#message-facts").inner_text()
+
+
+def test_versioned_address_works_too(visit: Visit) -> None:
+    page = visit.page
+    page.goto(f"{visit.server.origin}/v1/jobs/failed/view")
+    page.wait_for_selector("html[data-page=ready]")
+    assert page.locator("#status").inner_text() == "Failed"
+    assert f"{visit.server.origin}/v1/jobs/failed" in visit.requests
+
+
+def test_lost_connection_is_told_and_mended(visit: Visit) -> None:
+    page = visit.page
+    page.goto(visit.server.view("polled"))
+    page.wait_for_selector("text=2 jobs before it.")
+    page.context.set_offline(True)
+    page.wait_for_selector("text=The service cannot be reached at the moment")
+    visit.server.stage.advance()
+    page.context.set_offline(False)
+    expect(page.locator("#message-title")).to_have_text("Loading", timeout=30_000)

@@ -1,0 +1,239 @@
+"""The page of a finished job: what is drawn, what moves, which numbers are shown."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from tests.ui.conftest import Visit
+from tests.ui.fixture_server import TOKEN
+from tests.ui.pixels import canvas_pixels, centre_of, changed_share, coloured
+from tests.ui.synthetic import ITERATIONS
+
+pytestmark = pytest.mark.browser
+
+
+def seek(visit: Visit, position: int) -> None:
+    visit.page.locator("#iteration").fill(str(position))
+
+
+def hide(visit: Visit, *layers: str) -> None:
+    for layer in layers:
+        visit.page.locator(f"label.chip[data-layer={layer}]").click()
+
+
+def test_draws_the_clouds_and_stays_at_home(visit: Visit) -> None:
+    page = visit.open("done")
+    pixels = canvas_pixels(page)
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 500
+    assert coloured(pixels, "blue").mean() > 0.01
+    assert coloured(pixels, "orange").mean() > 0.005
+    assert visit.complaints == []
+    assert visit.requests
+    assert [url for url in visit.requests if not url.startswith(visit.server.origin + "/")] == []
+
+
+@pytest.mark.parametrize(("layer", "least"), [("scene", 0.2), ("before", 0.005), ("after", 0.005), ("box", 0.001)])
+def test_every_layer_can_be_hidden_and_shown_again(visit: Visit, layer: str, least: float) -> None:
+    page = visit.open("done")
+    shown = canvas_pixels(page)
+    hide(visit, layer)
+    hidden = canvas_pixels(page)
+    assert changed_share(shown, hidden) > least
+    hide(visit, layer)
+    assert changed_share(shown, canvas_pixels(page)) < 0.001
+
+
+def test_slider_moves_the_object_from_the_start_into_place(visit: Visit) -> None:
+    page = visit.open("done")
+    hide(visit, "scene", "box")
+    seek(visit, 0)
+    assert page.locator("#iteration-text").inner_text() == "Start"
+    hide(visit, "before")
+    start = coloured(canvas_pixels(page), "blue")
+    hide(visit, "before", "after")
+    ghost = coloured(canvas_pixels(page), "orange")
+    # At the start the object stands where its ghost does ...
+    assert math.dist(centre_of(start), centre_of(ghost)) < 6
+    hide(visit, "before", "after")
+    seek(visit, 5)
+    assert "Iteration 5" in page.locator("#iteration-text").inner_text()
+    halfway = coloured(canvas_pixels(page), "blue")
+    seek(visit, ITERATIONS + 1)
+    end = coloured(canvas_pixels(page), "blue")
+    # ... and every step brings it nearer to its place.
+    assert math.dist(centre_of(start), centre_of(end)) > math.dist(centre_of(halfway), centre_of(end)) > 6
+
+
+def test_result_lies_on_the_scene(visit: Visit) -> None:
+    page = visit.open("done")
+    hide(visit, "before", "box")
+    together = canvas_pixels(page)
+    hide(visit, "after")
+    scene_alone = canvas_pixels(page)
+    hide(visit, "after")
+    seek(visit, 0)
+    apart = canvas_pixels(page)
+    # In place, the object covers its twin in the scene and little else: far less of the rest than from the start.
+    assert changed_share(together, scene_alone) < changed_share(apart, scene_alone)
+
+
+def test_numbers_are_the_documents(visit: Visit) -> None:
+    page = visit.open("done")
+    result = visit.server.stage.data.result
+    assert page.locator("#verdict-word").inner_text() == "Registered"
+    assert "SURFACES_AGREE" in page.locator("#verdict-reason").inner_text()
+    cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
+    assert np.allclose(np.reshape(cells, (4, 4)), result["T_object_scene"]["matrix"], atol=5.1e-6)
+    page.locator("text=scene ← object").first.click()
+    cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
+    assert np.allclose(np.reshape(cells, (4, 4)), result["T_scene_object"]["matrix"], atol=5.1e-6)
+    figures = page.locator("#figures").inner_text()
+    assert "1.6000" in figures
+    assert "93.1 %" in figures
+    assert "0.41 %" in figures
+    assert "12.3 s" in figures
+    assert page.locator("#shares").inner_text().split("\n")[:2] == ["Scene inliers", "96.2 %"]
+    assert page.locator("#time-key li").count() == 6
+    assert page.locator("#loss svg").get_attribute("aria-label") == "Loss over 40 iterations, from 0.148 to 3.17e−4"
+
+
+def test_matrix_is_copied_whole(visit: Visit) -> None:
+    page = visit.page
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    visit.open("done")
+    page.locator("#copy-matrix").click()
+    expect(page.locator("#copy-matrix")).to_have_text("Copied")
+    copied = json.loads(page.evaluate("navigator.clipboard.readText()"))
+    assert np.allclose(copied, visit.server.stage.data.T_object_scene, atol=1e-12)
+
+
+def test_residuals_colour_the_clouds(visit: Visit) -> None:
+    page = visit.open("done")
+    before = canvas_pixels(page)
+    page.locator("#colour").select_option("residual")
+    page.wait_for_selector("#legend svg rect")
+    assert changed_share(before, canvas_pixels(page)) > 0.02
+    assert page.locator("#legend").is_visible()
+    page.locator("#colour").select_option("layer")
+    assert changed_share(before, canvas_pixels(page)) < 0.001
+    assert visit.complaints == []
+
+
+def test_up_axis_turns_the_scene(visit: Visit) -> None:
+    page = visit.open("done")
+    before = canvas_pixels(page)
+    page.locator("#up").select_option("y")
+    assert changed_share(before, canvas_pixels(page)) > 0.2
+    page.locator("#up").select_option("z")
+    assert changed_share(before, canvas_pixels(page)) < 0.001
+
+
+def test_mouse_and_keys_move_the_camera(visit: Visit) -> None:
+    page = visit.open("done")
+    home = canvas_pixels(page)
+    box = page.locator("#canvas").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 120, y + 20, steps=4)
+    page.mouse.up()
+    assert changed_share(home, canvas_pixels(page)) > 0.1
+    page.locator("#frame-object").click()
+    page.locator("#canvas").focus()
+    for key in ("ArrowLeft", "Shift+ArrowUp", "+"):
+        before = canvas_pixels(page)
+        page.keyboard.press(key)
+        assert changed_share(before, canvas_pixels(page)) > 0.05, key
+
+
+def test_play_runs_from_the_start_to_the_result(visit: Visit) -> None:
+    page = visit.open("done")
+    page.locator("#play").click()
+    page.wait_for_selector("#play[data-playing]")
+    expect(page.locator("#iteration-text")).to_have_text(re.compile(r"Start|Iteration 1?\d "))
+    expect(page.locator("#iteration-text")).to_have_text("Result", timeout=30_000)
+    expect(page.locator("#play")).not_to_have_attribute("data-playing", "")
+    assert page.locator("#iteration").input_value() == str(ITERATIONS + 1)
+
+
+def test_space_pauses_and_plays(visit: Visit) -> None:
+    page = visit.open("done")
+    page.locator("#canvas").focus()
+    page.keyboard.press("Space")
+    page.wait_for_selector("#play[data-playing]")
+    page.keyboard.press("Space")
+    page.wait_for_selector("#play:not([data-playing])")
+
+
+def test_alternatives_can_be_looked_at(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    assert page.locator("#status").inner_text() == "Ambiguous"
+    shown, matrix = canvas_pixels(page), page.locator("#matrix").inner_text()
+    page.locator("text=172 degrees about z").click()
+    assert changed_share(shown, canvas_pixels(page)) > 0.005
+    assert page.locator("#matrix").inner_text() != matrix
+    seek(visit, 3)  # the path leads to the result: choosing it again
+    assert page.locator("#pose-list input").first.is_checked()
+    assert page.locator("#matrix").inner_text() == matrix
+
+
+def test_every_artifact_can_be_downloaded(visit: Visit, tmp_path: Path) -> None:
+    page = visit.open("done")
+    artifacts = visit.server.stage.data.artifacts
+    assert page.locator("#files a").all_inner_texts() == list(artifacts)
+    with page.expect_download() as download:
+        page.locator("#files a", has_text="trace.json").click()
+    download.value.save_as(tmp_path / "trace.json")
+    assert (tmp_path / "trace.json").read_bytes() == artifacts["trace.json"]
+
+
+def test_sparse_result_is_shown_without_trace_and_start(visit: Visit) -> None:
+    page = visit.open("bare")
+    assert coloured(canvas_pixels(page), "blue").mean() > 0.01
+    assert not page.locator("#timeline").is_visible()
+    assert not page.locator("#before-chip").is_visible()
+    assert not page.locator("#convergence").is_visible()
+
+
+def test_damaged_cloud_leaves_the_numbers(visit: Visit) -> None:
+    page = visit.open("broken")
+    assert page.locator("#message-title").inner_text() == "The 3D view cannot be shown"
+    assert page.locator("#verdict-word").inner_text() == "Registered"
+
+
+def test_no_webgl_leaves_the_numbers(visit: Visit) -> None:
+    visit.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page = visit.open("done")
+    assert "WebGL 2" in page.locator("#message-text").inner_text()
+    assert page.locator("#matrix td").count() == 16
+
+
+def test_token_opens_page_and_downloads(visit: Visit, tmp_path: Path) -> None:
+    page = visit.open("locked")
+    assert page.locator("#message-title").inner_text() == "This service asks for a token"
+    page.locator("#token").fill("wrong")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#token-form:not([hidden])")
+    page.locator("#token").fill(TOKEN)
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#tools:not([hidden])")
+    with page.expect_download() as download:
+        page.locator("#files a", has_text="trace.json").click()
+    download.value.save_as(tmp_path / "trace.json")
+    assert (tmp_path / "trace.json").read_bytes() == visit.server.stage.data.artifacts["trace.json"]
+    assert TOKEN not in " ".join(visit.requests)
+
+
+def test_object_flies_into_place_by_itself(visit: Visit) -> None:
+    visit.page.emulate_media(reduced_motion="no-preference")
+    visit.page.goto(visit.server.view("done"))
+    visit.page.wait_for_selector("#play[data-playing]")
+    expect(visit.page.locator("#iteration-text")).to_have_text("Result", timeout=30_000)
