@@ -34,17 +34,18 @@ ATTRIBUTION = "Poly Haven, https://polyhaven.com, CC0 1.0"
 
 ROOM_OPTIONS = FitOptions(
     grid=HashGridConfig.from_top_resolution(512, levels=10, log2_table_size=17),
-    iterations=2500,
+    iterations=4000,
     batch=4096,
     gradient_batch=1024,
     near_points=900_000,
-    volume_points=150_000,
+    volume_points=200_000,
     noise=(0.0008, 0.004, 0.02),
-    padding=0.04,
+    padding=0.1,
+    margin=0.01,
 )
 CHAIR_OPTIONS = FitOptions(
     grid=HashGridConfig.from_top_resolution(1024, levels=10, log2_table_size=15),
-    iterations=2000,
+    iterations=4000,
     batch=4096,
     gradient_batch=1024,
     near_points=500_000,

@@ -50,8 +50,7 @@ def fit_field(
     ``seed`` on one machine. Raises InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET).
     """
     options = options or FitOptions()
-    bounds = padded_bounds(target, options.padding)
-    if bounds.abs().max() > _GRID_RADIUS:
+    if padded_bounds(target, options.padding).abs().max() > _GRID_RADIUS:
         raise InvalidInputError(
             "the target with its padding reaches beyond [-2, 2]: scale it down", reason="TARGET_OUTSIDE_GRID"
         )
@@ -60,7 +59,9 @@ def fit_field(
     near = near_samples(target, options.near_points, options.noise, rng)
     volume = volume_samples(target, options.volume_points, options.padding, rng)
     trained = _train(target, near, volume, options, seed, progress)
-    write_safe_field(path, _description(options, bounds, label, source or {}), trained.tensors())
+    write_safe_field(
+        path, _description(options, padded_bounds(target, options.margin), label, source or {}), trained.tensors()
+    )
     return measure_fit(open_field(path), target, options, seed + 1, time.monotonic() - started)
 
 
@@ -72,8 +73,9 @@ def measure_fit(field: SdfField, target: SdfField, options: FitOptions, seed: in
     size = diagonal(target)
     distance, gradient = field.signed_distance_and_gradient(near.points)
     error = (distance - near.distances).abs() / size
-    norm = gradient.norm(dim=-1)
-    cosine = (gradient * near.gradients).sum(dim=-1) / norm.clamp_min(1e-9)
+    free = near.distances > 0.0
+    norm = gradient[free].norm(dim=-1)
+    cosine = (gradient[free] * near.gradients[free]).sum(dim=-1) / norm.clamp_min(1e-9)
     return FitReport(
         mean_error=float(error.mean()),
         p95_error=float(error.quantile(0.95)),

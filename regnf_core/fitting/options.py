@@ -45,7 +45,9 @@ class FitOptions:
     noise: tuple[float, ...] = (0.002, 0.01, 0.04)
     """Standard deviations of the near points' distance from the surface; an equal share of the points for each."""
     padding: float = 0.25
-    """How far beyond the target's bounds the field is fitted, and meant to be used."""
+    """How far beyond the target's bounds the field is fitted."""
+    margin: float = 0.05
+    """How far beyond the target's bounds the written field's own bounds lie."""
     half_table: bool = True
     """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
 
@@ -66,7 +68,8 @@ class FitReport:
     """The same anywhere in the padded bounds."""
     mean_gradient_norm: float
     mean_normal_cosine: float
-    """Mean cosine between the field's gradient and the exact one."""
+    """Mean cosine between the field's gradient and the exact one. Both means are over points in free space: a mesh of
+    overlapping parts has creases inside that no field should reproduce."""
     diagonal: float
     """The target's diagonal, own units: what the errors are shares of."""
     iterations: int
