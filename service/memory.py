@@ -201,9 +201,10 @@ class InMemoryRecordStore:
         with self._changed:
             return [record for record in self._fields.values() if record.state == "validating"]
 
-    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
         with self._changed:
-            return self._save_field(transitions.retried_field(self._require_field(sha256), attempt, self.now()))
+            known = self._require_field(sha256)
+            return self._save_field(transitions.retried_field(known, attempt, self.now(), lost))
 
     def delete_field(self, sha256: str) -> bool:
         with self._changed:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Protocol
 
 QUEUE_NAME = "regnf"
+IMPORT_QUEUE_NAME = "regnf-import"
+"""Workers empty this one first: registrations wait for imports, never the other way round."""
 REGISTER_FUNCTION = "worker.jobs.run_registration"
 IMPORT_FUNCTION = "worker.jobs.run_import"
 

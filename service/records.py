@@ -72,6 +72,8 @@ class FieldRecord:
     error: dict[str, Any] | None = None
     attempt: int = 1
     """Grows each time the import starts anew; fences off the writer of an older one."""
+    requeues: int = 0
+    """How often this upload was handed out again because its worker vanished."""
 
 
 @dataclass(frozen=True)
@@ -187,8 +189,8 @@ class RecordStore(Protocol):
         """Every field whose import has not ended."""
         ...
 
-    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
-        """Start a lost import anew as the next attempt. Raises StaleAttemptError."""
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        """Start an import anew as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
         ...
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:

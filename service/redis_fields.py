@@ -68,8 +68,8 @@ class RedisFieldRecords(RedisDocuments):
         names = sorted(text(name) for name in self._redis.smembers(_VALIDATING))
         return [FieldRecord(**document) for document in self._read_many(map(_key, names))]
 
-    def retry_import(self, sha256: str, attempt: int) -> FieldRecord:
-        return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now))
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
     def delete_field(self, sha256: str) -> bool:
         with self._redis.pipeline() as pipeline:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -22,33 +23,44 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="REGNF_", frozen=True, extra="ignore")
 
     host: str = "127.0.0.1"
-    port: int = Field(8080, ge=0, le=65535)
+    port: int = Field(default=8080, ge=0, le=65535)
     """0 asks the system for a free port; the address is printed once it listens."""
     state_dir: Path = Field(default_factory=_default_state_dir)
     """Blobs, the embedded Redis' files and temporary uploads live under it."""
     redis_url: str | None = None
     """Unset: `regnf serve` starts a private server of its own."""
-    workers: int = Field(1, ge=0, le=64)
-    threads: int | None = Field(None, ge=1, le=256)
+    workers: int = Field(default=1, ge=0, le=64)
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where registrations run; auto: on the GPU if torch can use one."""
+    threads: int | None = Field(default=None, ge=1, le=256)
     """Threads of each job's process; unset: cores / workers."""
     api_tokens: frozenset[str] = frozenset()
     """JSON list. Empty: no token needed, which is allowed on loopback only."""
     allow_unauthenticated: bool = False
     """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
-    max_upload_bytes: int = Field(4096 * MIB, ge=1)
-    max_request_bytes: int = Field(1 * MIB, ge=1024)
+    max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
+    max_request_bytes: int = Field(default=1 * MIB, ge=1024)
     """Largest JSON body."""
-    upload_stall_s: float = Field(30.0, gt=0)
+    upload_stall_s: float = Field(default=30.0, gt=0)
     """An upload that sends nothing for this long is refused with 408."""
-    max_queued_jobs: int = Field(1000, ge=1)
-    job_timeout_s: int = Field(900, ge=1)
-    import_timeout_s: int = Field(120, ge=1)
-    import_memory_bytes: int = Field(8192 * MIB, ge=256 * MIB)
-    heartbeat_s: float = Field(5.0, gt=0)
-    lost_after_s: float = Field(90.0, gt=0)
+    max_queued_jobs: int = Field(default=1000, ge=1)
+    job_timeout_s: int = Field(default=900, ge=1)
+    import_timeout_s: int = Field(default=120, ge=1)
+    import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
+    heartbeat_s: float = Field(default=5.0, gt=0)
+    lost_after_s: float = Field(default=90.0, gt=0)
     """A running job whose heartbeat is older than this is taken for lost."""
-    retention_s: int = Field(7 * 24 * 3600, ge=60)
+    shutdown_grace_s: float = Field(default=5.0, ge=0)
+    """How long a worker that is told to stop lets its job go on before it gives the job back to the queue."""
+    retention_s: int = Field(default=7 * 24 * 3600, ge=60)
     """How long finished jobs and their artifacts are kept."""
+
+    log_format: Literal["text", "json"] = "text"
+
+    @property
+    def scratch_dir(self) -> Path:
+        """Jobs' temporary files: each worker has a folder below it and empties it after each job."""
+        return self.state_dir / "scratch"
 
     @property
     def blob_dir(self) -> Path:

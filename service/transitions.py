@@ -112,12 +112,13 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
     return replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
 
 
-def retried_field(record: FieldRecord, attempt: int, now: float) -> FieldRecord:
-    """The field with its lost import started anew. Raises StaleAttemptError."""
+def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> FieldRecord:
+    """The field with its import started anew. Raises StaleAttemptError."""
     _require_attempt(record, attempt)
     if record.state != "validating":
         raise StaleAttemptError(f"a field that is {record.state} is not imported again")
-    return replace(record, version=record.version + 1, updated=now, attempt=attempt + 1)
+    requeues = record.requeues + (1 if lost else 0)
+    return replace(record, version=record.version + 1, updated=now, attempt=attempt + 1, requeues=requeues)
 
 
 def uses_field(record: JobRecord, sha256: str) -> bool:

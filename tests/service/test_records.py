@@ -413,12 +413,14 @@ def test_a_rejected_field_starts_anew(store: RecordStore) -> None:
 
 def test_a_lost_import_starts_anew(store: RecordStore) -> None:
     store.create_field(field(store))
-    assert store.retry_import(SCENE, 1).attempt == 2
+    again = store.retry_import(SCENE, 1)
+    assert (again.attempt, again.requeues) == (2, 1)
+    assert store.retry_import(SCENE, 2, lost=False).requeues == 1
     with pytest.raises(StaleAttemptError):
         store.retry_import(SCENE, 1)
     store.update_field(SCENE, state="ready")
     with pytest.raises(StaleAttemptError):
-        store.retry_import(SCENE, 2)
+        store.retry_import(SCENE, 3)
 
 
 def test_fields_are_listed_and_deleted(store: RecordStore) -> None:

@@ -1,0 +1,135 @@
+"""Finds what died without a word: jobs without a heartbeat, work that no queue holds, results past their time."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from uuid import uuid4
+
+from redis import Redis
+
+from service.blobs import BlobStore
+from service.queue import JobQueue
+from service.reasons import REASONS
+from service.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
+from service.redis_documents import PREFIX
+from service.settings import Settings
+
+_LEADER_KEY = f"{PREFIX}reaper"
+_LEADS_FOR_S = 60
+_UNHELD_FOR_S = 15.0
+"""Work that was recorded this long ago and is in no queue was lost between the two."""
+_IMPORT_RETRIES = 2
+_RELEASE = "if redis.call('GET', KEYS[1]) == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0"
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reaped:
+    """What one round did: ids by deed."""
+
+    requeued: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+    dismissed: tuple[str, ...] = ()
+    enqueued: tuple[str, ...] = ()
+    expired: tuple[str, ...] = ()
+
+
+class Reaper:
+    """Call ``run_once`` every fifteen seconds or so, from as many processes as like: one at a time does the work."""
+
+    def __init__(
+        self, records: RecordStore, queue: JobQueue, redis: Redis, settings: Settings, blobs: BlobStore | None = None
+    ) -> None:
+        self._records = records
+        self._queue = queue
+        self._redis = redis
+        self._lost_after_s = settings.lost_after_s
+        self._blobs = blobs
+        self._release = redis.register_script(_RELEASE)
+
+    def run_once(self) -> Reaped:
+        """One round; nothing when another process is at it. Raises RedisError when Redis cannot be reached."""
+        with self._leading() as leads:
+            if not leads:
+                return Reaped()
+            deeds: dict[str, list[str]] = {"requeued": [], "failed": [], "dismissed": [], "enqueued": []}
+            now = self._records.now()
+            for job in self._records.active_jobs():
+                _note(deeds, job.id, lambda job=job: self._look_after_job(job, now))  # type: ignore[misc]
+            for field in self._records.validating_fields():
+                _note(deeds, field.sha256, lambda field=field: self._look_after_import(field, now))  # type: ignore[misc]
+            return Reaped(**{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(self._expire()))
+
+    @contextmanager
+    def _leading(self) -> Iterator[bool]:
+        token = uuid4().hex
+        leads = bool(self._redis.set(_LEADER_KEY, token, nx=True, ex=_LEADS_FOR_S))
+        try:
+            yield leads
+        finally:
+            if leads:
+                self._release(keys=[_LEADER_KEY], args=[token])
+
+    def _look_after_job(self, job: JobRecord, now: float) -> str | None:
+        """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
+        if job.status == "accepted":
+            if now - job.updated < _UNHELD_FOR_S or self._queue.holds_registration(job.id, job.attempt):
+                return None
+            self._queue.enqueue_registration(job.id, job.attempt)
+            return "enqueued"
+        if now - (job.heartbeat or job.updated) < self._lost_after_s:
+            return None
+        if job.cancel_requested:
+            self._records.update_job(job.id, job.attempt, status="dismissed")
+            return "dismissed"
+        if job.requeues == 0:
+            again = self._records.requeue_job(job.id, job.attempt)
+            self._queue.enqueue_registration(again.id, again.attempt)
+            return "requeued"
+        self._records.update_job(job.id, job.attempt, status="failed", error=_worker_lost())
+        return "failed"
+
+    def _look_after_import(self, field: FieldRecord, now: float) -> str | None:
+        if now - field.updated < _UNHELD_FOR_S or self._queue.holds_import(field.sha256, field.attempt):
+            return None
+        if field.requeues < _IMPORT_RETRIES:
+            again = self._records.retry_import(field.sha256, field.attempt)
+            self._queue.enqueue_import(again.sha256, again.attempt)
+            return "requeued"
+        self._records.update_field(field.sha256, attempt=field.attempt, state="rejected", error=_worker_lost())
+        if self._blobs is not None:
+            self._blobs.delete_prefix(f"fields/{field.sha256}")
+        return "failed"
+
+    def _expire(self) -> list[str]:
+        expired = self._records.expire_jobs()
+        if self._blobs is not None:
+            for job_id in expired:
+                self._blobs.delete_prefix(f"jobs/{job_id}")
+        return expired
+
+
+def _note(deeds: dict[str, list[str]], name: str, look: Callable[[], str | None]) -> None:
+    try:
+        deed = look()
+    except StaleAttemptError:
+        return  # it moved on by itself meanwhile
+    if deed is not None:
+        deeds[deed].append(name)
+        logger.warning("%s: %s", name, deed)
+
+
+def _worker_lost() -> dict[str, Any]:
+    reason = "WORKER_LOST"
+    known = REASONS[reason]
+    return {
+        "type": f"/docs#{reason}",
+        "title": known.title,
+        "status": known.status,
+        "reason": reason,
+        "detail": known.meaning,
+    }

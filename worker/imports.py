@@ -1,0 +1,92 @@
+"""One attempt at importing an upload: a safe field and a report, or a reason why not."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from redis.exceptions import RedisError
+from rq.timeouts import JobTimeoutException
+
+from regnf_core.errors import RegnfError
+from service.records import StaleAttemptError
+from worker.context import Context
+from worker.engine import Importer
+from worker.problems import fault, new_incident, problem
+
+logger = logging.getLogger(__name__)
+
+
+def run_import_attempt(context: Context, sha256: str, attempt: int, importer: Importer) -> None:
+    """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
+
+    The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
+    record, or one that has ended and an original of their own. Raises RedisError when the end cannot be written down.
+    """
+    field = context.records.get_field(sha256)
+    if field is None or field.attempt != attempt or field.state != "validating":
+        logger.info("import %s attempt %d is not run", sha256, attempt)
+        return
+    try:
+        report = _standing_report(context, sha256) or _work(context, sha256, field.description, importer)
+    except RedisError:
+        raise
+    except RegnfError as error:
+        reject(context, sha256, attempt, problem(error.reason, str(error)))
+    except JobTimeoutException:
+        reject(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
+    except Exception as error:
+        incident = new_incident()
+        logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
+        reject(context, sha256, attempt, fault(error, incident))
+    else:
+        context.blobs.delete(_original(sha256))
+        _end(context, sha256, attempt, state="ready", report=report)
+
+
+def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
+    """Drop everything the upload left and say why. Does nothing to a field that has moved on."""
+    field = context.records.get_field(sha256)
+    if field is not None and field.attempt == attempt and field.state == "validating":
+        context.blobs.delete_prefix(f"fields/{sha256}")
+        _end(context, sha256, attempt, state="rejected", error=error)
+
+
+def _original(sha256: str) -> str:
+    return f"fields/{sha256}/original"
+
+
+def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
+    try:
+        context.records.update_field(sha256, attempt=attempt, **changes)
+    except StaleAttemptError as error:
+        logger.info("import %s attempt %d has no say any more: %s", sha256, attempt, error)
+        if context.records.get_field(sha256) is None:
+            context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
+    else:
+        logger.info("import %s attempt %d ended: %s", sha256, attempt, changes["state"])
+
+
+def _standing_report(context: Context, sha256: str) -> dict[str, Any] | None:
+    """What an earlier attempt found that died before it could say so."""
+    try:
+        with context.blobs.open(f"fields/{sha256}/report.json") as file:
+            report: dict[str, Any] = json.load(file)
+    except FileNotFoundError:
+        return None
+    return report
+
+
+def _work(context: Context, sha256: str, description: dict[str, Any], importer: Importer) -> dict[str, Any]:
+    with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(_original(sha256)) as upload:
+        folder = Path(temporary)
+        report: dict[str, Any] = importer(upload, folder, description)
+        with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
+            while chunk := source.read(1 << 20):
+                writer.write(chunk)
+            writer.commit(f"fields/{sha256}/field.safetensors")
+    context.blobs.put(f"fields/{sha256}/report.json", json.dumps(report).encode())
+    return report

@@ -1,0 +1,36 @@
+"""The functions that the queue names. Each runs in a process of its own, forked for one job, and takes one id."""
+
+from __future__ import annotations
+
+from rq import get_current_job
+
+from service.redis_queue import attempt_of
+from service.settings import Settings
+from worker.context import Context
+
+
+def run_registration(job_id: str) -> None:
+    """Run the attempt at a registration that the queue handed out."""
+    from worker.engine import CoreEngine
+    from worker.registration import run_attempt
+
+    settings = Settings()
+    run_attempt(Context.from_settings(settings), job_id, current_attempt(), lambda: CoreEngine.on(settings.device))
+
+
+def run_import(sha256: str) -> None:
+    """Run the attempt at an import that the queue handed out."""
+    from regnf_core.importing.gate import ImportLimits
+    from worker.engine import core_importer
+    from worker.imports import run_import_attempt
+
+    settings = Settings()
+    limits = ImportLimits(wall_s=settings.import_timeout_s, memory_bytes=settings.import_memory_bytes)
+    run_import_attempt(Context.from_settings(settings), sha256, current_attempt(), core_importer(limits))
+
+
+def current_attempt() -> int:
+    """The attempt that the running queue job is."""
+    job = get_current_job()
+    assert job is not None, "called by a worker only"
+    return attempt_of(job.id)

@@ -1,0 +1,60 @@
+"""What the worker asks of the operating system: dying with one's parent, sharing cores, who ran out of memory."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import MutableMapping
+from contextlib import suppress
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_FIRST_TO_GO = "500"
+_COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Have the kernel kill this process when its parent ends, however it ends (Linux; nothing elsewhere).
+
+    Call it in a fresh child that the parent's main thread forked: the kernel watches that thread.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent_pid:  # it died before the kernel was told
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def offer_to_the_oom_killer() -> None:
+    """When memory runs out, this process goes first, not the worker or Redis beside it."""
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
+
+
+def oom_kills() -> int:
+    """How many processes the kernel has killed for memory, here or in this container; only its growth has meaning."""
+    total = 0
+    for counter in _COUNTERS:
+        with suppress(OSError):
+            for line in Path(counter).read_text().splitlines():
+                name, _, value = line.partition(" ")
+                total += int(value) if name == "oom_kill" else 0
+    return total
+
+
+def share_cores(environment: MutableMapping[str, str], threads: int | None, workers: int) -> None:
+    """Set how many threads each job's libraries start, before any of them is loaded. What the user set stays.
+
+    Threads wait passively: spinning ones of two jobs on the same cores slow each other many times over.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = threads if threads is not None else max(1, cores // max(1, workers))
+    for name in _THREAD_VARIABLES:
+        if threads is not None:
+            environment[name] = str(count)
+        else:
+            environment.setdefault(name, str(count))
+    environment.setdefault("OMP_WAIT_POLICY", "PASSIVE")

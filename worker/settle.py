@@ -1,0 +1,95 @@
+"""What becomes of a record whose process has ended without writing down how: decided by the worker that outlived it."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from dataclasses import dataclass
+from typing import Any
+
+from service.records import ACTIVE, JobRecord, StaleAttemptError
+from worker.artifacts import discard, read_manifest
+from worker.context import Context
+from worker.imports import reject
+from worker.problems import problem
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HorseEnd:
+    """How a job's process ended: by which signal, if by one, and what the worker knows about why."""
+
+    signal: int | None = None
+    late: bool = False
+    out_of_memory: bool = False
+    given_back: bool = False
+    """The worker itself was told to stop and took its job down with it."""
+
+    def reason(self) -> str:
+        if self.late:
+            return "JOB_TIMEOUT"
+        if self.out_of_memory and self.signal == signal.SIGKILL:
+            return "OUT_OF_MEMORY"
+        return "WORKER_LOST" if self.signal is not None else "INTERNAL"
+
+
+def settle_registration(context: Context, job_id: str, attempt: int, end: HorseEnd) -> None:
+    """See that the record of a job whose process is gone does not go on saying it runs.
+
+    A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
+    that ended by itself, for want of Redis or storage, is granted one more attempt; everything else has failed.
+    """
+    record = context.records.get_job(job_id)
+    if record is None or record.attempt != attempt or record.status not in ACTIVE:
+        return
+    try:
+        if record.status == "accepted":  # it died before it could claim its job
+            record = context.records.update_job(job_id, attempt, status="running")
+        _settle(context, record, end)
+    except StaleAttemptError as error:
+        logger.info("job %s attempt %d: somebody else has settled it: %s", job_id, attempt, error)
+
+
+def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
+    job_id, attempt = record.id, record.attempt
+    if read_manifest(context.blobs, job_id) is not None:
+        context.records.update_job(job_id, attempt, status="successful")
+        return
+    discard(context.blobs, job_id, attempt)
+    by_itself = end.signal is None and not end.late
+    changes: dict[str, Any]
+    if record.cancel_requested:
+        changes = {"status": "dismissed"}
+    elif end.given_back or (by_itself and record.requeues == 0):
+        again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
+        context.queue.enqueue_registration(job_id, again.attempt)
+        logger.warning("job %s attempt %d is to be run again", job_id, attempt)
+        return
+    else:
+        changes = {"status": "failed", "error": _problem(end)}
+    context.records.update_job(job_id, attempt, **changes)
+    logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
+
+
+def settle_import(context: Context, sha256: str, attempt: int, end: HorseEnd) -> None:
+    """The same for an import: one that was given back starts anew, everything else has the field rejected."""
+    field = context.records.get_field(sha256)
+    if field is None or field.attempt != attempt or field.state != "validating":
+        return
+    if end.given_back:
+        try:
+            again = context.records.retry_import(sha256, attempt, lost=False)
+        except StaleAttemptError:
+            return
+        context.queue.enqueue_import(sha256, again.attempt)
+        return
+    logger.warning("import %s attempt %d: its process is gone (%s)", sha256, attempt, end)
+    reason = end.reason()
+    reject(context, sha256, attempt, problem("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
+
+
+def _problem(end: HorseEnd) -> dict[str, Any]:
+    reason = end.reason()
+    killed = "The process that ran the job was killed. Post the job again."
+    return problem(reason, killed if reason == "WORKER_LOST" else None)
