@@ -34,7 +34,6 @@ def convert_file(
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
     from regnf_core.fields.safe_format import open_field, write_safe_field
-    from regnf_core.importing.plausibility import check_plausibility
 
     converted = _convert(upload, description, limits.tensor_bytes)
     target = out_dir / FIELD_NAME
@@ -43,6 +42,8 @@ def convert_file(
     family, why, warnings = converted.family, converted.why, converted.warnings
     bounds, label = converted.description["bounds"], converted.description["label"]
     del converted  # the tensors are on disk: let go of them before the evaluation
+    from regnf_core.importing.plausibility import check_plausibility  # loads torch, which a refused file never needs
+
     figures, more = check_plausibility(open_field(target))
     return {
         "family": family,

@@ -38,6 +38,7 @@ sys.exit(main(sys.argv[2:]))
 """
 _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
 _MAX_DETAIL = 500
+_OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
 _MAX_DESCRIPTION = 16_384
 _log = logging.getLogger(__name__)
 
@@ -50,15 +51,17 @@ def import_field(
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
     ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little.
 
-    Raises FieldFormatError with the reason (docs/import-gate.md lists them), and OSError when the disk is full.
+    Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
+    OSError when the disk is full.
     """
     limits = limits or ImportLimits()
     request = _request(description, limits)
+    upload = upload.resolve(strict=True)
     out_dir.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
     try:
         started = time.monotonic()
-        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload.resolve()), str(work.resolve())]
+        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
         outcome = run_child(command, request, work, _environment(limits), limits.wall_s)
         values = _judge(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
@@ -93,9 +96,10 @@ def _judge(outcome: ChildOutcome) -> dict[str, Any]:
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY")
     values = _parse(outcome.stdout) if outcome.exit_status == 0 else None
     if values is None:
-        if b"MemoryError" in outcome.stderr or b"DefaultCPUAllocator" in outcome.stderr:
+        if any(sign in outcome.stderr for sign in _OUT_OF_MEMORY_SIGNS):
             raise FieldFormatError("the import needs more memory than it may have", reason="IMPORT_OUT_OF_MEMORY")
-        _log.error("import process failed (%s): %s", outcome, outcome.stderr[-4000:].decode("utf-8", "replace"))
+        ending = f"status {outcome.exit_status}, signal {outcome.signal}, stopped {outcome.stopped}"
+        _log.error("import process failed (%s): %s", ending, outcome.stderr[-4000:].decode("utf-8", "replace"))
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
     reason = values.get("reason")
     if reason is None:

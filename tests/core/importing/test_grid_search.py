@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from regnf_core.importing.families.grid_search import FoundGrid, GridHabits, find_grid
+from regnf_core.importing.upload_description import GridDescription
+from tests.core.importing.archives import assert_refused
+
+HABITS = GridHabits((2, 4, 8), ((16, 2048), (16, 512), (64, 4096)), "smoothstep")
+
+
+def find(parameters: int, width: int, **wanted: Any) -> FoundGrid:
+    return find_grid(parameters, width, HABITS, GridDescription(**wanted))
+
+
+def test_the_published_sizes_are_recognised() -> None:
+    """12 196 240 and 446 837 120 are what tiny-cuda-nn reports for neus-facto's and angelo's grids."""
+    facto = find(12_196_240, 32)
+    assert not facto.ambiguous
+    assert (facto.config.levels, facto.config.features_per_level, facto.config.log2_table_size) == (16, 2, 19)
+    assert facto.config.per_level_scale == pytest.approx(1.3819128799677762, abs=1e-15)
+    angelo = find(446_837_120, 128).config
+    assert (angelo.levels, angelo.features_per_level, angelo.log2_table_size) == (16, 8, 22)
+    assert angelo.base_resolution == 64
+
+
+@pytest.mark.parametrize("log2_size", range(14, 23))
+def test_every_usual_table_size_is_told_by_its_total(log2_size: int) -> None:
+    """Totals by hand: the dense lattices of neus-facto's resolutions, rounded up to eights, capped at 2^T."""
+    resolutions = [16, 23, 31, 43, 59, 81, 112, 154, 213, 295, 407, 562, 777, 1073, 1483, 2048]
+    entries = sum(min((r**3 + 7) // 8 * 8, 2**log2_size) for r in resolutions)
+    found = find(2 * entries, 32)
+    assert found.config.log2_table_size == log2_size
+    assert not found.ambiguous
+
+
+def test_another_machines_rounding_is_settled_by_the_total() -> None:
+    """base 16, top 512: the resolutions double every third level, where exp2f decides between 32 and 33, 64 and 65."""
+    others = [r**3 for r in (16, 21, 26, 41, 51)]
+    exact, bumped = [32**3, 64**3], [33**3, 65**3]
+    hashed = 9 * 2**19
+    for doubtful, expected in ((exact, (32, 64)), (bumped, (33, 65)), ([32**3, 65**3], (32, 65))):
+        entries = sum((nodes + 7) // 8 * 8 for nodes in others + doubtful) + hashed
+        resolutions = find(2 * entries, 32, top_resolution=512).config.level_resolutions()
+        assert (resolutions[3], resolutions[6]) == expected
+
+
+def test_a_table_that_fits_several_grids_says_so() -> None:
+    assert find(16 * 4096 * 2, 32).ambiguous
+
+
+def test_the_description_narrows_the_search() -> None:
+    found = find(16 * 4096 * 2, 32, base_resolution=16, top_resolution=512, features_per_level=2)
+    assert not found.ambiguous
+    assert found.config.scales()[-1] == pytest.approx(511, abs=0.01)
+    assert find(12_196_240, 32, interpolation="linear").config.interpolation == "linear"
+
+
+def test_no_usual_grid_is_a_refusal() -> None:
+    assert_refused(lambda: find(12_196_241, 32), "HASH_GRID_NOT_RECOGNISED")
+    assert_refused(lambda: find(12_196_240, 33), "HASH_GRID_NOT_RECOGNISED")
+    assert_refused(lambda: find(2, 1_000_000), "HASH_GRID_NOT_RECOGNISED")

@@ -1,0 +1,113 @@
+"""Checkpoints made by the families' own trainers, against values computed by the families' own code."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.safe_format import open_field
+from regnf_core.importing.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate import import_field
+from regnf_core.importing.report import ImportLimits
+from tests.devdata import dev_data
+
+ANGELO_GRID = {"hash": {"base_resolution": 16, "top_resolution": 512, "features_per_level": 8}}
+_opened: list[str] = []
+_watching = False
+
+
+def _audit(event: str, arguments: tuple[Any, ...]) -> None:
+    if _watching and event == "open":
+        _opened.append(str(arguments[0]))
+
+
+def only_file(folder: Path, suffixes: set[str]) -> Path:
+    (path,) = [path for path in folder.rglob("*") if path.suffix in suffixes]
+    return path
+
+
+def assert_reproduces(field_file: Path, folder: Path) -> None:
+    """Distances within 1e-5 of their range, gradients within 1e-3."""
+    points = torch.from_numpy(np.load(folder / "points.npy"))
+    distance, gradient = open_field(field_file).signed_distance_and_gradient(points)
+    expected = np.load(folder / "sdf.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+    np.testing.assert_allclose(gradient.numpy(), np.load(folder / "gradient.npy"), rtol=0, atol=1e-3)
+
+
+def test_sdfstudio_through_the_gate(tmp_path: Path) -> None:
+    folder = dev_data("formats", "sdfstudio_neus_facto")
+    report = import_field(only_file(folder, {".ckpt"}), tmp_path)
+    assert report.family == "sdfstudio_neus_facto"
+    assert report.warnings == ()
+    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.02)
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+
+
+@pytest.mark.parametrize(
+    ("family", "description"),
+    [
+        ("sdfstudio_neus_facto", None),
+        ("nerfstudio_neus_facto", None),
+        ("sdfstudio_neus", None),
+        ("sdfstudio_neus_facto_angelo", ANGELO_GRID),
+    ],
+)
+def test_every_variant_is_recognised_and_reproduced(
+    tmp_path: Path, family: str, description: dict[str, Any] | None
+) -> None:
+    folder = dev_data("formats", family)
+    report = convert_file(only_file(folder, {".ckpt"}), tmp_path, description, ImportLimits())
+    assert report["family"] == family
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+
+
+def test_the_contraction_may_be_asked_for(tmp_path: Path) -> None:
+    folder = dev_data("formats", "sdfstudio_neus_facto")
+    convert_file(only_file(folder, {".ckpt"}), tmp_path, {"contraction": "linf"}, ImportLimits())
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(np.load(folder / "points.npy")))
+    expected = np.load(folder / "sdf_contracted.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+
+
+def test_the_trainers_configuration_is_never_opened(tmp_path: Path) -> None:
+    """Its YAML holds object tags that run code in an unsafe loader."""
+    global _watching
+    checkpoint = only_file(dev_data("formats", "sdfstudio_neus_facto"), {".ckpt"})
+    sys.addaudithook(_audit)
+    _watching = True
+    try:
+        convert_file(checkpoint, tmp_path, None, ImportLimits())
+    finally:
+        _watching = False
+    assert str(checkpoint) in _opened
+    assert not [name for name in _opened if name.endswith((".yml", ".yaml"))]
+
+
+@pytest.mark.parametrize(
+    ("family", "name"),
+    [
+        ("neus", "NeuS"),
+        ("instant_nsr_pl", "instant-nsr-pl"),
+        ("neuralangelo", "Neuralangelo"),
+        ("pin_slam", "PIN-SLAM"),
+    ],
+)
+def test_other_families_are_refused_by_name(tmp_path: Path, family: str, name: str) -> None:
+    checkpoint = only_file(dev_data("formats", family), {".ckpt", ".pth", ".pt"})
+    with pytest.raises(FieldFormatError, match=name) as caught:
+        convert_file(checkpoint, tmp_path, None, ImportLimits())
+    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
+
+
+def test_a_legacy_file_is_refused_by_name(tmp_path: Path) -> None:
+    checkpoint = dev_data("formats", "deepsdf") / "examples" / "toys" / "ModelParameters" / "latest.pth"
+    with pytest.raises(FieldFormatError) as caught:
+        convert_file(checkpoint, tmp_path, None, ImportLimits())
+    assert caught.value.reason == "LEGACY_TORCH_FILE"
