@@ -76,7 +76,7 @@ def test_mesh_loads_a_scene_graph(tmp_path: Path) -> None:
         pose = np.eye(4)
         pose[0, 3] = x
         scene.add_geometry(trimesh.creation.box((0.2, 0.2, 0.2)), transform=pose)
-    (tmp_path / "pair.glb").write_bytes(trimesh.exchange.gltf.export_glb(scene))
+    (tmp_path / "pair.glb").write_bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
     field = MeshField.load(tmp_path / "pair.glb")
     torch.testing.assert_close(field.bounds, torch.tensor([[-1.1, -0.1, -0.1], [1.1, 0.1, 0.1]], dtype=torch.float64))
     points = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])

@@ -61,10 +61,12 @@ def test_starts_as_a_signed_distance() -> None:
     # Geometric initialisation nears |x| - radius as the layers widen.
     wide = FitOptions(**(vars(OPTIONS) | {"hidden_width": 1024}))
     network = TrainableField(wide, radius=0.5, generator=torch.Generator().manual_seed(0))
-    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(1))
+    directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(1)))
     with torch.no_grad():
-        start = network.function().value(points)
-    torch.testing.assert_close(start + 0.5, points.norm(dim=1), rtol=0.2, atol=0.02)
+        outside = network.function().value(1.5 * directions)
+        inside = network.function().value(0.1 * directions)
+    torch.testing.assert_close(outside, torch.ones(200), rtol=0, atol=0.25)
+    assert (inside < 0).all()
 
 
 def test_progress_may_stop_the_fit(tmp_path: Path) -> None:
