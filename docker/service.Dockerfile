@@ -1,0 +1,34 @@
+# The HTTP front end: contract, routes, storage, queue client, page. It never loads torch, and torch is not in here.
+#   docker build -f docker/service.Dockerfile -t regnf-service .
+
+FROM python:3.11-slim-bookworm AS build
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+RUN python -m venv /opt/regnf
+ENV PATH=/opt/regnf/bin:$PATH
+WORKDIR /source
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY regnf_core regnf_core
+COPY regnf_cli regnf_cli
+COPY service service
+COPY worker worker
+RUN pip install --constraint constraints.txt ".[service]"
+
+FROM python:3.11-slim-bookworm
+# The state folder belongs to the user, so that a fresh volume mounted there does as well.
+RUN groupadd --system --gid 10001 regnf \
+    && useradd --system --uid 10001 --gid regnf --home-dir /tmp --no-create-home regnf \
+    && install --directory --owner regnf --group regnf --mode 0750 /var/lib/regnf
+COPY --from=build /opt/regnf /opt/regnf
+ENV PATH=/opt/regnf/bin:$PATH \
+    HOME=/tmp \
+    PYTHONUNBUFFERED=1 \
+    PYTHONDONTWRITEBYTECODE=1 \
+    REGNF_STATE_DIR=/var/lib/regnf
+USER 10001:10001
+WORKDIR /var/lib/regnf
+VOLUME ["/var/lib/regnf"]
+EXPOSE 8080
+HEALTHCHECK --interval=15s --timeout=5s --start-period=20s --retries=3 \
+    CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8080/healthz', timeout=4)"]
+CMD ["python", "-m", "uvicorn", "--factory", "service.app:create_app", "--host", "0.0.0.0", "--port", "8080", \
+     "--no-server-header", "--timeout-graceful-shutdown", "15"]

@@ -1,0 +1,50 @@
+"""Whether the worker of this container is alive: Redis knows one of this host that has reported lately.
+
+A worker's registration in Redis expires unless the worker renews it, so a process that hangs, has lost Redis or was
+stopped is told from one that works or waits. Exit status 0 when alive, 1 with a word on stderr when not.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+from typing import Any
+
+from redis import Redis, RedisError
+from rq.worker_registration import WORKERS_BY_QUEUE_KEY
+
+from service.queue import QUEUE_NAME
+from service.settings import Settings
+
+_TIMEOUT_S = 5.0
+
+
+def is_alive(redis: Redis, hostname: str) -> bool:
+    """True when a worker of this host is registered for the queue, has not expired and has not said goodbye."""
+    names: Any = redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)
+    for name in names:
+        answer: Any = redis.hmget(name, ["hostname", "death"])
+        known, dead = answer
+        if known is not None and known.decode() == hostname and dead is None:
+            return True
+    return False
+
+
+def main() -> int:
+    url = Settings().redis_url
+    if url is None:
+        sys.stderr.write("REGNF_REDIS_URL is not set\n")
+        return 1
+    try:
+        with Redis.from_url(url, socket_timeout=_TIMEOUT_S, socket_connect_timeout=_TIMEOUT_S) as redis:
+            if is_alive(redis, socket.gethostname()):
+                return 0
+    except RedisError as error:
+        sys.stderr.write(f"Redis does not answer: {error}\n")
+        return 1
+    sys.stderr.write("no worker of this host has reported lately\n")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""The compose file: valid, hardened, and saying what the documentation says."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.settings import Settings
+from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
+
+every_service = pytest.mark.parametrize("name", ["redis", "api", "worker"])
+# Read by the compose file itself, not by the program.
+COMPOSE_ONLY = {"REGNF_PUBLISH"}
+
+
+def settings_names() -> set[str]:
+    return {f"REGNF_{name.upper()}" for name in Settings.model_fields}
+
+
+def test_follows_the_compose_specification() -> None:
+    checker = Path(sys.executable).with_name("check-jsonschema")
+    command = [str(checker), "--builtin-schema", "vendor.compose-spec", str(COMPOSE)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+def test_holds_exactly_these_services() -> None:
+    assert set(services()) == {"redis", "api", "worker"}
+
+
+@every_service
+def test_is_hardened(name: str) -> None:
+    service = services()[name]
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert service["read_only"] is True
+    assert any(entry.startswith("/tmp") for entry in service["tmpfs"])
+    assert service["restart"] == "unless-stopped"
+    assert service["healthcheck"]["test"]
+    limits = service["deploy"]["resources"]["limits"]
+    assert {"memory", "pids"} <= set(limits)
+    assert "privileged" not in service
+    assert "cap_add" not in service
+
+
+def test_redis_forgets_nothing() -> None:
+    redis = services()["redis"]
+    command = " ".join(redis["command"])
+    assert "--appendonly yes" in command
+    assert "--appendfsync everysec" in command
+    assert "--maxmemory-policy noeviction" in command
+    assert redis["volumes"] == ["redis:/data"]
+    assert "ports" not in redis
+    assert redis["user"].split(":")[0] not in ("0", "root")
+    memory = re.search(r"--maxmemory (\d+)mb", command)
+    assert memory is not None
+    # rewriting the append-only file may need the memory once more
+    assert int(memory[1]) * 2 <= int(redis["deploy"]["resources"]["limits"]["memory"].removesuffix("M"))
+
+
+@pytest.mark.parametrize("name", ["api", "worker"])
+def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
+    service = services()[name]
+    assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
+    assert service["volumes"] == ["state:/var/lib/regnf"]
+    assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
+    assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
+
+
+def test_volumes_and_networks_are_declared() -> None:
+    document = compose()
+    used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
+    assert used == set(document["volumes"])
+    assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
+
+
+def test_only_the_api_can_be_reached_and_only_from_this_machine() -> None:
+    published = {name: service["ports"] for name, service in services().items() if "ports" in service}
+    assert published == {"api": ["${REGNF_PUBLISH:-127.0.0.1:8080}:8080"]}
+    assert compose()["networks"]["inside"] == {"internal": True}
+    for name in ("redis", "worker"):
+        assert services()[name]["networks"] == ["inside"]
+
+
+def test_no_tokens_is_nobodys_default() -> None:
+    environment = services()["api"]["environment"]
+    assert environment["REGNF_HOST"] == "0.0.0.0"
+    assert environment["REGNF_ALLOW_UNAUTHENTICATED"] == "${REGNF_ALLOW_UNAUTHENTICATED:-false}"
+    assert environment["REGNF_API_TOKENS"] == "${REGNF_API_TOKENS:-[]}"
+
+
+def test_every_variable_is_a_setting() -> None:
+    texts = [path.read_text() for path in (COMPOSE, *DOCKERFILES)]
+    named = set(re.findall(r"REGNF_[A-Z_]*[A-Z]", "\n".join(texts)))
+    assert named - COMPOSE_ONLY <= settings_names()
+
+
+def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The environment that compose hands over by default is one that Settings understands."""
+    for name in ("api", "worker"):
+        for variable, value in services()[name]["environment"].items():
+            default = re.fullmatch(r"\$\{\w+:-(.*)\}", value)
+            monkeypatch.setenv(variable, default[1] if default else value)
+    settings = Settings()
+    assert settings.api_tokens == frozenset()
+    assert settings.allow_unauthenticated is False
+    assert settings.threads == 2
+
+
+@pytest.mark.parametrize("name", ["api", "worker"])
+def test_is_built_from_a_dockerfile_that_exists(name: str) -> None:
+    build: dict[str, Any] = services()[name]["build"]
+    context = (COMPOSE.parent / build["context"]).resolve()
+    assert context == ROOT
+    assert (context / build["dockerfile"]).is_file()
+
+
+def test_the_worker_can_hold_an_import() -> None:
+    memory = services()["worker"]["deploy"]["resources"]["limits"]["memory"]
+    assert int(memory.removesuffix("G")) * 2**30 > Settings.model_fields["import_memory_bytes"].default

@@ -1,0 +1,81 @@
+"""The images: linted, small, without root, and torch only where it belongs. No container engine is needed."""
+
+from __future__ import annotations
+
+import fnmatch
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.docker.files import DOCKERFILES, ROOT, command_of, copied_sources, instructions, last_stage
+
+every_image = pytest.mark.parametrize("path", DOCKERFILES, ids=lambda path: path.stem)
+SERVICE, WORKER = DOCKERFILES
+
+
+@every_image
+def test_hadolint_finds_nothing(path: Path) -> None:
+    linter = Path(sys.executable).with_name("hadolint")
+    run = subprocess.run([linter, path], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout + run.stderr) == (0, "")
+
+
+@every_image
+def test_built_in_two_stages_on_the_pinned_base(path: Path) -> None:
+    bases = [rest for name, rest in instructions(path) if name == "FROM"]
+    assert bases == ["python:3.11-slim-bookworm AS build", "python:3.11-slim-bookworm"]
+    assert any(name == "COPY" and rest.startswith("--from=build ") for name, rest in last_stage(path))
+    assert not any("pip install" in rest for _, rest in last_stage(path))
+
+
+@every_image
+def test_runs_as_a_user_and_reports_its_health(path: Path) -> None:
+    stage = last_stage(path)
+    (user,) = [rest for name, rest in stage if name == "USER"]
+    assert user == "10001:10001"
+    assert [name for name, _ in stage].count("HEALTHCHECK") == 1
+    assert any(name == "RUN" and "--uid 10001" in rest and "--gid 10001" in rest for name, rest in stage)
+
+
+@every_image
+def test_every_install_is_constrained(path: Path) -> None:
+    installs = [rest for name, rest in instructions(path) if name == "RUN" and "pip install" in rest]
+    assert installs
+    assert all("--constraint constraints.txt" in rest for rest in installs)
+
+
+@every_image
+def test_every_copied_source_exists_and_is_sent_to_the_builder(path: Path) -> None:
+    patterns = [line for line in (ROOT / ".dockerignore").read_text().splitlines() if line and not line.startswith("#")]
+    assert patterns[0] == "*"
+    admitted = [pattern[1:] for pattern in patterns if pattern.startswith("!")]
+    for source in copied_sources(path):
+        assert (ROOT / source).exists(), source
+        assert any(fnmatch.fnmatch(source, pattern) for pattern in admitted), source
+
+
+def test_the_service_image_has_no_torch() -> None:
+    text = " ".join(rest for _, rest in instructions(SERVICE))
+    assert not re.search(r"torch|open3d|engine|all\]", text)
+    assert '".[service]"' in text
+
+
+def test_the_worker_image_has_the_engine_and_its_libraries() -> None:
+    text = " ".join(rest for _, rest in instructions(WORKER))
+    assert '".[engine,service]"' in text
+    wanted = re.search(r"runtime=\(([^)]*)\)", (ROOT / "scripts" / "system-packages.sh").read_text())
+    assert wanted is not None
+    assert set(wanted[1].split()) <= set(text.split())
+
+
+@every_image
+def test_the_started_module_exists(path: Path) -> None:
+    command = command_of(path)
+    assert command[:2] == ["python", "-m"]
+    targets = [command[2]] + [word.split(":")[0] for word in command[3:] if re.fullmatch(r"[\w.]+:\w+", word)]
+    for target in targets:
+        assert importlib.util.find_spec(target) is not None, target

@@ -1,0 +1,92 @@
+"""The worker's health check against a real Redis and the keys that RQ itself writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import pytest
+from redis import Redis
+from rq import Queue, Worker
+
+from service.queue import QUEUE_NAME
+from tests.docker.files import ROOT
+from tests.redis_server import private_redis
+
+SCRIPT = ROOT / "docker" / "worker_health.py"
+
+
+@pytest.fixture(scope="module")
+def health() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("worker_health", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    with private_redis() as url:
+        yield url
+
+
+@pytest.fixture
+def redis(address: str) -> Iterator[Redis]:
+    with Redis.from_url(address) as client:
+        client.flushall()
+        yield client
+
+
+def worker_of(redis: Redis, hostname: str) -> Any:
+    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis, name=f"{hostname}-1")
+    worker.hostname = hostname
+    worker.register_birth()
+    return worker
+
+
+def test_a_registered_worker_is_alive(health: ModuleType, redis: Redis) -> None:
+    worker_of(redis, "here")
+    assert health.is_alive(redis, "here")
+
+
+def test_another_hosts_worker_does_not_count(health: ModuleType, redis: Redis) -> None:
+    worker_of(redis, "elsewhere")
+    assert not health.is_alive(redis, "here")
+
+
+def test_a_worker_that_said_goodbye_is_not_alive(health: ModuleType, redis: Redis) -> None:
+    worker_of(redis, "here").register_death()
+    assert not health.is_alive(redis, "here")
+
+
+def test_a_worker_that_stopped_reporting_is_not_alive(health: ModuleType, redis: Redis) -> None:
+    worker = worker_of(redis, "here")
+    assert redis.ttl(worker.key) > 0  # the registration runs out by itself ...
+    redis.delete(worker.key)  # ... as it has now
+    assert not health.is_alive(redis, "here")
+
+
+@pytest.mark.parametrize(
+    ("url", "said"), [(None, "REGNF_REDIS_URL is not set"), ("unix:///nowhere/socket", "Redis does not answer")]
+)
+def test_says_what_is_wrong(url: str | None, said: str) -> None:
+    environment = {"PYTHONPATH": str(ROOT)} | ({"REGNF_REDIS_URL": url} if url else {})
+    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert said in run.stderr
+
+
+def test_exit_status_follows_the_worker(address: str, redis: Redis) -> None:
+    environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": address}
+    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
+    worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)
+    worker.register_birth()
+    run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
