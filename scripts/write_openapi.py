@@ -1,0 +1,28 @@
+"""Write openapi.yaml from the application. Run it whenever the contract changes; a test compares the two.
+
+python scripts/write_openapi.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from service.app import create_app
+from service.contract import contract_yaml
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.settings import Settings
+
+TARGET = Path(__file__).resolve().parents[1] / "openapi.yaml"
+
+
+def current_contract() -> str:
+    """The contract of the application as it is now."""
+    with TemporaryDirectory() as folder:
+        settings = Settings(state_dir=Path(folder), redis_url=None, api_tokens=frozenset())
+        return contract_yaml(create_app(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()))
+
+
+if __name__ == "__main__":
+    TARGET.write_text(current_contract(), encoding="utf-8")
+    print(f"wrote {TARGET.name}")

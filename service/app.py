@@ -1,0 +1,111 @@
+"""The HTTP application. `create_app` is the factory that servers call; tests hand it their own stores."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from pathlib import Path
+
+from fastapi import FastAPI
+from redis import Redis
+from redis.exceptions import RedisError
+from starlette.middleware import Middleware
+from starlette.staticfiles import StaticFiles
+
+from regnf_core import __version__
+from service import problems
+from service.blobs import BlobStore
+from service.contract import build_contract
+from service.dependencies import Services, off_loop
+from service.local_blobs import LocalBlobStore
+from service.middleware import RequestContext, TokenGate
+from service.queue import JobQueue
+from service.reaper import Reaper
+from service.records import RecordStore
+from service.redis_client import connect
+from service.redis_queue import RqJobQueue
+from service.redis_records import RedisRecordStore
+from service.routes import fields, jobs, meta, pages, registrations, results, uploads
+from service.settings import Settings
+from service.shutdown import stopping_on_signals
+from service.waiting import pause
+
+logger = logging.getLogger(__name__)
+_REAP_EVERY_S = 15.0
+_ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router, pages.router, meta.router)
+
+
+class ConfigurationError(RuntimeError):
+    """The service cannot start as it is configured."""
+
+    reason = "CONFIGURATION"
+
+
+def create_app(
+    settings: Settings | None = None,
+    records: RecordStore | None = None,
+    blobs: BlobStore | None = None,
+    queue: JobQueue | None = None,
+) -> FastAPI:
+    """The application over the given stores, or over Redis and the local folder that the settings name.
+
+    Raises ConfigurationError when stores are missing and no Redis is named.
+    """
+    settings = settings or Settings()
+    redis: Redis | None = None
+    if records is None or queue is None:
+        if settings.redis_url is None:
+            raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
+        redis = connect(settings.redis_url)
+        records = records or RedisRecordStore(redis, settings.retention_s)
+        queue = queue or RqJobQueue(redis)
+    services = Services(settings, records, blobs or LocalBlobStore(settings.blob_dir), queue)
+    app = FastAPI(
+        title="regnf",
+        version=__version__,
+        openapi_url=None,
+        docs_url=None,
+        redoc_url=None,
+        generate_unique_id_function=lambda route: route.name,
+        lifespan=_lifespan_of(services, redis),
+        middleware=[Middleware(RequestContext), Middleware(TokenGate, tokens=settings.api_tokens)],
+    )
+    app.state.services = services
+    for router in _ROUTERS:
+        app.include_router(router)
+    # read before the second mounting, which is the same contract under another prefix
+    contract = build_contract(app)
+    app.openapi = lambda: contract  # type: ignore[method-assign]
+    for router in _ROUTERS:
+        app.include_router(router, prefix="/v1", include_in_schema=False)
+    app.mount("/static", StaticFiles(directory=Path(__file__).with_name("web")), name="static")
+    problems.install(app)
+    return app
+
+
+def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
+        with stopping_on_signals(services.stopping):
+            yield
+        services.stopping.set()
+        if reaping is not None:
+            await reaping
+        if redis is not None:
+            redis.close()
+
+    return lifespan
+
+
+async def _reap(services: Services, redis: Redis) -> None:
+    """Look after lost jobs every fifteen seconds until the service stops."""
+    reaper = Reaper(services.records, services.queue, redis, services.settings, services.blobs)
+    while not services.stopping.is_set():
+        try:
+            await off_loop(reaper.run_once)
+        except (RedisError, OSError) as error:
+            logger.warning("the reaper found a store away: %s", type(error).__name__)
+        await pause(_REAP_EVERY_S, services.stopping)

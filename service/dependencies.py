@@ -1,0 +1,65 @@
+"""What routes are given: the stores, and the small readings of a request that several of them share."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from typing import Annotated, Any, TypeVar
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import Depends, Query
+from starlette.requests import Request
+
+from service.blobs import BlobStore
+from service.queue import JobQueue
+from service.records import RecordStore
+from service.settings import Settings
+from service.uploads import Upload, open_upload
+
+_UPLOAD_THREADS = 4
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Services:
+    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
+
+    settings: Settings
+    records: RecordStore
+    blobs: BlobStore
+    queue: JobQueue
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    # threads of their own: uploads to a slow disk must not keep a poll waiting for one
+    upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
+
+    def open_upload(self) -> AbstractAsyncContextManager[Upload]:
+        """A new upload into the blob store, within the settings' limit."""
+        return open_upload(self.blobs, self.settings.max_upload_bytes, self.upload_limiter)
+
+
+def services_of(request: Request) -> Services:
+    services: Services = request.app.state.services
+    return services
+
+
+def prefix_of(request: Request) -> str:
+    """What the caller's paths begin with: "" or "/v1", behind whatever a proxy put in front."""
+    root = str(request.scope.get("root_path", ""))
+    path = request.scope["path"].removeprefix(root)
+    return root + ("/v1" if path == "/v1" or path.startswith("/v1/") else "")
+
+
+async def off_loop(work: Callable[..., _Result], *arguments: Any) -> _Result:
+    """Run blocking work, a call of a store, in a thread."""
+    return await to_thread.run_sync(work, *arguments)
+
+
+ServicesDep = Annotated[Services, Depends(services_of)]
+PrefixDep = Annotated[str, Depends(prefix_of)]
+WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
+LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]
+PageTokenQuery = Annotated[
+    str | None, Query(max_length=200, description="`next_page_token` of the page before.", examples=[None])
+]

@@ -1,0 +1,111 @@
+"""Every reason the HTTP interface can give, with its status, title and meaning: the table that clients program against.
+
+Stable: a reason is never renamed, and never changes its meaning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One way to be refused: its HTTP status, a short title, and what the caller can do about it."""
+
+    status: int
+    title: str
+    meaning: str
+
+
+REASONS: dict[str, Reason] = {
+    # the request as such
+    "MALFORMED_JSON": Reason(
+        400, "Malformed JSON", "The body is not one JSON value in UTF-8, names a member twice, or nests too deeply."
+    ),
+    "INVALID_QUERY": Reason(400, "Invalid query", "`errors` names the parameters of the wrong type or out of range."),
+    "INVALID_PAGE_TOKEN": Reason(400, "Invalid page token", "Use `next_page_token` of the page before, unchanged."),
+    "INVALID_HEADER": Reason(400, "Invalid header", "A request header does not follow its grammar or its limits."),
+    "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is no id of an event of this service."),
+    "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a token that holds."),
+    "NOT_FOUND": Reason(404, "Not found", "There is nothing under this address. `GET /` names every address."),
+    "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
+    "CONFLICT": Reason(409, "Conflict", "Somebody else changed the same thing at the same time. Look again, repeat."),
+    "REQUEST_TOO_LARGE": Reason(413, "Request too large", "The JSON or a text part exceeds the service's limit."),
+    "UNSUPPORTED_MEDIA_TYPE": Reason(
+        415, "Unsupported media type", "The `Content-Type` or `Content-Encoding` is not one this address takes."
+    ),
+    "INVALID_REQUEST": Reason(422, "Invalid request", "`errors` points at the members that are wrong."),
+    # multipart
+    "MALFORMED_MULTIPART": Reason(400, "Malformed multipart body", "The parts or their headers cannot be told apart."),
+    "MISSING_PART": Reason(400, "Missing part", "A part that this address needs is not there."),
+    "UNKNOWN_PART": Reason(400, "Unknown part", "The body has a part that this address does not know."),
+    "DUPLICATE_PART": Reason(400, "Duplicate part", "Two parts bear the same name."),
+    # uploads
+    "INVALID_DIGEST": Reason(400, "Invalid digest", "A SHA-256 is 64 lower-case hexadecimal digits."),
+    "DIGEST_MISMATCH": Reason(400, "Digest mismatch", "The bytes that arrived are not the bytes that were announced."),
+    "UPLOAD_EMPTY": Reason(400, "Empty upload", "The upload has no bytes."),
+    "UPLOAD_INCOMPLETE": Reason(400, "Incomplete upload", "The body ended before its declared length."),
+    "UPLOAD_STALLED": Reason(408, "Upload stalled", "The body sent nothing for too long. Nothing was kept."),
+    "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
+    "FIELD_NOT_RECOGNISED": Reason(
+        415, "Not a field file", "The first bytes are neither a PyTorch zip archive's nor a safetensors file's."
+    ),
+    "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
+    # fields
+    "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
+    "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
+    "FIELD_DESCRIPTION_DIFFERS": Reason(
+        409, "Field held with another description", "The same bytes are held as another function. Delete them first."
+    ),
+    "FIELD_REJECTED": Reason(
+        422, "Field was rejected", "The import refused the file; `GET /fields/{sha256}` says why in `error`."
+    ),
+    "INVALID_DESCRIPTION": Reason(422, "Invalid description", "`errors` points at the members that are wrong."),
+    # registration requests
+    "INVALID_IDEMPOTENCY_KEY": Reason(
+        400, "Invalid idempotency key", "The key is empty, longer than 255 characters, or not printable ASCII."
+    ),
+    "IDEMPOTENCY_KEY_REUSED": Reason(
+        422, "Idempotency key reused", "The key came with another request within the last 24 hours. Use a new one."
+    ),
+    "INVALID_DETECTION": Reason(
+        422, "Invalid detection", "The box is malformed: every number finite, every edge positive, min below max."
+    ),
+    "INVALID_OPTIONS": Reason(422, "Invalid options", "An option is unknown, of the wrong type or out of its range."),
+    "INVALID_TRANSFORM": Reason(
+        422,
+        "Invalid transform",
+        "The matrix is no similarity transform: s R | t with s > 0, R a rotation, last row 0 0 0 1.",
+    ),
+    "DETECTION_OUTSIDE_SCENE": Reason(
+        422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
+    ),
+    "QUEUE_FULL": Reason(503, "Queue full", "As many jobs are active as the service takes. Retry after `Retry-After`."),
+    # jobs
+    "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
+    "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
+    "JOB_NOT_READY": Reason(409, "Job not finished", "The job has no result yet. Retry after `Retry-After`."),
+    "JOB_DISMISSED": Reason(409, "Job was dismissed", "The job was cancelled. Post the request again to run it."),
+    "JOB_FINISHED": Reason(409, "Job has finished", "A job that succeeded or failed can no longer be cancelled."),
+    "JOB_ACTIVE": Reason(409, "Job is active", "Cancel the job before you delete it."),
+    "JOB_EXPIRED": Reason(410, "Job has expired", "The job outlived its retention. Post the request again."),
+    "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
+    # what a job can end with
+    "NO_SURFACE_IN_DETECTION": Reason(
+        422, "No surface in the detection", "Too few surface points were found in the box. Check the box, or the scene."
+    ),
+    "NO_SURFACE_IN_OBJECT": Reason(422, "No surface in the object", "The object's field has no zero level to be seen."),
+    "NO_INITIAL_TRANSFORM": Reason(
+        422, "No initial transform", "No first guess was found. The surfaces may have nothing in common."
+    ),
+    "CANCELLED": Reason(409, "Cancelled", "The job stopped because it was cancelled."),
+    "FIELD_IMPORT_TIMEOUT": Reason(422, "Import took too long", "The field could not be converted in time."),
+    "JOB_TIMEOUT": Reason(500, "Job took too long", "The job exceeded its time and was stopped."),
+    "WORKER_LOST": Reason(500, "Worker lost", "The worker vanished twice while it ran this job. Post it again."),
+    "OUT_OF_MEMORY": Reason(500, "Out of memory", "The job needed more memory than the worker has."),
+    # the service itself
+    "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
+    "STORE_UNAVAILABLE": Reason(503, "Records unavailable", "The record store does not answer. Retry later."),
+    "STORAGE_UNAVAILABLE": Reason(503, "Storage unavailable", "The blob storage does not answer. Retry later."),
+    "INTERNAL": Reason(500, "Internal error", "A fault of ours. The log has it under the request id."),
+}

@@ -1,0 +1,107 @@
+"""From a checked question to a job: fields looked up, the box compared with the scene, the job recorded and queued."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from service.boxes import boxes_overlap
+from service.canonical import digest, job_id_of
+from service.dependencies import Services
+from service.problems import Problem
+from service.records import FieldRecord, JobRecord
+
+_KEY_LIFETIME_S = 24 * 3600
+_MAX_KEY_LENGTH = 255
+
+
+def check_idempotency_key(key: str | None) -> None:
+    """Raises Problem INVALID_IDEMPOTENCY_KEY."""
+    if key is not None and not (0 < len(key) <= _MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
+        raise Problem("INVALID_IDEMPOTENCY_KEY")
+
+
+def check_fields(services: Services, request: dict[str, Any], arriving: bool = False) -> None:
+    """Refuse what can be refused now; a field that is still validating is waited for by the worker.
+
+    ``arriving``: the fields' bytes are here and will be taken in next, so it is no fault that they are not held.
+    Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE.
+    """
+    found = {name: services.records.get_field(request[name]) for name in ("scene", "object")}
+    if not arriving:
+        for name, record in found.items():
+            _require_usable(name, record)
+    bounds = _bounds(found["scene"])
+    box = request["detection"]
+    if bounds is None or boxes_overlap(box["centre"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
+        return
+    raise Problem("DETECTION_OUTSIDE_SCENE", errors=[{"pointer": "/detection", "detail": "outside the scene's bounds"}])
+
+
+def _require_usable(name: str, record: FieldRecord | None) -> None:
+    if record is None:
+        raise Problem("FIELD_NOT_FOUND", errors=[{"pointer": f"/{name}", "detail": "no such field"}])
+    if record.state == "rejected":
+        why = str((record.error or {}).get("reason", "unknown"))
+        raise Problem("FIELD_REJECTED", errors=[{"pointer": f"/{name}", "detail": f"rejected: {why}"}])
+
+
+def _bounds(scene: FieldRecord | None) -> tuple[Sequence[float], Sequence[float]] | None:
+    """Lowest and highest corner of a ready scene, as its import reported them."""
+    match scene.report.get("bounds") if scene is not None else None:
+        case [[_, _, _] as lower, [_, _, _] as upper]:
+            return lower, upper
+        case {"min": [_, _, _] as lower, "max": [_, _, _] as upper}:
+            return lower, upper
+    return None
+
+
+def submit(services: Services, request: dict[str, Any], idempotency_key: str | None) -> JobRecord:
+    """The job for a canonical request: a new one, or the one that exists, queued if it has not run.
+
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError.
+    """
+    job_id = job_id_of(request)
+    if idempotency_key is not None:
+        existing = _earlier_answer(services, idempotency_key, job_id)
+        if existing is not None:
+            return existing
+    now = services.records.now()
+    record, _ = services.records.create_job(
+        JobRecord(
+            id=job_id,
+            kind="registration",
+            status="accepted",
+            request=request,
+            inputs=_inputs(request),
+            created=now,
+            updated=now,
+        ),
+        services.settings.max_queued_jobs,
+    )
+    if record.status == "accepted":
+        # also for a job known before: mends one that was recorded but never queued
+        services.queue.enqueue_registration(record.id, record.attempt)
+    return record
+
+
+def _earlier_answer(services: Services, key: str, job_id: str) -> JobRecord | None:
+    """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
+    mine = f"{job_id} {services.records.now()!r}"
+    bound = services.records.remember(f"idempotency:{digest(key)}", mine, _KEY_LIFETIME_S)
+    bound_id, _, bound_at = bound.partition(" ")
+    if bound_id != job_id:
+        raise Problem("IDEMPOTENCY_KEY_REUSED")
+    known = services.records.get_job(job_id) if bound != mine else None
+    # a job that has not changed since the key came up is not that call's doing: the call never got so far
+    return known if known is not None and known.updated >= float(bound_at) else None
+
+
+def _inputs(request: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "scene": request["scene"],
+        "object": request["object"],
+        "detection": request["detection"],
+        "seed": request["seed"],
+        "options_sha256": digest(request["options"]),
+    }

@@ -1,0 +1,51 @@
+"""How routes say in the contract what they answer: refusals by their reasons, headers by their names."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+from service.problems import MEDIA_TYPE
+from service.reasons import REASONS
+
+_PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
+JSON = "application/json"
+
+
+def refusals(*reasons: str) -> dict[int | str, dict[str, Any]]:
+    """The responses entry for these reasons, grouped by status."""
+    by_status: dict[int, list[str]] = defaultdict(list)
+    for reason in reasons:
+        by_status[REASONS[reason].status].append(reason)
+    return {
+        status: {
+            "description": ", ".join(f"`{reason}`" for reason in names),
+            "content": {MEDIA_TYPE: {"schema": _PROBLEM}},
+        }
+        for status, names in sorted(by_status.items())
+    }
+
+
+def reference(model: type) -> dict[str, Any]:
+    """A reference to a model's schema; the contract lists the schema itself."""
+    return {"$ref": f"#/components/schemas/{model.__name__}"}
+
+
+def header(description: str) -> dict[str, Any]:
+    return {"description": description, "schema": {"type": "string"}}
+
+
+BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+UPLOAD_REFUSALS = (
+    "INVALID_HEADER",
+    "INVALID_DIGEST",
+    "DIGEST_MISMATCH",
+    "UPLOAD_EMPTY",
+    "UPLOAD_INCOMPLETE",
+    "UPLOAD_STALLED",
+    "UPLOAD_TOO_LARGE",
+    "UNSUPPORTED_MEDIA_TYPE",
+    "FIELD_NOT_RECOGNISED",
+    "STORAGE_FULL",
+)
+MULTIPART_REFUSALS = ("MALFORMED_MULTIPART", "MISSING_PART", "UNKNOWN_PART", "DUPLICATE_PART", "REQUEST_TOO_LARGE")

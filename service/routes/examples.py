@@ -1,0 +1,55 @@
+"""The contract's examples. Each request here is replayed against the service by a test."""
+
+from __future__ import annotations
+
+from typing import Any
+
+SCENE = "a3" * 32
+OBJECT = "7c" * 32
+
+REGISTER_EXAMPLES: dict[str, Any] = {
+    "shortest": {
+        "summary": "An axis-aligned box by its corners; everything else at its default",
+        "value": {
+            "scene": SCENE,
+            "object": OBJECT,
+            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
+        },
+    },
+    "oriented": {
+        "summary": "An oriented box from a detector, with options and a seed",
+        "value": {
+            "scene": {"field": SCENE},
+            "object": {"field": OBJECT},
+            "detection": {
+                "centre": [-0.15, -0.05, 0.2],
+                "size": [0.5, 0.5, 0.4],
+                "rotation_quaternion_xyzw": [0.0, 0.0, 0.38268343, 0.92387953],
+                "label": "chair",
+                "score": 0.91,
+            },
+            "options": {
+                "preset": "paper",
+                "sampling": {"views": 8, "up_axis": "z"},
+                "optimisation": {"iterations": 300},
+            },
+            "seed": 7,
+        },
+    },
+    "measured": {
+        "summary": "With the known transform: the metrics then hold the errors",
+        "value": {
+            "scene": SCENE,
+            "object": OBJECT,
+            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
+            "ground_truth": {
+                "T_object_scene": [
+                    [2.0, 0.0, 0.0, 0.3],
+                    [0.0, 2.0, 0.0, 0.1],
+                    [0.0, 0.0, 2.0, -0.4],
+                    [0.0, 0.0, 0.0, 1.0],
+                ]
+            },
+        },
+    },
+}

@@ -1,0 +1,94 @@
+"""GET, HEAD and DELETE of fields: what is held, and in which state."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from starlette.responses import JSONResponse, Response
+
+from service.dependencies import LimitQuery, PageTokenQuery, PrefixDep, Services, ServicesDep, WaitQuery, off_loop
+from service.digests import is_sha256
+from service.paging import decode_token, encode_token
+from service.problems import Problem
+from service.records import FieldRecord
+from service.routes.documentation import refusals
+from service.routes.uploads import field_etag
+from service.schemas.fields import FieldDocument, FieldPage, field_document
+from service.waiting import wait_for
+
+router = APIRouter(tags=["fields"])
+
+
+def _require(services: Services, sha256: str) -> FieldRecord:
+    record = services.records.get_field(sha256) if is_sha256(sha256) else None
+    if record is None:
+        raise Problem("FIELD_NOT_FOUND")
+    return record
+
+
+@router.get(
+    "/fields/{sha256}",
+    summary="A field's state and what its import found",
+    response_model=FieldDocument,
+    responses=refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+)
+async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait: WaitQuery = 0) -> JSONResponse:
+    """With `wait`, the answer comes as soon as the field is no longer `validating`."""
+    record = await wait_for(
+        lambda: _require(services, sha256), lambda found: found.state != "validating", wait, services.stopping
+    )
+    headers = {"ETag": field_etag(record.sha256, record.version), "Cache-Control": "no-cache"}
+    if record.state == "validating":
+        headers["Retry-After"] = "1"
+    return JSONResponse(field_document(record, prefix), headers=headers)
+
+
+@router.head(
+    "/fields/{sha256}",
+    summary="Whether a field is held",
+    response_class=Response,
+    responses=refusals("FIELD_NOT_FOUND"),
+)
+def head_field(sha256: str, services: ServicesDep) -> Response:
+    """Ask before you upload: 200 when the bytes are here."""
+    record = _require(services, sha256)
+    return Response(headers={"ETag": field_etag(record.sha256, record.version)}, media_type="application/json")
+
+
+@router.get(
+    "/fields",
+    summary="Fields, newest first",
+    response_model=FieldPage,
+    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+)
+async def list_fields(
+    services: ServicesDep,
+    prefix: PrefixDep,
+    limit: LimitQuery = 50,
+    page_token: PageTokenQuery = None,
+    label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
+) -> dict[str, Any]:
+    before = decode_token(page_token)
+    # one more than asked for tells whether there is a next page
+    found = await off_loop(services.records.list_fields, label, limit + 1, before)
+    page = found[:limit]
+    more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
+    return {"fields": [field_document(record, prefix) for record in page], "next_page_token": more}
+
+
+@router.delete(
+    "/fields/{sha256}",
+    summary="Forget a field and its bytes",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"),
+)
+def delete_field(sha256: str, services: ServicesDep) -> Response:
+    """Refused while an active job needs the field. Results of finished jobs stay."""
+    _require(services, sha256)
+    if next(iter(services.records.jobs_using_field(sha256)), None) is not None:
+        raise Problem("FIELD_IN_USE")
+    services.records.delete_field(sha256)
+    services.blobs.delete_prefix(f"fields/{sha256}")
+    return Response(status_code=204)

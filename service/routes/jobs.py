@@ -1,0 +1,173 @@
+"""Jobs: their documents, their events, and their end."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query
+from starlette.responses import JSONResponse, Response, StreamingResponse
+
+from service import sse
+from service.canonical import digest
+from service.dependencies import LimitQuery, PageTokenQuery, PrefixDep, Services, ServicesDep, WaitQuery, off_loop
+from service.lookup import find_job
+from service.paging import decode_token, encode_token
+from service.problems import Problem
+from service.records import ACTIVE, JobRecord
+from service.routes.documentation import header, refusals
+from service.schemas.jobs import JobDocument, JobPage, Status, job_document
+from service.waiting import wait_for
+
+router = APIRouter(tags=["jobs"])
+_RETRY_AFTER_S = "1"
+
+
+async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
+    """The job's document, with the headers that tell a poller when to come back."""
+    position = await off_loop(_position, services, record)
+    return _answer(services, record, position, prefix, status)
+
+
+def _position(services: Services, record: JobRecord) -> int | None:
+    return services.records.queue_position(record.id) if record.status == "accepted" else None
+
+
+def _answer(services: Services, record: JobRecord, position: int | None, prefix: str, status: int) -> JSONResponse:
+    headers = {"ETag": _etag(record, position), "Cache-Control": "no-cache"}
+    if record.status in ACTIVE:
+        headers["Retry-After"] = _RETRY_AFTER_S
+    document = job_document(record, position, services.settings.retention_s, prefix)
+    return JSONResponse(document, status_code=status, headers=headers)
+
+
+def _etag(record: JobRecord, position: int | None) -> str:
+    # by what the document shows, not by the version: heartbeats change that every few seconds
+    shown = (record.attempt, record.status, record.phase, record.progress, record.updated, position)
+    return f'"{digest(shown)[:24]}"'
+
+
+@router.get(
+    "/jobs",
+    summary="Jobs, newest first",
+    response_model=JobPage,
+    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+)
+def list_jobs(
+    services: ServicesDep,
+    prefix: PrefixDep,
+    limit: LimitQuery = 50,
+    page_token: PageTokenQuery = None,
+    status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
+) -> dict[str, Any]:
+    """`queue_position` is left out here: ask for the job itself."""
+    found = services.records.list_jobs(status, limit + 1, decode_token(page_token))
+    page = found[:limit]
+    more = encode_token(page[-1].created, page[-1].id) if len(found) > limit else None
+    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page]
+    return {"jobs": documents, "next_page_token": more}
+
+
+@router.get(
+    "/jobs/{id}",
+    summary="A job's state",
+    response_model=JobDocument,
+    responses={
+        200: {"headers": {"ETag": header("For If-None-Match."), "Retry-After": header("While the job is active.")}},
+        304: {"description": "Nothing has changed since the ETag given."},
+        **refusals("INVALID_QUERY", "JOB_NOT_FOUND", "JOB_EXPIRED"),
+    },
+)
+async def get_job(
+    id: str,  # noqa: A002 -- the contract's own word
+    services: ServicesDep,
+    prefix: PrefixDep,
+    wait: WaitQuery = 0,
+    if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
+) -> Response:
+    """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
+
+    def look() -> tuple[JobRecord, int | None]:
+        record = find_job(services, id)
+        return record, _position(services, record)
+
+    def is_news(seen: tuple[JobRecord, int | None]) -> bool:
+        return seen[0].status not in ACTIVE or (if_none_match is not None and _etag(*seen) != if_none_match)
+
+    record, position = await wait_for(look, is_news, wait, services.stopping)
+    response = _answer(services, record, position, prefix, 200)
+    if if_none_match is not None and response.headers["ETag"] == if_none_match:
+        return Response(status_code=304, headers={"ETag": if_none_match})
+    return response
+
+
+@router.get(
+    "/jobs/{id}/events",
+    summary="A job's changes as server-sent events",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Events `status` and `progress`; the data are status, phase, progress, attempt, updated. "
+            "The stream ends after the event that ends the job.",
+            "content": {sse.MEDIA_TYPE: {"schema": {"type": "string"}}},
+        },
+        204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
+        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED"),
+    },
+)
+async def job_events(
+    id: str,  # noqa: A002
+    services: ServicesDep,
+    last_event_id: Annotated[str | None, Header(description="Resume after this event.")] = None,
+) -> Response:
+    """From the beginning, or after `Last-Event-ID`."""
+    record = await off_loop(find_job, services, id)
+    try:
+        waiting = await off_loop(services.records.events, id, last_event_id, 0.0)
+    except ValueError as error:
+        raise Problem("INVALID_EVENT_ID") from error
+    if last_event_id is not None and record.status not in ACTIVE and not waiting:
+        return Response(status_code=204)
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    stream = sse.event_stream(services, id, last_event_id)
+    return StreamingResponse(stream, media_type=sse.MEDIA_TYPE, headers=headers)
+
+
+@router.post(
+    "/jobs/{id}/cancel",
+    summary="Stop a job",
+    response_model=JobDocument,
+    status_code=202,
+    responses={
+        200: {"description": "It was dismissed already.", "model": JobDocument},
+        202: {"description": "A waiting job is dismissed at once, a running one within seconds."},
+        **refusals("JOB_NOT_FOUND", "JOB_FINISHED", "JOB_EXPIRED"),
+    },
+)
+async def cancel_job(id: str, services: ServicesDep, prefix: PrefixDep) -> JSONResponse:  # noqa: A002
+    """Cancelling twice is no error."""
+    before = await off_loop(find_job, services, id)
+    if before.status == "dismissed":
+        return await job_answer(services, before, prefix)
+    after = await off_loop(services.records.request_cancel, id)
+    if after is None:
+        raise Problem("JOB_NOT_FOUND")
+    if after.status in ("successful", "failed"):
+        raise Problem("JOB_FINISHED")
+    await off_loop(services.queue.stop, id, after.attempt)
+    return await job_answer(services, after, prefix, 202)
+
+
+@router.delete(
+    "/jobs/{id}",
+    summary="Forget a job and its artifacts",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("JOB_NOT_FOUND", "JOB_ACTIVE", "JOB_EXPIRED"),
+)
+def delete_job(id: str, services: ServicesDep) -> Response:  # noqa: A002
+    """Only a finished job: cancel it first."""
+    if find_job(services, id).status in ACTIVE:
+        raise Problem("JOB_ACTIVE")
+    services.records.delete_job(id)
+    services.blobs.delete_prefix(f"jobs/{id}")
+    return Response(status_code=204)

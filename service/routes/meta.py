@@ -1,0 +1,90 @@
+"""What the service says about itself."""
+
+from __future__ import annotations
+
+import logging
+import platform
+from collections.abc import Callable
+
+from fastapi import APIRouter
+from redis.exceptions import RedisError
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from regnf_core import __version__
+from service.contract import contract_yaml
+from service.dependencies import PrefixDep, Services, ServicesDep
+from service.docs_page import STYLE_POLICY, render_docs
+from service.problems import RETRY_LATER, Problem
+from service.routes.documentation import refusals
+from service.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
+
+router = APIRouter(tags=["service"])
+logger = logging.getLogger(__name__)
+
+
+@router.get("/healthz", summary="Whether the process answers", response_model=HealthDocument)
+async def healthz() -> dict[str, str]:
+    """Needs no token, looks at nothing else."""
+    return {"status": "ok"}
+
+
+@router.get(
+    "/readyz", summary="Whether a registration would run", response_model=ReadyDocument, responses=refusals("NOT_READY")
+)
+def readyz(services: ServicesDep) -> dict[str, object]:
+    """Records, storage and at least one live worker. A 503 has the same `checks`."""
+    checks = {
+        "records": _answers(services.records.ping),
+        "storage": _answers(lambda: _storage_writes(services)),
+        "worker": _answers(lambda: services.queue.live_workers() > 0),
+    }
+    if not all(checks.values()):
+        raise Problem("NOT_READY", headers=RETRY_LATER, extra={"checks": checks})
+    return {"status": "ready", "checks": checks}
+
+
+def _answers(check: Callable[[], bool]) -> bool:
+    try:
+        return check()
+    except (RedisError, OSError) as error:
+        logger.warning("not ready: %s", type(error).__name__)
+        return False
+
+
+def _storage_writes(services: Services) -> bool:
+    with services.blobs.writer() as writer:
+        return writer.write(b"probe") == len(b"probe")
+
+
+@router.get("/version", summary="What runs here", response_model=VersionDocument)
+async def version() -> dict[str, str]:
+    return {"name": "regnf", "version": __version__, "python": platform.python_version()}
+
+
+@router.get("/", summary="Every address", response_model=IndexDocument)
+async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
+    """Start here."""
+    paths = request.app.openapi()["paths"]
+    addresses = {
+        f"{method.upper()} {prefix}{path}": operation["summary"]
+        for path, operations in paths.items()
+        for method, operation in operations.items()
+    }
+    return {"name": "regnf", "version": __version__, "addresses": addresses}
+
+
+@router.get(
+    "/openapi.yaml",
+    summary="This contract",
+    response_class=Response,
+    responses={200: {"content": {"application/yaml": {"schema": {"type": "string"}}}}},
+)
+async def openapi_yaml(request: Request) -> Response:
+    return Response(contract_yaml(request.app), media_type="application/yaml")
+
+
+@router.get("/docs", summary="This contract, for people", response_class=HTMLResponse)
+async def docs(request: Request) -> HTMLResponse:
+    """One page without scripts; loads nothing from elsewhere."""
+    return HTMLResponse(render_docs(request.app.openapi()), headers={"Content-Security-Policy": STYLE_POLICY})

@@ -1,0 +1,157 @@
+"""POST /register: one registration, by reference or with its files."""
+
+from __future__ import annotations
+
+import re
+from contextlib import AsyncExitStack
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from service import body
+from service.canonical import canonical_request, job_id_of
+from service.dependencies import PrefixDep, Services, ServicesDep, off_loop
+from service.intake import take_in
+from service.multipart import boundary_of, read_parts
+from service.problems import Problem
+from service.records import ACTIVE, FINISHED
+from service.registrations import check_fields, check_idempotency_key, submit
+from service.routes.documentation import JSON, MULTIPART_REFUSALS, UPLOAD_REFUSALS, header, reference, refusals
+from service.routes.examples import REGISTER_EXAMPLES
+from service.routes.jobs import job_answer
+from service.schemas.jobs import JobDocument
+from service.schemas.reading import read_model
+from service.schemas.registrations import DryRunDocument, Question, RegisterRequest
+from service.waiting import wait_for
+
+router = APIRouter(tags=["registrations"])
+_PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
+_LONGEST_WAIT_S = 30
+_FILE = {"type": "string", "format": "binary"}
+_ONE_SHOT = {
+    "schema": {
+        "type": "object",
+        "required": ["scene", "object", "request"],
+        "properties": {"scene": _FILE, "object": _FILE, "request": reference(Question)},
+    }
+}
+
+
+def preferred_wait(prefer: str | None) -> int | None:
+    """The seconds of `Prefer: wait=N` (RFC 7240), at most thirty; what is malformed is ignored, as the RFC has it."""
+    for preference in (prefer or "").split(","):
+        match = _PREFERENCE.fullmatch(preference)
+        if match:
+            return min(int(match.group(1)), _LONGEST_WAIT_S)
+    return None
+
+
+@router.post(
+    "/register",
+    summary="Find the transform that lays the scene's copy of the object onto the library's",
+    response_model=JobDocument,
+    status_code=202,
+    responses={
+        200: {
+            "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
+            "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
+        },
+        202: {
+            "description": "Accepted.",
+            "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
+        },
+        **refusals(
+            *UPLOAD_REFUSALS,
+            *MULTIPART_REFUSALS,
+            "MALFORMED_JSON",
+            "INVALID_QUERY",
+            "INVALID_IDEMPOTENCY_KEY",
+            "FIELD_NOT_FOUND",
+            "INVALID_REQUEST",
+            "INVALID_DETECTION",
+            "INVALID_OPTIONS",
+            "INVALID_TRANSFORM",
+            "FIELD_REJECTED",
+            "DETECTION_OUTSIDE_SCENE",
+            "IDEMPOTENCY_KEY_REUSED",
+            "QUEUE_FULL",
+        ),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                JSON: {"schema": reference(RegisterRequest), "examples": REGISTER_EXAMPLES},
+                "multipart/form-data": _ONE_SHOT,
+            },
+        }
+    },
+)
+async def register(
+    request: Request,
+    services: ServicesDep,
+    prefix: PrefixDep,
+    dry_run: Annotated[bool, Query(description="Check everything, start nothing.")] = False,
+    prefer: Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")] = None,
+    idempotency_key: Annotated[
+        str | None, Header(description="Kept for 24 hours: the same key with another request is refused.")
+    ] = None,
+) -> JSONResponse:
+    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew."""
+    check_idempotency_key(idempotency_key)
+    kind = body.media_type(request)
+    if kind == JSON:
+        asked = await _by_reference(request, services)
+    elif kind == "multipart/form-data":
+        asked = await _one_shot(request, services, keep=not dry_run)
+    else:
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
+    if dry_run:
+        return JSONResponse({"valid": True, "id": job_id_of(asked), "request": asked})
+    record = await off_loop(submit, services, asked, idempotency_key)
+    wait = preferred_wait(prefer)
+    if wait and record.status in ACTIVE:
+        record = await wait_for(
+            lambda: services.records.get_job(record.id) or record,
+            lambda found: found.status in FINISHED,
+            wait,
+            services.stopping,
+        )
+    response = await job_answer(services, record, prefix, 200 if record.status in FINISHED else 202)
+    response.headers["Location"] = f"{prefix}/jobs/{record.id}"
+    if wait is not None:
+        response.headers["Preference-Applied"] = f"wait={wait}"
+    return response
+
+
+async def _by_reference(request: Request, services: Services) -> dict[str, Any]:
+    settings = services.settings
+    text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
+    question = read_model(RegisterRequest, text)
+    asked = canonical_request(question, question.scene, question.object)
+    await off_loop(check_fields, services, asked)
+    return asked
+
+
+async def _one_shot(request: Request, services: Services, keep: bool) -> dict[str, Any]:
+    """Both files and the question in one body. Nothing is kept before all of it has arrived and been checked."""
+    body.refuse_encoding(request)
+    settings = services.settings
+    limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
+    async with AsyncExitStack() as stack:
+        files = {name: await stack.enter_async_context(services.open_upload()) for name in ("scene", "object")}
+        data = body.chunks(request, limit, settings.upload_stall_s)
+        parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
+        missing = [name for name in ("scene", "object", "request") if name not in parts]
+        if missing:
+            raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
+        question = read_model(Question, parts["request"])
+        received = {name: await upload.finish() for name, upload in files.items()}
+        asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
+        await off_loop(check_fields, services, asked, True)
+        if keep:
+            for name, upload in files.items():
+                await take_in(services, upload, received[name])
+    return asked

@@ -1,0 +1,137 @@
+"""PUT /fields/{sha256} and POST /fields: the bytes of a field."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Path
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from regnf_core.importing.upload_description import UploadDescription
+from service import body
+from service.dependencies import PrefixDep, Services, ServicesDep
+from service.digests import announced_digest, is_sha256
+from service.intake import Intake, take_in
+from service.multipart import boundary_of, read_parts
+from service.problems import Problem
+from service.routes.documentation import BINARY, MULTIPART_REFUSALS, UPLOAD_REFUSALS, header, reference, refusals
+from service.schemas.fields import FieldDocument, field_document
+from service.schemas.reading import read_model
+from service.uploads import Received, Upload
+
+router = APIRouter(tags=["fields"])
+DESCRIPTION_BYTES = 16 * 1024
+_HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
+_MULTIPART = {
+    "schema": {
+        "type": "object",
+        "required": ["file"],
+        "properties": {"file": {"type": "string", "format": "binary"}, "description": reference(UploadDescription)},
+    }
+}
+
+
+@router.put(
+    "/fields/{sha256}",
+    summary="Upload a field under its SHA-256",
+    response_model=FieldDocument,
+    status_code=201,
+    responses={
+        200: {"description": "The bytes were held already.", "model": FieldDocument, "headers": _HEADERS},
+        201: {"description": "Stored; the import is queued.", "headers": _HEADERS},
+        **refusals(*UPLOAD_REFUSALS),
+    },
+    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": BINARY}}},
+)
+async def put_field(
+    request: Request,
+    services: ServicesDep,
+    prefix: PrefixDep,
+    sha256: Annotated[str, Path(description="SHA-256 of the file, 64 lower-case hexadecimal digits.")],
+    content_digest: Annotated[str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.")] = None,
+) -> JSONResponse:
+    """The file's bytes as they are: an archive of torch.save, or safetensors. Repeat it freely: 200 when held."""
+    if not is_sha256(sha256):
+        raise Problem("INVALID_DIGEST", headers=body.CLOSE)
+    if body.media_type(request).startswith("multipart/"):
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=body.CLOSE)
+    digest = announced_digest(content_digest)
+    async with services.open_upload() as upload:
+        received = await _receive_raw(request, services, upload)
+        if received.sha256 != sha256 or digest not in (None, received.sha256):
+            raise Problem("DIGEST_MISMATCH")
+        taken = await take_in(services, upload, received)
+    return _answer(taken, prefix)
+
+
+@router.post(
+    "/fields",
+    summary="Upload a field; the service computes its SHA-256",
+    response_model=FieldDocument,
+    status_code=201,
+    responses={
+        200: {"description": "The bytes were held already.", "model": FieldDocument, "headers": _HEADERS},
+        201: {"description": "Stored; the import is queued.", "headers": _HEADERS},
+        **refusals(
+            *UPLOAD_REFUSALS, *MULTIPART_REFUSALS, "MALFORMED_JSON", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"
+        ),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/octet-stream": BINARY, "multipart/form-data": _MULTIPART},
+        }
+    },
+)
+async def post_field(
+    request: Request,
+    services: ServicesDep,
+    prefix: PrefixDep,
+    content_digest: Annotated[str | None, Header(description="RFC 9530, of the body as sent.")] = None,
+) -> JSONResponse:
+    """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
+    digest = announced_digest(content_digest)
+    async with services.open_upload() as upload:
+        if body.media_type(request) == "multipart/form-data":
+            received, description = await _receive_parts(request, services, upload)
+        else:
+            received, description = await _receive_raw(request, services, upload), None
+            if digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+        taken = await take_in(services, upload, received, description)
+    return _answer(taken, prefix)
+
+
+async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+    body.refuse_encoding(request)
+    settings = services.settings
+    async for data in body.chunks(request, settings.max_upload_bytes, settings.upload_stall_s):
+        await upload.feed(data)
+    return await upload.finish()
+
+
+async def _receive_parts(
+    request: Request, services: Services, upload: Upload
+) -> tuple[Received, UploadDescription | None]:
+    body.refuse_encoding(request)
+    settings = services.settings
+    limit = settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
+    data = body.chunks(request, limit, settings.upload_stall_s)
+    parts = await read_parts(data, boundary_of(request), {"file": upload}, {"description": DESCRIPTION_BYTES})
+    if "file" not in parts:
+        raise Problem("MISSING_PART", "The part `file` is missing.")
+    text = parts.get("description")
+    description = None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
+    return await upload.finish(), description
+
+
+def _answer(taken: Intake, prefix: str) -> JSONResponse:
+    document = field_document(taken.record, prefix)
+    headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record.sha256, taken.record.version)}
+    return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)
+
+
+def field_etag(sha256: str, version: int) -> str:
+    """Changes with every change of the field's record."""
+    return f'"{sha256[:16]}.{version}"'

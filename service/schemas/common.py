@@ -1,0 +1,65 @@
+"""Pieces that several schemas share."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Links = dict[str, str]
+_NO_CONTROLS = r"^[^\x00-\x1f\x7f\u202a-\u202e\u2066-\u2069]*$"
+Label = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=_NO_CONTROLS)]
+
+
+class Incoming(BaseModel):
+    """Base of what clients send: unknown members and values of another type are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class Outgoing(BaseModel):
+    """Base of what the service sends; it may gain members, so clients ignore those they do not know."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class ProblemEntry(Outgoing):
+    """One fault: a JSON Pointer into the body, or the name of a query parameter or header."""
+
+    pointer: str | None = None
+    parameter: str | None = None
+    detail: str
+
+
+class ProblemDocument(Outgoing):
+    """RFC 9457 problem details. Programs switch on `reason`, never on text."""
+
+    type: str
+    title: str
+    status: int
+    reason: str
+    detail: str
+    instance: str | None = None
+    request_id: str | None = None
+    errors: list[ProblemEntry] = []
+
+
+def rfc3339(seconds: float | None) -> str | None:
+    """A time of the record store, seconds since the epoch, as RFC 3339 in UTC."""
+    if seconds is None:
+        return None
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:
+    """A record's problem as it travels."""
+    return None if error is None else whole_problem(error)
+
+
+def whole_problem(error: dict[str, Any]) -> dict[str, Any]:
+    """A stored problem with every member that a problem has."""
+    reason = str(error.get("reason", "INTERNAL"))
+    return {"type": f"/docs#{reason}", "title": reason, "status": 500, "reason": reason, "detail": ""} | error

@@ -1,0 +1,57 @@
+"""Fields as the contract shows them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Literal
+
+from pydantic import Field
+
+from regnf_core.importing.upload_description import UploadDescription
+from service.records import FieldRecord
+from service.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem, rfc3339
+
+
+def function_of(description: UploadDescription) -> dict[str, Any]:
+    """What the import needs of a description: everything that was said but the label."""
+    said = asdict(description)
+    said["hash"] = {name: value for name, value in said["hash"].items() if value is not None}
+    return {name: value for name, value in said.items() if name != "label" and value not in (None, {})}
+
+
+class FieldDocument(Outgoing):
+    """One field. `validating` until its import has ended; only a `ready` field can be registered."""
+
+    sha256: Sha256
+    state: Literal["validating", "ready", "rejected"]
+    bytes: int
+    label: str | None = None
+    description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
+    report: dict[str, Any] = Field({}, description="What the import found: family, bounds, parameters, plausibility.")
+    error: ProblemDocument | None = Field(None, description="Why the field was rejected.")
+    created_at: str
+    updated_at: str
+    links: Links
+
+
+class FieldPage(Outgoing):
+    """Fields, newest first."""
+
+    fields: list[FieldDocument]
+    next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
+
+
+def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
+    """The field as it travels; ``prefix`` is what the API's paths begin with."""
+    return {
+        "sha256": record.sha256,
+        "state": record.state,
+        "bytes": record.bytes,
+        "label": record.label,
+        "description": record.description,
+        "report": record.report,
+        "error": outgoing_problem(record.error),
+        "created_at": rfc3339(record.created),
+        "updated_at": rfc3339(record.updated),
+        "links": {"self": f"{prefix}/fields/{record.sha256}"},
+    }

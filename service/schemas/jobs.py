@@ -1,0 +1,106 @@
+"""Jobs and their results as the contract shows them."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from service.records import ACTIVE, JobRecord
+from service.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem, rfc3339
+
+Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+
+
+class JobDocument(Outgoing):
+    """One job. `successful` means that it has a result, whose verdict may still be `rejected`."""
+
+    id: str
+    kind: Literal["registration"]
+    status: Status
+    phase: str | None = Field(
+        None, description="loading, sampling, initialising, optimising, verifying or exporting: where it is, or ended."
+    )
+    progress: float = Field(0.0, ge=0, le=1)
+    queue_position: int | None = Field(None, description="1 is next; null for a job that does not wait.")
+    attempts: int = Field(1, ge=1, description="How often the job was handed to a worker.")
+    cancel_requested: bool = False
+    created_at: str
+    updated_at: str
+    started_at: str | None = None
+    finished_at: str | None = None
+    expires_at: str | None = Field(None, description="When a finished job and its artifacts will be gone.")
+    inputs: dict[str, Any] = Field(description="scene, object, detection, seed, and the SHA-256 of the full options.")
+    engine: dict[str, Any] = Field({}, description="Version and device.")
+    error: ProblemDocument | None = Field(None, description="Why the job failed.")
+    links: Links
+
+
+class JobPage(Outgoing):
+    """Jobs, newest first."""
+
+    jobs: list[JobDocument]
+    next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
+
+
+class TransformDocument(Outgoing):
+    """A similarity transform x -> s R x + t. `matrix` is row-major 4x4 and holds all of it."""
+
+    matrix: list[list[float]]
+    scale: float
+    rotation_quaternion_xyzw: list[float]
+    translation: list[float]
+
+
+class ArtifactEntry(Outgoing):
+    """One file that the job wrote."""
+
+    name: str
+    bytes: int
+    sha256: str
+    url: str
+
+
+class ResultDocument(Outgoing):
+    """What a registration found. Transforms carry their direction in their name."""
+
+    verdict: Literal["registered", "ambiguous", "rejected"]
+    verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
+    T_object_scene: TransformDocument = Field(description="Scene coordinates to object coordinates.")
+    T_scene_object: TransformDocument = Field(description="Its inverse.")
+    alternatives: list[dict[str, Any]] = Field([])
+    metrics: dict[str, float | None] = Field({})
+    seed: int = 0
+    artifacts: list[ArtifactEntry] = Field([])
+
+
+def job_document(record: JobRecord, queue_position: int | None, retention_s: float, prefix: str) -> dict[str, Any]:
+    """The job as it travels; ``prefix`` is what the API's paths begin with."""
+    return {
+        "id": record.id,
+        "kind": record.kind,
+        "status": record.status,
+        "phase": record.phase,
+        "progress": record.progress,
+        "queue_position": queue_position,
+        "attempts": record.attempt,
+        "cancel_requested": record.cancel_requested,
+        "created_at": rfc3339(record.created),
+        "updated_at": rfc3339(record.updated),
+        "started_at": rfc3339(record.started),
+        "finished_at": rfc3339(record.finished),
+        "expires_at": None if record.finished is None else rfc3339(record.finished + retention_s),
+        "inputs": record.inputs,
+        "engine": record.engine,
+        "error": outgoing_problem(record.error),
+        "links": _links(record, f"{prefix}/jobs/{record.id}"),
+    }
+
+
+def _links(record: JobRecord, address: str) -> Links:
+    links = {"self": address, "events": f"{address}/events", "view": f"{address}/view"}
+    if record.status in ACTIVE:
+        links["cancel"] = f"{address}/cancel"
+    if record.status == "successful":
+        links["result"] = f"{address}/result"
+    return links

@@ -1,0 +1,45 @@
+"""Reading a JSON body as a schema, and saying what is wrong with it without repeating it."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from service.problems import Problem, json_pointer
+from service.schemas.detections import SPELLINGS
+from service.strict_json import parse_json
+
+_REASONS = {
+    "detection": "INVALID_DETECTION",
+    "options": "INVALID_OPTIONS",
+    "ground_truth": "INVALID_TRANSFORM",
+}
+_Model = TypeVar("_Model")
+
+
+def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUEST") -> _Model:
+    """The body as ``model``, a pydantic model or dataclass, strictly.
+
+    Raises Problem: MALFORMED_JSON, the faulty member's reason, or ``otherwise``.
+    """
+    parse_json(body)
+    try:
+        return TypeAdapter(model).validate_json(body, strict=True)
+    except ValidationError as error:
+        raise refusal(error, otherwise) from error
+
+
+def refusal(error: ValidationError, otherwise: str) -> Problem:
+    """The problem for what a schema refused: the reason goes by the first faulty member, every fault is listed."""
+    if any(fault["type"] == "json_invalid" for fault in error.errors(include_url=False, include_input=False)):
+        return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
+    faults = error.errors(include_url=False, include_input=False, include_context=False)
+    places = [[part for part in fault["loc"] if part not in SPELLINGS] for fault in faults]
+    heads = [str(place[0]) if place else "" for place in places]
+    reason = next((_REASONS[head] for head in heads if head in _REASONS), otherwise)
+    entries = [
+        {"pointer": json_pointer(place), "detail": fault["msg"].removeprefix("Value error, ")}
+        for place, fault in zip(places, faults, strict=True)
+    ]
+    return Problem(reason, errors=entries)
