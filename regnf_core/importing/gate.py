@@ -126,6 +126,7 @@ def _report(
     """The report from the child's own words and this side's measurements, after a look at the file it left."""
     try:
         size = _checked_size(field, limits.file_bytes)
+        isolation = {str(key): bool(value) for key, value in values["isolation"].items()}
         lower, upper = ((float(x), float(y), float(z)) for x, y, z in values["bounds"])
         return ImportReport(
             family=str(values["family"]),
@@ -133,17 +134,23 @@ def _report(
             bounds=(lower, upper),
             parameters=int(values["parameters"]),
             plausibility={str(key): float(value) for key, value in values["plausibility"].items()},
-            warnings=tuple(map(str, values["warnings"])),
+            warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),
             label=None if values["label"] is None else str(values["label"]),
             field_bytes=size,
             seconds=round(seconds, 3),
             cpu_seconds=round(outcome.cpu_seconds, 3),
             peak_memory_bytes=int(values["peak_memory_bytes"]),
-            isolation={str(key): bool(value) for key, value in values["isolation"].items()},
+            isolation=isolation,
         )
     except (KeyError, TypeError, ValueError, AttributeError, OSError, FieldFormatError) as error:
         _log.error("import process left no usable result: %r", error)
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED") from error
+
+
+def _isolation_warnings(isolation: dict[str, bool]) -> list[str]:
+    if isolation.get("network_namespace") or isolation.get("system_call_filter"):
+        return []
+    return ["NOT_ISOLATED: the kernel granted the import neither a network namespace nor a system call filter"]
 
 
 def _checked_size(field: Path, most: int) -> int:

@@ -67,7 +67,7 @@ def _are_extents(values: tuple[Any, ...]) -> bool:
 
 
 def _parameter(_function: GlobalRef, args: tuple[Any, ...]) -> Any:
-    """_rebuild_parameter: (tensor, requires_grad, hooks)."""
+    """_rebuild_parameter(_with_state): (tensor, requires_grad, hooks[, state])."""
     if args and isinstance(args[0], (TensorRef, Placeholder)):
         return args[0]
     raise pickle_error("a parameter without a tensor")
@@ -147,6 +147,7 @@ HANDLERS: dict[tuple[str, str], Handler] = {
     ("torch._utils", "_rebuild_tensor"): _tensor,
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): _parameter,
+    ("torch._utils", "_rebuild_parameter_with_state"): _parameter,
     ("torch", "Size"): _sequence,
     ("collections", "OrderedDict"): _mapping,
     ("collections", "Counter"): _mapping,

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import errno
 import json
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,7 @@ from regnf_core.importing.report import MIB
 from tests.core.importing.archives import assert_refused, saved, text, torch_zip
 from tests.core.importing.checkpoints import checkpoint, write_small_checkpoint
 
+ROOT = Path(__file__).resolve().parents[3]
 SHORT = ImportLimits(wall_s=100)
 
 
@@ -197,6 +201,27 @@ def test_the_details_of_a_refusal_are_short_and_printable(
         import_field(upload, tmp_path, None, SHORT)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) <= 500
+
+
+def test_a_kernel_that_grants_no_isolation_is_warned_of() -> None:
+    assert [w.split(":")[0] for w in gate._isolation_warnings({"network_namespace": False})] == ["NOT_ISOLATED"]
+    assert gate._isolation_warnings({"network_namespace": False, "system_call_filter": True}) == []
+
+
+def test_the_outer_side_loads_neither_torch_nor_numpy() -> None:
+    program = "import sys, regnf_core.importing.gate; sys.exit(bool({'torch', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0
+
+
+def test_every_reason_is_documented() -> None:
+    """Any quoted word of capitals in the gate's sources is a reason or a warning, and stands in its page."""
+    words: set[str] = set()
+    for source in (ROOT / "regnf_core" / "importing").rglob("*.py"):
+        words |= set(re.findall(r'"([A-Z]+(?:_[A-Z0-9]+)+)[":]', source.read_text()))
+    words -= {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "FIELD_NAME"}
+    page = (ROOT / "docs" / "import-gate.md").read_text()
+    assert len(words) > 50
+    assert sorted(word for word in words if f"`{word}`" not in page) == []
 
 
 def test_the_helper_for_others_builds_a_checkpoint_with_adams_state() -> None:
