@@ -34,7 +34,7 @@ def _softplus(x: Tensor) -> Tensor:
 
 def _slope(x: Tensor) -> Tensor:
     """Derivative of the softplus."""
-    return (x * _BETA).clamp(-_FLAT, _FLAT).sigmoid()
+    return (x * _BETA).clamp_(-_FLAT, _FLAT).sigmoid_()
 
 
 class GeometryMlp:

@@ -129,9 +129,13 @@ class HashEncoding:
         both = torch.stack((lower, lower + self._strides), dim=1)  # (3, 2, A, N)
         x, y, z = both[0][:, None, None], both[1][None, :, None], both[2][None, None, :]
         d = self._dense
-        dense = (x[..., :d, :] + (y[..., :d, :] + z[..., :d, :])).bitwise_and_(_UINT32).remainder_(self._entries[:d])
-        hashed = (x[..., d:, :] ^ (y[..., d:, :] ^ z[..., d:, :])).bitwise_and_(self._entries[d:] - 1)
-        return torch.cat((dense, hashed), dim=-2).add_(self._offsets).view(-1)  # from (2, 2, 2, A, N)
+        rows = cell.new_empty(2, 2, 2, *cell.shape[1:])
+        dense, hashed = rows[..., :d, :], rows[..., d:, :]
+        torch.add(x[..., :d, :], y[..., :d, :] + z[..., :d, :], out=dense)
+        dense.bitwise_and_(_UINT32).remainder_(self._entries[:d])
+        torch.bitwise_xor(x[..., d:, :], y[..., d:, :] ^ z[..., d:, :], out=hashed)
+        hashed.bitwise_and_(self._entries[d:] - 1)
+        return rows.add_(self._offsets).view(-1)
 
     def _gather(self, cells: _Cells) -> Tensor:
         rows: Tensor = _GatherRows.apply(self.table, cells.corners)  # type: ignore[no-untyped-call]
