@@ -18,7 +18,6 @@ from regnf_core.importing.zip_records import Directory, Header, malformed
 
 MAX_ENTRIES = 16_384
 MAX_PICKLE_BYTES = 32 * 1024 * 1024
-_MAX_NAME_BYTES = 512
 _ENCRYPTION_FLAGS = 0x0001 | 0x0040 | 0x2000
 _DESCRIPTOR_FLAG = 0x0008
 _UTF8_FLAG = 0x0800
@@ -186,7 +185,7 @@ def _below_one_folder(entries: list[Entry]) -> dict[str, Entry]:
     for entry in entries:
         parts = entry.name.split("/")
         safe = all(_PART.fullmatch(part) and part not in (".", "..") for part in parts)
-        if not safe or len(parts) < 2 or len(entry.name) > _MAX_NAME_BYTES:
+        if not safe or len(parts) < 2:
             raise malformed("an entry's name leaves the archive's folder or is no name", "ARCHIVE_ENTRY_NAME")
         folders.add(parts[0])
         members["/".join(parts[1:])] = entry

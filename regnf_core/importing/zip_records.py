@@ -24,6 +24,8 @@ _LOCATOR64 = struct.Struct("<4sIQI")
 END_SIZE = _END.size
 _ZIP64_EXTRA = 1
 _MAX16, _MAX32 = 0xFFFF, 0xFFFFFFFF
+_MAX_NAME_BYTES = 512
+_MAX_EXTRA_FIELDS = 8
 
 
 def malformed(message: str, reason: str = "ARCHIVE_MALFORMED") -> FieldFormatError:
@@ -98,6 +100,8 @@ def read_central_header(data: Bytes, at: int, limit: int) -> Header:
     values = _CENTRAL.unpack_from(data, at)
     flags, method, crc32, packed, size = values[3], values[4], values[7], values[8], values[9]
     name_length, extra_length, comment_length, disk, offset = *values[10:14], values[16]
+    if name_length > _MAX_NAME_BYTES:
+        raise malformed("an entry's name is too long", "ARCHIVE_ENTRY_NAME")
     name_at = at + _CENTRAL.size
     end = name_at + name_length + extra_length
     if comment_length or disk or end > limit:
@@ -124,10 +128,11 @@ def read_local_header(data: Bytes, at: int, limit: int) -> Header:
 def _zip64_values(extra: Bytes) -> list[int]:
     """The 64-bit numbers of the zip64 extra field, in order; the other extra fields (padding) are only walked."""
     found: list[int] | None = None
-    at = 0
+    at = fields = 0
     while at < len(extra):
-        if at + 4 > len(extra):
-            raise malformed("an extra field is cut short")
+        fields += 1
+        if at + 4 > len(extra) or fields > _MAX_EXTRA_FIELDS:
+            raise malformed("an extra field is cut short, or there are too many")
         kind, length = struct.unpack_from("<HH", extra, at)
         at += 4
         if at + length > len(extra):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import struct
 import zipfile
 from pathlib import Path
@@ -80,10 +81,18 @@ def test_a_second_data_pkl_further_down_is_refused() -> None:
     refused(zip_bytes(entries), "ARCHIVE_DUPLICATE_ENTRY")
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["archive/../evil", "/archive/data/0", "archive/a\\b", "archive/data/", "archive//0", "loose", "other/data/0"],
-)
+UNSAFE_NAMES = [
+    "archive/../evil",
+    "/archive/data/0",
+    "archive/a\\b",
+    "archive/data/",
+    "archive//0",
+    "loose",
+    "other/data/0",
+]
+
+
+@pytest.mark.parametrize("name", [*UNSAFE_NAMES, "archive/" + "x" * 600])
 def test_names_that_leave_the_folder_are_refused(name: str) -> None:
     refused(zip_bytes([("archive/data.pkl", PICKLE_OF_NOTHING), (name, b"")]), "ARCHIVE_ENTRY_NAME")
 
@@ -138,6 +147,15 @@ def test_zip64_sizes_of_2_to_the_63_are_refused() -> None:
 def test_a_zip64_size_that_is_missing_is_refused() -> None:
     data = torch_zip()
     refused(patched(data, central_header_at(data, 0) + SIZE_AT, b"\xff" * 4), "ARCHIVE_MALFORMED")
+
+
+def test_extra_fields_without_end_are_refused() -> None:
+    entry = zipfile.ZipInfo("archive/data.pkl")
+    entry.extra = struct.pack("<HH", 0x4246, 0) * 1000
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr(entry, PICKLE_OF_NOTHING)
+    refused(buffer.getvalue(), "ARCHIVE_MALFORMED")
 
 
 def test_bytes_before_behind_and_between_are_refused() -> None:
