@@ -92,7 +92,7 @@ UNSAFE_NAMES = [
 ]
 
 
-@pytest.mark.parametrize("name", [*UNSAFE_NAMES, "archive/" + "x" * 600])
+@pytest.mark.parametrize("name", UNSAFE_NAMES)
 def test_names_that_leave_the_folder_are_refused(name: str) -> None:
     refused(zip_bytes([("archive/data.pkl", PICKLE_OF_NOTHING), (name, b"")]), "ARCHIVE_ENTRY_NAME")
 
