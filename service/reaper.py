@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from redis import Redis
@@ -24,6 +24,7 @@ _UNHELD_FOR_S = 15.0
 """Work that was recorded this long ago and is in no queue was lost between the two."""
 _IMPORT_RETRIES = 2
 _RELEASE = "if redis.call('GET', KEYS[1]) == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0"
+_Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
 
@@ -59,9 +60,9 @@ class Reaper:
             deeds: dict[str, list[str]] = {"requeued": [], "failed": [], "dismissed": [], "enqueued": []}
             now = self._records.now()
             for job in self._records.active_jobs():
-                _note(deeds, job.id, lambda job=job: self._look_after_job(job, now))  # type: ignore[misc]
+                _note(deeds, job.id, self._look_after_job, job, now)
             for field in self._records.validating_fields():
-                _note(deeds, field.sha256, lambda field=field: self._look_after_import(field, now))  # type: ignore[misc]
+                _note(deeds, field.sha256, self._look_after_import, field, now)
             return Reaped(**{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(self._expire()))
 
     @contextmanager
@@ -113,9 +114,11 @@ class Reaper:
         return expired
 
 
-def _note(deeds: dict[str, list[str]], name: str, look: Callable[[], str | None]) -> None:
+def _note(
+    deeds: dict[str, list[str]], name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float
+) -> None:
     try:
-        deed = look()
+        deed = look(record, now)
     except StaleAttemptError:
         return  # it moved on by itself meanwhile
     if deed is not None:

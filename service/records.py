@@ -52,6 +52,8 @@ class JobRecord:
     error: dict[str, Any] | None = None
     requeues: int = 0
     """How often this request was handed out again because its worker vanished, since it was last asked for."""
+    worker: str | None = None
+    """Who claimed the attempt."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
-_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs"})
+_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker"})
 _CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes"})
 
 

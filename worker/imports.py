@@ -17,10 +17,16 @@ from worker.context import Context
 from worker.engine import Importer
 from worker.problems import fault, new_incident, problem
 
+_CLAIM_KEPT_S = 24 * 3600
 logger = logging.getLogger(__name__)
 
 
-def run_import_attempt(context: Context, sha256: str, attempt: int, importer: Importer) -> None:
+def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bool:
+    """Whether this attempt at the import is this worker's: of several that ask, the first one's."""
+    return context.records.remember(f"import:{sha256}:{attempt}", worker, _CLAIM_KEPT_S) == worker
+
+
+def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
     """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
 
     The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
@@ -29,6 +35,9 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, importer: Im
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         logger.info("import %s attempt %d is not run", sha256, attempt)
+        return
+    if not claim_import(context, sha256, attempt, worker):
+        logger.info("import %s attempt %d is somebody else's", sha256, attempt)
         return
     try:
         report = _standing_report(context, sha256) or _work(context, sha256, field.description, importer)

@@ -15,7 +15,7 @@ def run_registration(job_id: str) -> None:
     from worker.registration import run_attempt
 
     settings = Settings()
-    run_attempt(Context.from_settings(settings), job_id, current_attempt(), lambda: CoreEngine.on(settings.device))
+    run_attempt(Context.from_settings(settings), job_id, *delivery(), lambda: CoreEngine.on(settings.device))
 
 
 def run_import(sha256: str) -> None:
@@ -26,11 +26,12 @@ def run_import(sha256: str) -> None:
 
     settings = Settings()
     limits = ImportLimits(wall_s=settings.import_timeout_s, memory_bytes=settings.import_memory_bytes)
-    run_import_attempt(Context.from_settings(settings), sha256, current_attempt(), core_importer(limits))
+    run_import_attempt(Context.from_settings(settings), sha256, *delivery(), core_importer(limits))
 
 
-def current_attempt() -> int:
-    """The attempt that the running queue job is."""
+def delivery() -> tuple[int, str]:
+    """Which attempt the running queue job is, and by which worker it is run."""
     job = get_current_job()
     assert job is not None, "called by a worker only"
-    return attempt_of(job.id)
+    assert job.worker_name is not None, "set before the job begins"
+    return attempt_of(job.id), job.worker_name

@@ -49,7 +49,7 @@ class RegnfWorker(Worker):
         )
         self._context = context
         self._scratch = scratch
-        self._settlers: dict[str, Callable[[Context, str, int, HorseEnd], None]] = {
+        self._settlers: dict[str, Callable[[Context, str, int, str, HorseEnd], None]] = {
             IMPORT_QUEUE_NAME: settle_import,
             QUEUE_NAME: settle_registration,
         }
@@ -86,7 +86,7 @@ class RegnfWorker(Worker):
             given_back=self._given_back,
         )
         try:
-            self._settlers[queue.name](self._context, job.args[0], attempt_of(job.id), end)
+            self._settlers[queue.name](self._context, job.args[0], attempt_of(job.id), self.name, end)
         except (RedisError, OSError) as error:
             self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
 

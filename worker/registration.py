@@ -29,14 +29,16 @@ class FieldsNotReadyError(Exception):
     """A field is still being imported; whoever waits longer should let somebody else use the worker."""
 
 
-def run_attempt(context: Context, job_id: str, attempt: int, make_engine: Callable[[], RegistrationEngine]) -> None:
+def run_attempt(
+    context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], RegistrationEngine]
+) -> None:
     """Claim the attempt, do its work with the engine, write down how it ended.
 
     Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Raises RedisError and
     OSError of the network kind when the end cannot be written down; the worker's parent process then sees to it.
     """
     try:
-        record = context.records.update_job(job_id, attempt, status="running", phase="loading")
+        record = context.records.update_job(job_id, attempt, status="running", phase="loading", worker=worker)
     except StaleAttemptError as error:
         logger.info("job %s attempt %d is not run: %s", job_id, attempt, error)
         return

@@ -10,7 +10,7 @@ from typing import Any
 from service.records import ACTIVE, JobRecord, StaleAttemptError
 from worker.artifacts import discard, read_manifest
 from worker.context import Context
-from worker.imports import reject
+from worker.imports import claim_import, reject
 from worker.problems import problem
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class HorseEnd:
         return "WORKER_LOST" if self.signal is not None else "INTERNAL"
 
 
-def settle_registration(context: Context, job_id: str, attempt: int, end: HorseEnd) -> None:
+def settle_registration(context: Context, job_id: str, attempt: int, worker: str, end: HorseEnd) -> None:
     """See that the record of a job whose process is gone does not go on saying it runs.
 
     A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
@@ -45,7 +45,9 @@ def settle_registration(context: Context, job_id: str, attempt: int, end: HorseE
         return
     try:
         if record.status == "accepted":  # it died before it could claim its job
-            record = context.records.update_job(job_id, attempt, status="running")
+            record = context.records.update_job(job_id, attempt, status="running", worker=worker)
+        if record.worker != worker:
+            return  # handed out twice, and the other one has it
         _settle(context, record, end)
     except StaleAttemptError as error:
         logger.info("job %s attempt %d: somebody else has settled it: %s", job_id, attempt, error)
@@ -72,10 +74,12 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
     logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
 
 
-def settle_import(context: Context, sha256: str, attempt: int, end: HorseEnd) -> None:
+def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: HorseEnd) -> None:
     """The same for an import: one that was given back starts anew, everything else has the field rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
+        return
+    if not claim_import(context, sha256, attempt, worker):
         return
     if end.given_back:
         try:

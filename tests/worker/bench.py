@@ -1,0 +1,136 @@
+"""A private Redis, a folder, and worker processes: what tests of the worker stand on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from redis import Redis
+
+from service.local_blobs import LocalBlobStore
+from service.records import FINISHED, FieldRecord, JobRecord
+from service.redis_client import connect
+from service.redis_queue import RqJobQueue
+from service.redis_records import RedisRecordStore
+from service.settings import Settings
+from tests.redis_server import private_redis
+from tests.worker.tiny_worker import FUNCTIONS
+from worker.context import Context
+
+SCENE, OBJECT = "a" * 64, "b" * 64
+DEADLINE_S = 60.0
+_Value = TypeVar("_Value")
+
+
+def eventually(look: Callable[[], _Value], what: str = "condition", deadline_s: float = DEADLINE_S) -> _Value:
+    """What ``look`` returns once that is truthy. Fails after the deadline."""
+    end = time.monotonic() + deadline_s
+    while not (value := look()):
+        assert time.monotonic() < end, f"{what} did not come about within {deadline_s} s"
+        time.sleep(0.02)
+    return value
+
+
+@dataclass
+class Bench:
+    """Stores over a private Redis, and the workers started over them."""
+
+    context: Context
+    redis: Redis
+    folder: Path
+    environment: dict[str, str]
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def start_worker(self, module: str = "tests.worker.tiny_worker", **settings: object) -> subprocess.Popen[bytes]:
+        """A worker process; returns once it is listed as live."""
+        before = self.context.queue.live_workers()
+        environment = self.environment | {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+        with (self.folder / f"worker-{len(self.workers)}.log").open("wb") as log:
+            worker = subprocess.Popen([sys.executable, "-m", module], env=environment, stderr=log)
+        self.workers.append(worker)
+        eventually(lambda: self.context.queue.live_workers() > before or worker.poll() is not None, "live worker")
+        assert worker.poll() is None, self.log()
+        return worker
+
+    def log(self) -> str:
+        return "\n".join(path.read_text() for path in sorted(self.folder.glob("worker-*.log")))
+
+    def add_ready_fields(self) -> None:
+        for sha256 in (SCENE, OBJECT):
+            now = self.context.records.now()
+            self.context.records.create_field(FieldRecord(sha256, "validating", 1, now, now))
+            self.context.blobs.put(f"fields/{sha256}/field.safetensors", sha256[:1].encode())
+            self.context.records.update_field(sha256, state="ready")
+
+    def submit(self, do: str, job_id: str = "j1") -> JobRecord:
+        """Record and queue a job whose engine shall do this."""
+        now = self.context.records.now()
+        request = {"scene": SCENE, "object": OBJECT, "options": {"do": do}, "seed": 0}
+        record, created = self.context.records.create_job(
+            JobRecord(job_id, "registration", "accepted", request, {}, now, now), 100
+        )
+        assert created
+        self.context.queue.enqueue_registration(job_id, record.attempt)
+        return record
+
+    def job(self, job_id: str = "j1") -> JobRecord:
+        record = self.context.records.get_job(job_id)
+        assert record is not None
+        return record
+
+    def finished(self, job_id: str = "j1") -> JobRecord:
+        return eventually(lambda: record if (record := self.job(job_id)).status in FINISHED else None, self.log())
+
+    def reaches(self, phase: str, job_id: str = "j1") -> JobRecord:
+        return eventually(lambda: record if (record := self.job(job_id)).phase == phase else None, phase)
+
+    def leftovers(self) -> list[str]:
+        """Temporary files of jobs and of the blob store."""
+        scratch = self.context.settings.scratch_dir
+        inside = [path for folder in scratch.iterdir() if folder.is_dir() for path in folder.iterdir()]
+        temporary = (self.context.settings.blob_dir / ".tmp").iterdir()
+        return [path.name for path in [*inside, *temporary] if path.name != ".lock"]
+
+
+@contextmanager
+def bench(folder: Path, **settings: object) -> Iterator[Bench]:
+    """A bench below ``folder``; every worker is gone when it closes."""
+    with private_redis() as url, connect(url) as redis:
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+        given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
+        environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}
+        values = Settings(**given)  # type: ignore[arg-type]
+        stores = RedisRecordStore(redis), LocalBlobStore(values.blob_dir), RqJobQueue(redis, *FUNCTIONS)
+        made = Bench(Context(values, *stores), redis, folder, environment)
+        try:
+            yield made
+        finally:
+            for worker in made.workers:
+                worker.kill()
+                worker.wait()
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes whose parent this is."""
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def alive(pid: int) -> bool:
+    """Whether the process exists and is no zombie."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state not in "ZX"
+
+
+def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
+    os.kill(pid, number)

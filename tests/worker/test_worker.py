@@ -1,0 +1,256 @@
+"""A real worker on a real queue: how jobs end, and that the next one runs whatever befell the last."""
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.records import FieldRecord
+from tests.worker.bench import OBJECT, SCENE, Bench, alive, bench, children_of, eventually
+from worker.artifacts import read_manifest
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Iterator[Bench]:
+    with bench(tmp_path, shutdown_grace_s=0) as made:
+        made.add_ready_fields()
+        yield made
+
+
+def assert_next_job_runs(table: Bench) -> None:
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+    eventually(lambda: not table.leftovers(), "a clean scratch folder")
+
+
+def test_a_job_succeeds(table: Bench) -> None:
+    worker = table.start_worker()
+    table.submit("succeed")
+    done = table.finished()
+    assert (done.status, done.progress, done.attempt, done.error) == ("successful", 1.0, 1, None)
+    assert done.engine == {"version": "tiny", "device": "none"}
+    manifest = read_manifest(table.context.blobs, "j1")
+    assert manifest is not None
+    assert manifest["attempt"] == 1
+    assert [(one["name"], one["media_type"]) for one in manifest["artifacts"]] == [
+        ("result.json", "application/json"),
+        ("aligned.ply", "application/octet-stream"),
+    ]
+    with table.context.blobs.open("jobs/j1/1/aligned.ply") as file:
+        assert file.read() == b"ab"
+    with table.context.blobs.open("jobs/j1/1/result.json") as file:
+        assert json.load(file)["pid"] not in (worker.pid, os.getpid()), "jobs have a process of their own"
+    phases = [event.data["phase"] for event in table.context.records.events("j1", None, 0)]
+    assert phases == [None, "loading", "sampling", "optimising", "exporting", "exporting"]
+    eventually(lambda: not table.redis.keys("rq:job:*"), "the queue's forgetting the job")
+    assert_next_job_runs(table)
+
+
+def test_the_parent_never_loads_torch(table: Bench) -> None:
+    worker = table.start_worker("worker.main")
+    maps = Path(f"/proc/{worker.pid}/maps").read_text()
+    assert "/python" in maps
+    assert "libtorch" not in maps
+    assert "open3d" not in maps
+
+
+@pytest.mark.parametrize(
+    ("do", "reason", "status"),
+    [("refuse", "NO_SURFACE_IN_DETECTION", 422), ("crash", "INTERNAL", 500), ("exhaust", "OUT_OF_MEMORY", 500)],
+)
+def test_a_job_fails_with_its_reason(table: Bench, do: str, reason: str, status: int) -> None:
+    table.start_worker()
+    table.submit(do)
+    failed = table.finished()
+    assert failed.status == "failed"
+    assert failed.error is not None
+    assert (failed.error["reason"], failed.error["status"]) == (reason, status)
+    assert failed.error.keys() >= {"type", "title", "detail"}
+    assert "secret" not in json.dumps(failed.error)
+    assert list(table.context.blobs.list("jobs")) == []
+    if reason == "INTERNAL":
+        assert failed.error["incident"] in table.log()
+        assert "secret value 42" in table.log()
+    assert_next_job_runs(table)
+
+
+@pytest.mark.parametrize("do", ["die", "segfault"])
+def test_a_killed_job_is_lost_and_its_worker_goes_on(table: Bench, do: str) -> None:
+    worker = table.start_worker()
+    table.submit(do)
+    failed = table.finished()
+    assert failed.error is not None
+    assert (failed.status, failed.error["reason"], failed.attempt) == ("failed", "WORKER_LOST", 1)
+    assert worker.poll() is None
+    assert_next_job_runs(table)
+
+
+def test_a_job_that_ends_without_a_word_is_run_again_once(table: Bench) -> None:
+    table.start_worker()
+    table.submit("leave")
+    done = table.finished()
+    assert (done.status, done.attempt, done.requeues) == ("successful", 2, 1)
+
+
+@pytest.mark.parametrize("do", ["iterate", "hang"])
+def test_a_running_job_is_cancelled(table: Bench, do: str) -> None:
+    table.start_worker()
+    table.submit(do)
+    table.reaches("optimising" if do == "iterate" else "sampling")
+    table.context.records.request_cancel("j1")
+    table.context.queue.stop("j1", 1)
+    assert table.finished().status == "dismissed"
+    assert_next_job_runs(table)
+
+
+@pytest.mark.parametrize("do", ["iterate", "hang"])
+def test_a_cancelled_job_stops_though_the_stop_command_is_lost(table: Bench, do: str) -> None:
+    table.start_worker()
+    table.submit(do)
+    table.reaches("optimising" if do == "iterate" else "sampling")
+    table.context.records.request_cancel("j1")
+    assert table.finished().status == "dismissed"
+    assert_next_job_runs(table)
+
+
+def test_a_waiting_job_is_cancelled_and_leaves_the_queue(table: Bench) -> None:
+    table.submit("succeed")
+    assert table.context.queue.holds_registration("j1", 1)
+    table.context.records.request_cancel("j1")
+    table.context.queue.stop("j1", 1)
+    assert not table.context.queue.holds_registration("j1", 1)
+    table.start_worker()
+    assert_next_job_runs(table)
+    assert table.job().status == "dismissed"
+    assert table.job().started is None
+
+
+@pytest.mark.parametrize("do", ["iterate", "hang"])
+def test_a_job_that_takes_too_long_is_ended(table: Bench, do: str) -> None:
+    table.start_worker(job_timeout_s=1)
+    table.submit(do)
+    failed = table.finished()
+    assert failed.error is not None
+    assert (failed.status, failed.error["reason"]) == ("failed", "JOB_TIMEOUT")
+    assert_next_job_runs(table)
+
+
+def test_a_killed_worker_takes_its_job_along(table: Bench) -> None:
+    worker = table.start_worker()
+    table.submit("hang")
+    table.reaches("sampling")
+    (child,) = children_of(worker.pid)
+    assert alive(child)
+    worker.kill()
+    worker.wait()
+    eventually(lambda: not alive(child), "the child's end")
+    assert table.job().status == "running", "nobody is left to say otherwise; the reaper will"
+    assert table.leftovers() == ["job-" + name.removeprefix("job-") for name in table.leftovers()] != []
+    table.start_worker()
+    assert table.leftovers() == [], "the next worker sweeps what the dead one left"
+
+
+def test_a_worker_told_to_stop_gives_its_job_back(table: Bench) -> None:
+    worker = table.start_worker()
+    table.submit("hang")
+    table.reaches("sampling")
+    worker.send_signal(signal.SIGTERM)
+    assert worker.wait(30) == 0
+    back = table.job()
+    assert (back.status, back.attempt, back.requeues) == ("accepted", 2, 0)
+    assert table.context.queue.holds_registration("j1", 2)
+    assert table.context.queue.live_workers() == 0
+
+
+def test_an_idle_worker_stops_at_once_and_leaves_nothing(table: Bench) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        worker = table.start_worker()
+        worker.send_signal(number)
+        assert worker.wait(30) == 0
+    assert [path for path in table.context.settings.scratch_dir.iterdir() if path.is_dir()] == []
+
+
+def test_two_workers_one_job(table: Bench) -> None:
+    """The queue's promise is at least once; the record's claim makes it once."""
+    table.start_worker()
+    table.start_worker()
+    for number in range(6):
+        table.submit("succeed", f"j{number}")
+        table.redis.rpush("rq:queue:regnf", f"j{number}-1")
+    for number in range(6):
+        done = table.finished(f"j{number}")
+        assert (done.status, done.attempt) == ("successful", 1)
+        assert (
+            len([e for e in table.context.records.events(f"j{number}", None, 0) if e.data["phase"] == "loading"]) == 1
+        )
+
+
+def upload(table: Bench, sha256: str, data: bytes) -> None:
+    now = table.context.records.now()
+    table.context.blobs.put(f"fields/{sha256}/original", data)
+    record, created = table.context.records.create_field(FieldRecord(sha256, "validating", len(data), now, now))
+    assert created
+    table.context.queue.enqueue_import(sha256, record.attempt)
+
+
+def field_state(table: Bench, sha256: str) -> FieldRecord:
+    def ended() -> FieldRecord | None:
+        record = table.context.records.get_field(sha256)
+        return record if record is not None and record.state != "validating" else None
+
+    return eventually(ended, table.log())
+
+
+def test_imports_and_registrations_that_wait_for_them(tmp_path: Path) -> None:
+    with bench(tmp_path) as table:
+        table.submit("succeed")
+        upload(table, SCENE, b"s")
+        upload(table, OBJECT, b"o")
+        table.start_worker()
+        assert table.finished().status == "successful", table.job().error
+        with table.context.blobs.open("jobs/j1/1/aligned.ply") as file:
+            assert file.read() == b"so"
+        ready = field_state(table, SCENE)
+        assert (ready.state, ready.report) == ("ready", {"family": "tiny"})
+        assert list(table.context.blobs.list(f"fields/{SCENE}")) == [
+            f"fields/{SCENE}/field.safetensors",
+            f"fields/{SCENE}/report.json",
+        ]
+
+
+def test_a_registration_of_a_rejected_field_fails(tmp_path: Path) -> None:
+    with bench(tmp_path) as table:
+        upload(table, SCENE, b"die")
+        upload(table, OBJECT, b"o")
+        table.submit("succeed")
+        table.start_worker()
+        failed = table.finished()
+        assert failed.error is not None
+        assert failed.error["reason"] == "FIELD_REJECTED"
+        rejected = field_state(table, SCENE)
+        assert rejected.error is not None
+        assert (rejected.state, rejected.error["reason"]) == ("rejected", "WORKER_LOST")
+        assert list(table.context.blobs.list(f"fields/{SCENE}")) == []
+        upload(table, SCENE, b"s")
+        assert field_state(table, SCENE).attempt == 2
+        table.submit("succeed")
+        assert table.finished().status == "successful"
+
+
+def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
+    with bench(tmp_path) as table:
+        from service.redis_queue import RqJobQueue
+
+        now = table.context.records.now()
+        table.context.blobs.put(f"fields/{SCENE}/original", b"no field at all")
+        table.context.records.create_field(FieldRecord(SCENE, "validating", 15, now, now))
+        RqJobQueue(table.redis).enqueue_import(SCENE)
+        table.start_worker("worker.main")
+        rejected = field_state(table, SCENE)
+        assert rejected.error is not None
+        assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNISED")
+        assert list(table.context.blobs.list("fields")) == []
+        assert "Traceback" not in table.log()

@@ -1,0 +1,91 @@
+"""An engine that does in milliseconds what a request's options name: succeed, refuse, hang, die ..."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import NoSurfaceError
+from worker.jobs import delivery
+from worker.registration import run_attempt
+
+Report = Callable[[str, float], None]
+
+
+class TinyEngine:
+    """``request["options"]`` is {"do": <a method's name>}."""
+
+    def describe(self) -> dict[str, Any]:
+        return {"version": "tiny", "device": "none"}
+
+    def register(self, scene: Path, object_: Path, request: dict[str, Any], report: Report, folder: Path) -> list[str]:
+        report("sampling", 0.1)
+        (folder / "half-written").write_bytes(b".")
+        getattr(self, request["options"]["do"])(report)
+        report("exporting", 0.9)
+        (folder / "result.json").write_text(json.dumps({"pid": os.getpid()}))
+        (folder / "aligned.ply").write_bytes(scene.read_bytes() + object_.read_bytes())
+        return ["result.json", "aligned.ply"]
+
+    def succeed(self, report: Report) -> None:
+        report("optimising", 0.5)
+
+    def refuse(self, report: Report) -> None:
+        raise NoSurfaceError("nothing in the box")
+
+    def crash(self, report: Report) -> None:
+        raise ZeroDivisionError("secret value 42")
+
+    def exhaust(self, report: Report) -> None:
+        raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")
+
+    def iterate(self, report: Report) -> None:
+        """Goes on until it is stopped, reporting all the while."""
+        while True:
+            report("optimising", 0.5)
+            time.sleep(0.01)
+
+    def hang(self, report: Report) -> None:
+        """Native code that never comes back to Python: no alarm is heard, nothing is reported."""
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
+        ctypes.CDLL(None).sleep(600)
+
+    def die(self, report: Report) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def segfault(self, report: Report) -> None:
+        signal.signal(signal.SIGSEGV, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    def leave(self, report: Report) -> None:
+        """Ends by itself without a word, the first time."""
+        if delivery()[0] == 1:
+            os._exit(0)
+
+
+def run_registration(job_id: str) -> None:
+    """What tests have the queue name instead of worker.jobs.run_registration."""
+    from tests.worker.tiny_worker import tiny_context
+
+    run_attempt(tiny_context(), job_id, *delivery(), TinyEngine)
+
+
+def run_import(sha256: str) -> None:
+    """An import whose upload says how it ends."""
+    from tests.worker.tiny_worker import tiny_context
+    from worker.imports import run_import_attempt
+
+    run_import_attempt(tiny_context(), sha256, *delivery(), tiny_importer)
+
+
+def tiny_importer(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+    if upload.read_bytes() == b"die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    (folder / "field.safetensors").write_bytes(upload.read_bytes())
+    return {"family": "tiny"}
