@@ -1,9 +1,9 @@
-"""Make the demo's two fields from open meshes: a furnished room, and the armchair of the library.
+"""Make the demo's fields from open meshes: a furnished room, and two chairs of the library.
 
-    python scripts/make_demo_fields.py MESHES ROOM.json [--out examples/data] [--only room|chair] [--iterations N]
+    python scripts/make_demo_fields.py MESHES ROOM.json [--out examples/data] [--only NAME] [--iterations N]
 
 MESHES holds the meshes that the room's instances name; ROOM.json lists floor, walls and instances (a pose each). Beside
-the two fields it writes the detection of the armchair in the room, the true transform, and what the fits measured.
+the fields it writes each chair's detection in the room and its true transform, and what the fits measured.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ SCENE_UNITS_PER_METRE = 0.5
 SCENE_ORIGIN_M = np.array([0.0, 0.0, 1.0])
 OBJECT_UNITS_PER_METRE = 0.625
 """1.25 object units a scene unit: the scale that the registration has to find."""
-INSTANCE = "fc"
+LIBRARY = {"armchair": ("fc", ""), "dining-chair": ("dc", "-dining-chair")}
+"""Library objects: the room's instance that shows each, and how its detection and truth files end."""
 ATTRIBUTION = "Poly Haven, https://polyhaven.com, CC0 1.0"
 
 ROOM_OPTIONS = FitOptions(
@@ -145,21 +146,23 @@ def main() -> None:
     parser.add_argument("meshes", type=Path)
     parser.add_argument("room", type=Path)
     parser.add_argument("--out", type=Path, default=Path("examples/data"))
-    parser.add_argument("--only", choices=("room", "chair"))
+    parser.add_argument("--only", choices=("mix-room", *LIBRARY))
     parser.add_argument("--iterations", type=int, help="instead of the usual number")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     room = json.loads(arguments.room.read_text())
-    instance = next(i for i in room["instances"] if i["id"] == INSTANCE)
-    chair = load_instance(arguments.meshes, instance)
-    for name, content in (("detection", detection(instance)), ("truth", truth(instance, chair))):
-        (arguments.out / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
     change = {"iterations": arguments.iterations} if arguments.iterations else {}
-    if arguments.only != "room":
+    for name, (identifier, suffix) in LIBRARY.items():
+        if arguments.only not in (None, name):
+            continue
+        instance = next(i for i in room["instances"] if i["id"] == identifier)
+        chair = load_instance(arguments.meshes, instance)
+        for kind, content in (("detection", detection(instance)), ("truth", truth(instance, chair))):
+            (arguments.out / f"{kind}{suffix}.json").write_text(json.dumps(content, indent=1) + "\n")
         target = chair.transformed(object_from_mesh(chair))
-        path = arguments.out / "armchair.safetensors"
+        path = arguments.out / f"{name}.safetensors"
         fit(target, path, replace(CHAIR_OPTIONS, **change), "chair", [Path(instance["mesh"]).stem])
-    if arguments.only != "chair":
+    if arguments.only in (None, "mix-room"):
         names = sorted({Path(i["mesh"]).stem for i in room["instances"]})
         path = arguments.out / "mix-room.safetensors"
         fit(compose_room(arguments.meshes, room), path, replace(ROOM_OPTIONS, **change), "mix-room", names)

@@ -41,9 +41,13 @@ class MeshField:
     def load(cls, path: str | os.PathLike[str]) -> MeshField:
         """The mesh in a glb, ply, obj or stl file; the nodes of a scene graph are merged at their poses.
 
-        Raises FieldFormatError (MESH_INVALID) when the file holds no triangles.
+        Raises FieldFormatError (MESH_INVALID) when the file is malformed or holds no triangles, and OSError.
         """
-        scene = trimesh.load_scene(os.fspath(path), process=False)
+        os.stat(path)  # trimesh takes a name without a file for the mesh itself
+        try:
+            scene = trimesh.load_scene(os.fspath(path), process=False)
+        except (LookupError, NotImplementedError, TypeError, ValueError) as error:
+            raise FieldFormatError(f"{os.path.basename(path)}: {error}", reason="MESH_INVALID") from error
         meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
         if not meshes:
             raise FieldFormatError(f"{os.path.basename(path)} holds no triangle mesh", reason="MESH_INVALID")

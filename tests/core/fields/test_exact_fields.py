@@ -108,6 +108,16 @@ def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
     assert caught.value.reason == "MESH_INVALID"
 
 
+@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.txt"])
+def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("no mesh at all")
+    with pytest.raises(FieldFormatError) as caught:
+        MeshField.load(tmp_path / name)
+    assert caught.value.reason == "MESH_INVALID"
+    with pytest.raises(FileNotFoundError):
+        MeshField.load(tmp_path / "absent.glb")
+
+
 def test_surface_samples_lie_on_the_surface() -> None:
     rng = np.random.default_rng(0)
     for field in (BOX, box_mesh(BOX), UnionField([BOX, BoxField((1, 1, 1), (2, 2, 2))])):
