@@ -1,0 +1,56 @@
+"""The socket that the service listens on: opened by the supervisor, so that it outlives an API process that dies."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+
+from regnf_cli.service_errors import ServiceError
+from service.settings import Settings
+
+_BACKLOG = 2048
+
+
+def open_socket(settings: Settings) -> socket.socket:
+    """A listening socket on the settings' host and port (0: a free one).
+
+    Raises ServiceError: ADDRESS_UNAVAILABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others can reach while
+    no token is asked for.
+    """
+    if not is_loopback(settings.host) and not settings.api_tokens and not settings.allow_unauthenticated:
+        raise ServiceError(
+            f"{settings.host} can be reached by others and no token is asked for: set REGNF_API_TOKENS, "
+            "or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
+            reason="UNAUTHENTICATED_PUBLIC_BIND",
+        )
+    try:
+        found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, address = found[0]
+        listener = socket.socket(family, kind, protocol)
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(_BACKLOG)
+        except OSError:
+            listener.close()
+            raise
+    except OSError as error:
+        detail = f"cannot listen on {settings.host}, port {settings.port}: {error.strerror or error}"
+        raise ServiceError(detail, reason="ADDRESS_UNAVAILABLE") from error
+    return listener
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach the host. Names other than localhost are not looked up: they are not."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def address_of(listener: socket.socket) -> str:
+    """The address to open in a browser on this machine."""
+    host, port = listener.getsockname()[:2]
+    if ipaddress.ip_address(host).is_unspecified:
+        host = "127.0.0.1"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,0 +1,36 @@
+"""``regnf serve``: the service on this machine, with everything it needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="0: a free one. [default: 8080]")] = None,
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Where fields, results and records are kept. [default: ~/.local/state/regnf]")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=0, max=64, help="Worker processes. [default: 1]")] = None,
+) -> None:
+    """Serve the HTTP interface and the web page, with workers and a private Redis of its own.
+
+    What is not given here is read from REGNF_* in the environment. Ctrl+C stops everything.
+
+    Example: **regnf serve --port 8080**
+    """
+    from regnf_cli.supervisor import Supervisor
+    from service.logs import configure_logging
+    from service.settings import Settings
+
+    given: dict[str, Any] = {"host": host, "port": port, "state_dir": state_dir, "workers": workers}
+    settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    configure_logging(settings.log_format)
+    Supervisor(settings).run(ready=lambda address: typer.echo(f"regnf serves {address} (Ctrl+C stops it)"))
+
+
+if __name__ == "__main__":
+    typer.run(serve)

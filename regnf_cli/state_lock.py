@@ -1,0 +1,74 @@
+"""One service to a state folder."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from types import TracebackType
+
+from regnf_cli.service_errors import ServiceError
+
+_NAME = "serve.lock"
+_SOCKET_PREFIX = "regnf-"
+
+
+class StateLock:
+    """Holds a state folder for one service, and remembers for the next one what a killed one could not tidy up.
+
+    Raises ServiceError (STATE_DIR_IN_USE, STATE_DIR_UNUSABLE) on entry.
+    """
+
+    def __init__(self, state_dir: Path) -> None:
+        self._state_dir = state_dir
+        self.socket_dir: Path | None = None
+
+    def __enter__(self) -> StateLock:
+        try:
+            self._state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._file = (self._state_dir / _NAME).open("a+")
+        except OSError as error:
+            detail = f"cannot keep state in {self._state_dir}: {error.strerror}"
+            raise ServiceError(detail, reason="STATE_DIR_UNUSABLE") from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self._file.close()
+            detail = f"another service uses {self._state_dir}; give this one its own with --state-dir"
+            raise ServiceError(detail, reason="STATE_DIR_IN_USE") from error
+        self._remove_leftover()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.socket_dir is not None:
+            shutil.rmtree(self.socket_dir, ignore_errors=True)
+        self._write({})
+        self._file.close()
+
+    def make_socket_dir(self) -> Path:
+        """A private folder with a short path: socket paths hold about a hundred bytes, state folders may lie deep."""
+        usual = tempfile.gettempdir()
+        folder = Path(tempfile.mkdtemp(prefix=_SOCKET_PREFIX, dir=usual if len(usual) < 60 else "/tmp"))  # noqa: S108
+        self.socket_dir = folder
+        self._write({"socket_dir": str(folder)})
+        return folder
+
+    def _write(self, content: dict[str, str]) -> None:
+        self._file.seek(0)
+        self._file.truncate()
+        json.dump(content, self._file)
+        self._file.flush()
+
+    def _remove_leftover(self) -> None:
+        self._file.seek(0)
+        try:
+            left = Path(json.loads(self._file.read() or "{}").get("socket_dir", ""))
+        except ValueError:
+            return
+        if left.name.startswith(_SOCKET_PREFIX) and left.is_dir() and left.stat().st_uid == os.getuid():
+            shutil.rmtree(left, ignore_errors=True)

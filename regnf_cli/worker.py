@@ -1,0 +1,33 @@
+"""``regnf worker``: one more worker for a service that runs elsewhere."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+
+def worker(
+    redis_url: Annotated[
+        str | None, typer.Option(help="The service's Redis. [default: REGNF_REDIS_URL]", show_default=False)
+    ] = None,
+) -> None:
+    """Take jobs from the service's queue until told to stop; a running job goes back to the queue.
+
+    It needs the service's Redis and its storage folder (REGNF_STATE_DIR). What is not given here is read from REGNF_*.
+
+    Example: **regnf worker --redis-url redis://queue:6379/0**
+    """
+    import os
+
+    from regnf_cli.service_errors import ServiceError
+    from service.settings import Settings
+    from worker.context import NoRedisError
+    from worker.main import run_worker
+
+    if redis_url is not None:
+        os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too
+    try:
+        run_worker(Settings())
+    except NoRedisError as error:
+        raise ServiceError(str(error), reason=error.reason) from error
