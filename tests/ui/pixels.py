@@ -29,13 +29,24 @@ def canvas_pixels(page: Page) -> Pixels:
 
 def changed_share(before: Pixels, after: Pixels) -> float:
     """The share of pixels that differ visibly."""
-    return float((np.abs(before - after).max(axis=-1) > 12).mean())
+    return float(differs(before, after).mean())
+
+
+def differs(before: Pixels, after: Pixels) -> NDArray[np.bool_]:
+    """(H, W): which pixels differ visibly."""
+    marked: NDArray[np.bool_] = np.abs(before - after).max(axis=-1) > 12
+    return marked
+
+
+def overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+    """Shared pixels over all pixels of both."""
+    return float((one & other).sum() / (one | other).sum())
 
 
 def coloured(pixels: Pixels, hue: str) -> NDArray[np.bool_]:
     """(H, W): which pixels show the object after (blue) or before (orange)."""
     red, blue = pixels[..., 0], pixels[..., 2]
-    return blue - red > 70 if hue == "blue" else red - blue > 60
+    return blue - red > 70 if hue == "blue" else red - blue > 25
 
 
 def centre_of(mask: NDArray[np.bool_]) -> tuple[float, float]:

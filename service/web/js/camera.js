@@ -10,7 +10,7 @@ const CANDIDATES = 16;
 export function frameSphere(camera, controls, sphere, direction) {
   const half = (camera.fov * Math.PI) / 360;
   const narrow = Math.min(half, Math.atan(Math.tan(half) * camera.aspect));
-  const distance = (sphere.radius / Math.sin(narrow)) * 1.05;
+  const distance = (sphere.radius / Math.sin(narrow)) * 1.2;
   controls.target.copy(sphere.center);
   camera.position.copy(sphere.center).addScaledVector(direction, distance);
   controls.minDistance = sphere.radius * 0.1;

@@ -93,7 +93,7 @@ export class Cloud {
 
   /** `factor` scales the discs; 1 just covers the gaps between the samples. */
   resize(factor, pixelsPerUnit, pixelRatio) {
-    this.material.uniforms.uWorldSize.value = this.spacing * 2.7 * factor * this.style.discs;
+    this.material.uniforms.uWorldSize.value = this.spacing * 1.7 * factor * this.style.discs;
     this.material.uniforms.uPixels.value = pixelsPerUnit;
     this.material.uniforms.uMinPixels.value = 1.4 * factor * pixelRatio;
   }
@@ -104,26 +104,36 @@ export class Cloud {
   }
 }
 
-/** The typical distance between neighbours, in the cloud's units: the median over some of the points. */
+/**
+ * The typical distance between neighbours, in the cloud's units: the median over some points of the distance to the
+ * fourth nearest, which tells an even cloud's density from a random one's far better than the nearest does.
+ */
 function spacingOf(geometry) {
-  const position = geometry.getAttribute('position');
-  const count = position.count;
+  const { array, count } = geometry.getAttribute('position');
   const probes = Math.min(count, 96);
   const stride = Math.max(Math.floor(count / 20_000), 1);
-  const nearest = [];
+  const fourth = [];
   for (let p = 0; p < probes; p += 1) {
-    const i = Math.floor((p * count) / probes);
-    const [x, y, z] = [position.getX(i), position.getY(i), position.getZ(i)];
-    let best = Infinity;
-    for (let j = 0; j < count; j += stride) {
-      const d = (position.getX(j) - x) ** 2 + (position.getY(j) - y) ** 2 + (position.getZ(j) - z) ** 2;
-      if (d > 0 && d < best) best = d;
-    }
-    if (best < Infinity) nearest.push(Math.sqrt(best / stride));
+    const squares = fourNearest(array, count, stride, Math.floor((p * count) / probes));
+    if (squares[3] < Infinity) fourth.push(Math.sqrt(squares[3] / stride));
   }
-  nearest.sort((a, b) => a - b);
+  fourth.sort((a, b) => a - b);
   const fallback = (geometry.boundingSphere ?? new Sphere()).radius / 100;
-  return nearest[Math.floor(nearest.length / 2)] || fallback || 0.01;
+  return fourth[Math.floor(fourth.length / 2)] || fallback || 0.01;
+}
+
+/** The four smallest squared distances from point i to others, ascending. */
+function fourNearest(array, count, stride, i) {
+  const squares = [Infinity, Infinity, Infinity, Infinity];
+  for (let j = 0; j < count; j += stride) {
+    const [x, y, z] = [array[j * 3] - array[i * 3], array[j * 3 + 1] - array[i * 3 + 1], array[j * 3 + 2] - array[i * 3 + 2]];
+    let square = x * x + y * y + z * z;
+    if (square === 0 || square >= squares[3]) continue;
+    for (let k = 0; k < 4; k += 1) {
+      if (square < squares[k]) [squares[k], square] = [square, squares[k]];
+    }
+  }
+  return squares;
 }
 
 // The loader takes colours to three.js's linear working space; the shader writes display colours.

@@ -9,7 +9,7 @@ import { readResiduals } from './residuals.js';
 import { between, inverse } from './sim3.js';
 import { Viewer } from './viewer.js';
 
-const FOCUS = ['after', 'before', 'box'];
+const FOCUS = ['after', 'box'];
 
 export class Stage {
   constructor(api, names) {
@@ -56,7 +56,7 @@ export class Stage {
   addBefore(known) {
     show(byId('before-chip'), known);
     if (!known) return;
-    const before = new Cloud(this.plain.after.geometry, { opacity: 0.5, discs: 0.5 });
+    const before = new Cloud(this.plain.after.geometry, { opacity: 0.35, discs: 0.5 });
     before.place(this.poses[0]);
     this.addCloud('before', before, 'cloud-before');
   }
@@ -80,7 +80,7 @@ export class Stage {
     };
     byId('size').oninput = (event) => this.viewer.setPointFactor(Number(event.target.value));
     byId('frame-object').onclick = () => this.viewer.look(FOCUS);
-    byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'scene']);
+    byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'before', 'scene']);
     byId('colour').onchange = (event) => this.colourBy(event.target.value);
     this.offer('residual', this.names.includes('residuals.npz'));
     this.offer('file', Object.values(this.plain).some((cloud) => isColourful(cloud.geometry)));

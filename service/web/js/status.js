@@ -48,7 +48,7 @@ export function showTrouble(error) {
 export function showFailed(job) {
   showBadge('failed', job.id);
   const problem = job.error ?? {};
-  card({ eyebrow: 'The job failed', title: problem.title ?? words(problem.reason ?? 'failed'), text: problem.detail ?? '', tone: 'bad' });
+  card({ eyebrow: 'The job failed', title: titleOf(problem), text: problem.detail ?? '', tone: 'bad' });
   showProblem(problem);
 }
 
@@ -116,6 +116,9 @@ function showPhases(current) {
     return item;
   }));
 }
+
+// A problem without a title of its own bears its reason as one.
+const titleOf = ({ title, reason }) => (title && title !== reason ? title : words(reason ?? 'failed'));
 
 const runningText = (attempt) => (attempt > 1 ? `Running, attempt ${attempt}` : 'Running');
 

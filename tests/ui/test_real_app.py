@@ -1,0 +1,119 @@
+"""The page served by the real application, over stores in memory: its policy, its addresses, its documents."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import pytest
+import uvicorn
+from playwright.sync_api import expect
+
+from service.app import create_app
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.records import JobRecord
+from service.settings import Settings
+from tests.ui.conftest import Visit
+from tests.ui.pixels import canvas_pixels, coloured
+from tests.ui.synthetic import JOB_ID, Synthetic
+
+pytestmark = pytest.mark.browser
+
+
+@dataclass(frozen=True)
+class RealService:
+    """The application on a port of its own, with one accepted job in its store."""
+
+    origin: str
+    records: InMemoryRecordStore
+    blobs: InMemoryBlobStore
+
+    @property
+    def view(self) -> str:
+        return f"{self.origin}/jobs/{JOB_ID}/view"
+
+    def finish(self, data: Synthetic) -> None:
+        """What a worker does when the registration has ended well."""
+        result = {name: value for name, value in data.result.items() if name != "artifacts"}
+        files = data.artifacts | {"result.json": json.dumps(result).encode()}
+        for name, content in files.items():
+            self.blobs.put(f"jobs/{JOB_ID}/1/{name}", content)
+        listed = [
+            {"name": name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            for name, content in files.items()
+        ]
+        self.blobs.put(f"jobs/{JOB_ID}/manifest.json", json.dumps({"attempt": 1, "artifacts": listed}).encode())
+        self.records.update_job(JOB_ID, 1, status="successful")
+
+
+@contextmanager
+def real_service(detection: dict[str, object], settings: Settings) -> Iterator[RealService]:
+    records, blobs = InMemoryRecordStore(), InMemoryBlobStore()
+    now = time.time()
+    inputs = {"scene": "a3" * 32, "object": "7c" * 32, "seed": 7, "detection": detection}
+    job = JobRecord(JOB_ID, "registration", "accepted", request={}, inputs=inputs, created=now, updated=now)
+    records.create_job(job, max_active=10)
+    app = create_app(settings, records, blobs, InMemoryJobQueue())
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            yield RealService(f"http://127.0.0.1:{listener.getsockname()[1]}", records, blobs)
+        finally:
+            server.should_exit = True
+            thread.join()
+
+
+def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
+    data = visit.server.stage.data
+    with real_service(data.detection, Settings()) as service:
+        page = visit.page
+        page.goto(service.view)
+        expect(page.locator("#message-title")).to_have_text("In the queue")
+        service.records.update_job(JOB_ID, 1, status="running")
+        service.records.update_job(JOB_ID, 1, phase="optimising", progress=0.5)
+        expect(page.locator("#message-title")).to_have_text("Optimising", timeout=30_000)
+        service.records.update_job(JOB_ID, 1, progress=0.75)
+        expect(page.locator("#message-text")).to_have_text("75 % done", timeout=30_000)
+        service.finish(data)
+        expect(page.locator("#verdict-word")).to_have_text("Registered", timeout=30_000)
+        page.wait_for_selector("#tools:not([hidden])")
+        assert coloured(canvas_pixels(page), "blue").mean() > 0.01
+        page.locator("#colour").select_option("residual")
+        page.wait_for_selector("#legend svg rect")
+        assert page.locator("#box-chip").is_visible()
+        assert "result.json" in page.locator("#files").inner_text()
+        assert visit.complaints == []
+        assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
+        page.goto("about:blank")  # lets go of the connections before the server ends
+
+
+def test_failed_job_of_the_real_service(visit: Visit) -> None:
+    with real_service(visit.server.stage.data.detection, Settings()) as service:
+        error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "12 points were found; 500 are needed."}
+        service.records.update_job(JOB_ID, 1, status="failed", error=error)
+        visit.page.goto(service.view.replace("/jobs/", "/v1/jobs/"))
+        expect(visit.page.locator("#message-text")).to_have_text("12 points were found; 500 are needed.")
+        assert visit.page.locator("#message-title").inner_text() == "No surface in detection"
+        visit.page.goto("about:blank")
+
+
+def test_page_of_a_guarded_service_asks_for_the_token(visit: Visit) -> None:
+    settings = Settings(api_tokens=frozenset({"open-sesame"}))
+    with real_service(visit.server.stage.data.detection, settings) as service:
+        service.records.update_job(JOB_ID, 1, status="running")
+        service.finish(visit.server.stage.data)
+        page = visit.page
+        page.goto(service.view)
+        page.locator("#token").fill("open-sesame")
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#tools:not([hidden])")
+        assert page.locator("#verdict-word").inner_text() == "Registered"
+        page.goto("about:blank")
