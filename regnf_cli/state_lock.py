@@ -67,8 +67,9 @@ class StateLock:
     def _remove_leftover(self) -> None:
         self._file.seek(0)
         try:
-            left = Path(json.loads(self._file.read() or "{}").get("socket_dir", ""))
+            content = json.loads(self._file.read() or "{}")
         except ValueError:
             return
+        left = Path(str(content.get("socket_dir", ""))) if isinstance(content, dict) else Path()
         if left.name.startswith(_SOCKET_PREFIX) and left.is_dir() and left.stat().st_uid == os.getuid():
             shutil.rmtree(left, ignore_errors=True)

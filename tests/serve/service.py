@@ -1,0 +1,115 @@
+"""`regnf serve` as a real process, and a look at every process it has made."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+
+from tests.worker.bench import alive, eventually
+
+DEADLINE_S = 40.0
+
+
+def descendants(pid: int) -> set[int]:
+    """Every process below this one."""
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        children.setdefault(int(fields[1]), []).append(int(stat.parent.name))
+    found: set[int] = set()
+    waiting = [pid]
+    while waiting:
+        below = children.get(waiting.pop(), [])
+        found.update(below)
+        waiting += below
+    return found
+
+
+def command_line(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except FileNotFoundError:
+        return ""
+
+
+@dataclass
+class Service:
+    """A started service. ``seen`` are all processes that were ever found below it."""
+
+    process: subprocess.Popen[str]
+    state_dir: Path
+    address: str
+    seen: set[int] = field(default_factory=set)
+
+    def look(self) -> set[int]:
+        found = descendants(self.process.pid)
+        self.seen |= found
+        return found
+
+    def part(self, name: str) -> int:
+        """The process whose command line holds this."""
+        return eventually(lambda: next((pid for pid in self.look() if name in command_line(pid)), 0), name, DEADLINE_S)
+
+    def socket_dir(self) -> Path:
+        line = command_line(self.part("unixsocket:"))
+        return Path(line.split("unixsocket:")[1].split("/redis.sock")[0])
+
+    def is_ready(self) -> bool:
+        try:
+            return httpx.get(f"{self.address}/readyz").status_code == 200
+        except httpx.HTTPError:
+            return False
+
+    def await_ready(self) -> None:
+        eventually(self.is_ready, f"readiness; {self.log()}", DEADLINE_S)
+
+    def log(self) -> str:
+        return (self.state_dir.parent / "serve.log").read_text()
+
+    def all_gone(self) -> bool:
+        return not any(alive(pid) for pid in self.seen)
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+
+def environment(**settings: object) -> dict[str, str]:
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    return plain | {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
+
+
+def command(state_dir: Path, *arguments: str) -> list[str]:
+    return [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir), *arguments]
+
+
+def start(state_dir: Path, *arguments: str, **settings: object) -> Service:
+    """Start a service and wait for the line that tells its address."""
+    state_dir.parent.mkdir(parents=True, exist_ok=True)
+    with (state_dir.parent / "serve.log").open("a") as log:
+        process = subprocess.Popen(
+            command(state_dir, *arguments),
+            env=environment(**settings),
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    service = Service(process, state_dir, "")
+    if "http://" not in line:
+        service.end()
+        raise AssertionError(f"it did not start: {service.log()}")
+    service.address = next(word for word in line.split() if word.startswith("http://"))
+    service.look()
+    return service

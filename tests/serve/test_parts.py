@@ -1,0 +1,118 @@
+"""The supervisor's small parts on their own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from regnf_cli import embedded_redis
+from regnf_cli.listening import address_of, is_loopback, open_socket
+from regnf_cli.service_errors import ServiceError
+from regnf_cli.state_lock import StateLock
+from service.settings import Settings
+from tests.worker.bench import alive, children_of, eventually
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [
+        ("127.0.0.1", True),
+        ("127.9.9.9", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("::", False),
+        ("10.0.0.1", False),
+        ("localhost.example.org", False),
+        ("", False),
+    ],
+)
+def test_what_is_loopback(host: str, expected: bool) -> None:
+    assert is_loopback(host) is expected
+
+
+def test_addresses_to_open() -> None:
+    with open_socket(Settings(port=0)) as listener:
+        assert address_of(listener) == f"http://127.0.0.1:{listener.getsockname()[1]}"
+    with open_socket(Settings(port=0, host="0.0.0.0", allow_unauthenticated=True)) as listener:
+        assert address_of(listener).startswith("http://127.0.0.1:")
+
+
+def test_a_host_that_is_not_ours() -> None:
+    with pytest.raises(ServiceError) as caught:
+        open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True))
+    assert caught.value.reason == "ADDRESS_UNAVAILABLE"
+
+
+def test_a_missing_redis_server_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(embedded_redis, "_packaged_binary", lambda: None)
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ServiceError) as caught:
+        embedded_redis.server_binary()
+    assert caught.value.reason == "EMBEDDED_REDIS_MISSING"
+
+
+def test_the_lock_tidies_up_after_a_killed_service(tmp_path: Path) -> None:
+    lock = StateLock(tmp_path)
+    lock.__enter__()
+    left = lock.make_socket_dir()
+    lock._file.close()  # what the kernel does when the holder is killed
+    with StateLock(tmp_path) as next_one:
+        assert not left.exists()
+        mine = next_one.make_socket_dir()
+        assert mine.is_dir()
+    assert not mine.exists()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"socket_dir": "/"}', '{"socket_dir": "/tmp"}'])
+def test_the_lock_removes_no_folder_that_is_not_its_own(tmp_path: Path, content: str) -> None:
+    (tmp_path / "serve.lock").write_text(content)
+    with StateLock(tmp_path):
+        assert Path("/tmp").is_dir()
+
+
+GUARD = """
+import os, subprocess, sys, time
+lifeline, held = os.pipe()
+code = "import sys; from regnf_cli.guard import main; sys.exit(main(sys.argv[1:], kernel_kills=%s))"
+command = [sys.executable, "-c", code, str(os.getpid()), str(lifeline), "/bin/sleep", "300"]
+subprocess.Popen(command, pass_fds=[lifeline])
+time.sleep(300)
+"""
+
+
+@pytest.mark.parametrize("kernel_kills", [True, False])
+def test_the_guarded_command_ends_with_whoever_asked_for_it(kernel_kills: bool) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", GUARD % kernel_kills])
+    try:
+
+        def sleeper() -> int:
+            waiting, found = [parent.pid], 0
+            while waiting:
+                pid = waiting.pop()
+                if b"sleep" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]:
+                    found = pid
+                waiting += children_of(pid)
+            return found
+
+        command = eventually(sleeper, "the guarded command")
+        parent.kill()
+        parent.wait()
+        eventually(lambda: not alive(command), "its end")
+    finally:
+        parent.kill()
+        parent.wait()
+
+
+def test_a_guard_that_comes_too_late_runs_nothing() -> None:
+    """The parent died between the start and the word to the kernel: the parent process is another one by then."""
+    lifeline, held = os.pipe()
+    try:
+        arguments = [sys.executable, "-m", "regnf_cli.guard", "1", str(lifeline), "/bin/echo", "ran"]
+        done = subprocess.run(arguments, pass_fds=[lifeline], capture_output=True, timeout=60)
+        assert (done.returncode, done.stdout) == (-9, b"")
+    finally:
+        os.close(lifeline)
+        os.close(held)

@@ -1,0 +1,174 @@
+"""`regnf serve` with real processes: it comes up unconfigured, and leaves nothing running however it ends."""
+
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.serve.service import DEADLINE_S, Service, command, command_line, environment, start
+from tests.worker.bench import alive, eventually
+
+
+@pytest.fixture
+def service(tmp_path: Path) -> Iterator[Service]:
+    started = start(tmp_path / "state")
+    try:
+        yield started
+    finally:
+        started.end()
+        eventually(started.all_gone, "the end of every process", DEADLINE_S)
+
+
+def test_it_comes_up_with_nothing_configured(service: Service) -> None:
+    service.await_ready()
+    assert httpx.get(f"{service.address}/healthz").json() == {"status": "ok"}
+    parts = ("unixsocket:", "worker.main", "regnf_cli.api_process")
+    assert {service.part(part) for part in parts} == service.look(), [command_line(pid) for pid in service.look()]
+    assert service.address.startswith("http://127.0.0.1:")
+    assert oct(service.socket_dir().stat().st_mode & 0o777) == "0o700"
+    assert oct(service.state_dir.stat().st_mode & 0o777) == "0o700"
+    redis = service.part("unixsocket:")
+    assert not listening_sockets(redis), "Redis has no TCP port"
+    assert listening_sockets(service.part("regnf_cli.api_process")), "or this test cannot tell"
+
+
+def listening_sockets(pid: int) -> set[str]:
+    """Inodes of the TCP sockets on which a process listens."""
+    inodes = set()
+    for entry in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # closed meanwhile
+            inodes.add(os.readlink(entry))
+    tables = (line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/net/{name}").read_text().splitlines())
+    return {entry[9] for entry in tables if entry[3] == "0A" and f"socket:[{entry[9]}]" in inodes}
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_ends_everything_in_order(service: Service, number: signal.Signals) -> None:
+    service.await_ready()
+    folder = service.socket_dir()
+    service.look()
+    service.process.send_signal(number)
+    assert service.process.wait(DEADLINE_S) == 0
+    assert service.all_gone(), "nothing outlives the one who waited for it"
+    assert not folder.exists()
+    assert "killed" not in service.log()
+    assert "Traceback" not in service.log()
+
+
+def test_ctrl_c_reaches_the_supervisor_alone(tmp_path: Path) -> None:
+    """A terminal sends SIGINT to its whole foreground group: Redis must not go before the jobs are given back."""
+    service = start(tmp_path / "state")
+    try:
+        group = os.getpgid(service.process.pid)
+        assert all(os.getpgid(pid) != group for pid in service.look())
+    finally:
+        service.end()
+    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+
+
+def test_a_killed_supervisor_takes_everything_along(service: Service, tmp_path: Path) -> None:
+    service.await_ready()
+    folder = service.socket_dir()
+    service.process.kill()
+    service.process.wait()
+    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+    assert folder.exists(), "nobody was left to remove it"
+    again = start(service.state_dir)
+    try:
+        assert not folder.exists(), "the next one does"
+        again.await_ready()
+    finally:
+        again.end()
+    eventually(again.all_gone, "the end of every process", DEADLINE_S)
+
+
+def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> None:
+    process = subprocess.Popen(command(tmp_path / "state"), env=environment(), stderr=subprocess.DEVNULL)
+    started = Service(process, tmp_path / "state", "")
+    eventually(started.look, "a first child", DEADLINE_S)
+    process.kill()
+    process.wait()
+    eventually(started.all_gone, "the end of every process", DEADLINE_S)
+
+
+@pytest.mark.parametrize("part", ["worker.main", "regnf_cli.api_process", "unixsocket:"])
+def test_a_part_that_dies_is_started_anew(service: Service, part: str) -> None:
+    service.await_ready()
+    before = service.part(part)
+    os.kill(before, signal.SIGKILL)
+    eventually(lambda: not alive(before), "its end")
+    eventually(lambda: service.part(part) != before, "its successor", DEADLINE_S)
+    service.await_ready()
+    assert service.process.poll() is None
+
+
+def test_state_survives_a_restart(tmp_path: Path) -> None:
+    data = b"no field, but bytes"
+    first = start(tmp_path / "state", "--workers", "0")
+    try:
+        posted = httpx.post(f"{first.address}/fields", content=b"PK\x03\x04" + data)
+        assert posted.status_code == 201, posted.text
+        first.process.terminate()
+        assert first.process.wait(DEADLINE_S) == 0
+    finally:
+        first.end()
+    second = start(tmp_path / "state", "--workers", "0")
+    try:
+        held = httpx.get(f"{second.address}{posted.headers['location']}")
+        assert held.json()["state"] == "validating"
+    finally:
+        second.end()
+    eventually(lambda: first.all_gone() and second.all_gone(), "the end of every process", DEADLINE_S)
+
+
+def refused(*arguments: str, state_dir: Path, **settings: object) -> str:
+    done = subprocess.run(
+        command(state_dir, *arguments), env=environment(**settings), capture_output=True, text=True, timeout=DEADLINE_S
+    )
+    assert done.returncode == 3, done
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+def test_one_service_to_a_state_folder(service: Service) -> None:
+    assert "STATE_DIR_IN_USE" in refused(state_dir=service.state_dir)
+    assert service.is_ready()
+
+
+def test_an_unusable_state_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    assert "STATE_DIR_UNUSABLE" in refused(state_dir=tmp_path / "file" / "state")
+
+
+def test_a_port_that_is_taken(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert "ADDRESS_UNAVAILABLE" in refused("--port", port, state_dir=tmp_path / "state")
+
+
+def test_beyond_loopback_only_with_tokens_or_on_request(tmp_path: Path) -> None:
+    assert "UNAUTHENTICATED_PUBLIC_BIND" in refused("--host", "0.0.0.0", state_dir=tmp_path / "state")
+    for settings in ({"allow_unauthenticated": "true"}, {"api_tokens": '["0123456789abcdef0123456789abcdef"]'}):
+        service = start(tmp_path / "state", "--host", "0.0.0.0", "--workers", "0", **settings)
+        service.end()
+        eventually(service.all_gone, "the end of every process", DEADLINE_S)
+
+
+def test_without_an_embedded_redis_there_is_one_child_less(tmp_path: Path) -> None:
+    from tests.redis_server import private_redis
+
+    with private_redis() as url:
+        service = start(tmp_path / "state", redis_url=url)
+        try:
+            service.await_ready()
+            assert len(service.look()) == 2
+        finally:
+            service.end()
+    eventually(service.all_gone, "the end of every process", DEADLINE_S)

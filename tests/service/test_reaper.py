@@ -1,0 +1,138 @@
+"""What the reaper finds, and what it leaves alone."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import pytest
+from redis import Redis
+
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.reaper import Reaped, Reaper
+from service.records import FieldRecord, JobRecord
+from service.redis_client import connect
+from service.settings import Settings
+from tests.redis_server import private_redis
+
+SHA = "a" * 64
+
+
+@pytest.fixture(scope="module")
+def redis() -> Iterator[Redis]:
+    with private_redis() as url, connect(url) as client:
+        yield client
+
+
+@dataclass
+class World:
+    """Stores in memory with a clock that is moved by hand."""
+
+    redis: Redis
+    time: float = 1000.0
+    queue: InMemoryJobQueue = field(default_factory=InMemoryJobQueue)
+    blobs: InMemoryBlobStore = field(default_factory=InMemoryBlobStore)
+
+    def __post_init__(self) -> None:
+        self.records = InMemoryRecordStore(retention_s=3600, clock=lambda: self.time)
+        self.reaper = Reaper(self.records, self.queue, self.redis, Settings(lost_after_s=90), self.blobs)
+
+    def accept(self, job_id: str = "j1", queued: bool = True) -> None:
+        self.records.create_job(JobRecord(job_id, "registration", "accepted", {}, {}, self.time, self.time), 100)
+        if queued:
+            self.queue.enqueue_registration(job_id, 1)
+
+    def run(self, job_id: str = "j1") -> None:
+        self.accept(job_id)
+        self.take(job_id, 1)
+
+    def take(self, job_id: str, attempt: int) -> None:
+        self.queue.registrations.remove((job_id, attempt))
+        self.records.update_job(job_id, attempt, status="running")
+
+    def upload(self, queued: bool) -> None:
+        self.records.create_field(FieldRecord(SHA, "validating", 1, self.time, self.time))
+        self.blobs.put(f"fields/{SHA}/original", b".")
+        if queued:
+            self.queue.enqueue_import(SHA)
+
+    def after(self, seconds: float) -> Reaped:
+        self.time += seconds
+        return self.reaper.run_once()
+
+
+@pytest.fixture
+def world(redis: Redis) -> World:
+    redis.flushall()
+    return World(redis)
+
+
+def test_nothing_to_do(world: World) -> None:
+    world.run("running")
+    world.accept("waiting")
+    world.upload(queued=True)
+    assert world.after(60) == Reaped()
+    world.records.heartbeat("running", 1)
+    assert world.after(60) == Reaped()
+
+
+def test_a_silent_job_is_requeued_once_and_then_lost(world: World) -> None:
+    world.run()
+    assert world.after(89) == Reaped()
+    assert world.after(2) == Reaped(requeued=("j1",))
+    assert world.queue.registrations == [("j1", 2)]
+    world.take("j1", 2)
+    assert world.after(91) == Reaped(failed=("j1",))
+    record = world.records.get_job("j1")
+    assert record is not None
+    assert record.error is not None
+    assert (record.status, record.attempt, record.error["reason"]) == ("failed", 2, "WORKER_LOST")
+    assert world.after(91) == Reaped()
+
+
+def test_a_silent_job_that_was_to_stop_is_dismissed(world: World) -> None:
+    world.run()
+    world.records.request_cancel("j1")
+    assert world.after(91) == Reaped(dismissed=("j1",))
+
+
+def test_a_job_that_never_reached_the_queue_is_queued(world: World) -> None:
+    world.accept(queued=False)
+    assert world.after(14) == Reaped(), "whoever recorded it may still be about to queue it"
+    assert world.after(2) == Reaped(enqueued=("j1",))
+    assert world.queue.registrations == [("j1", 1)]
+    assert world.after(60) == Reaped()
+
+
+def test_a_lost_import_is_tried_again_and_given_up_at_last(world: World) -> None:
+    world.upload(queued=False)
+    assert world.after(14) == Reaped()
+    for attempt in (2, 3):
+        assert world.after(20) == Reaped(requeued=(SHA,))
+        assert world.queue.imports == [(SHA, attempt)]
+        world.queue.imports.clear()
+    assert world.after(20) == Reaped(failed=(SHA,))
+    record = world.records.get_field(SHA)
+    assert record is not None
+    assert record.error is not None
+    assert (record.state, record.error["reason"]) == ("rejected", "WORKER_LOST")
+    assert world.blobs.blobs == {}
+
+
+def test_expired_results_go(world: World) -> None:
+    world.run()
+    world.records.update_job("j1", 1, status="successful")
+    world.blobs.put("jobs/j1/manifest.json", b".")
+    world.blobs.put("jobs/j10/manifest.json", b".")
+    assert world.after(3599) == Reaped()
+    assert world.after(2) == Reaped(expired=("j1",))
+    assert list(world.blobs.blobs) == ["jobs/j10/manifest.json"]
+    assert world.records.job_expired("j1")
+
+
+def test_one_process_at_a_time(world: World, redis: Redis) -> None:
+    world.run()
+    redis.set("regnf:reaper", "another", ex=60)
+    assert world.after(91) == Reaped()
+    assert redis.get("regnf:reaper") == b"another", "its lock is not ours to release"
+    redis.delete("regnf:reaper")
+    assert world.after(0) == Reaped(requeued=("j1",))
+    assert not redis.exists("regnf:reaper")
