@@ -97,6 +97,6 @@ class OrientedBox:
         return (points - self.centre.to(points)) @ rotation
 
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
-        """(N,) bool: which of the points (N, 3), scene frame, lie in the box grown by ``margin`` (a share of its size)."""
+        """(N,) bool: which points (N, 3), scene frame, lie in the box grown by ``margin`` (a share of its size)."""
         half = self.size.to(points) * (0.5 * (1.0 + margin))
         return (self.to_local(points).abs() <= half).all(dim=-1)

@@ -55,6 +55,9 @@ class InitialisationOptions:
     ransac_iterations: Annotated[int, Ge(1), Le(10_000_000)] = 100_000
     icp_distance_voxels: Annotated[float, Gt(0), Le(100)] = 0.4
     """Largest distance of an ICP correspondence, in voxels."""
+    draws: Annotated[int, Ge(1), Le(256)] = 1
+    """Independent RANSAC draws; the one that both fields agree with best is kept. 1 is the published method; 8 cost
+    about a second more and avoid the chance draw that turns the object the wrong way round."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,9 @@ class OptimisationOptions:
     """w, the weight of the nearest-neighbour regulariser. The paper gives no value."""
     stop_residual: Annotated[float, Ge(0), Le(1)] = 0.0005
     """Stop once the mean residuals of both directions are at most this."""
+    samples_per_iteration: Annotated[int, Ge(16), Le(1_000_000)] = 2000
+    """Samples of each set, drawn anew in every iteration, over which the loss's expectations are taken. The
+    paper does not say how many; fewer are faster, field evaluations being the cost."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ ProgressCallback = Callable[[Phase, float], None]
 
 @dataclass(frozen=True)
 class SurfaceSamples:
-    """Points on a field's zero level with the field's unit normals there. points, normals: (N, 3) float32, field frame."""
+    """Points on a field's zero level and the unit normals there. points, normals: (N, 3) float32, field frame."""
 
     points: Tensor
     normals: Tensor
