@@ -39,4 +39,13 @@ def _show(values: dict[str, Any], indent: int = 0) -> None:
             out.print(f"{'  ' * indent}{name}:")
             _show(value, indent + 1)
         else:
-            out.print(f"{'  ' * indent}{name:<24} {value}", markup=False)
+            out.print(f"{'  ' * indent}{name:<24} {_readable(value)}", markup=False, soft_wrap=True)
+
+
+def _readable(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list | tuple):
+        parts = [_readable(part) for part in value]
+        return f"[{', '.join(parts)}]" if any(isinstance(part, float) for part in value) else "; ".join(parts) or "none"
+    return "-" if value is None else str(value)

@@ -107,4 +107,5 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
         with tempfile.TemporaryDirectory(dir=output) as folder:
             for name in write_artifacts(result, Path(folder), truth=truth):
                 (Path(folder) / name).replace(output / name)
-    return result_document(result, truth=truth)
+    document: dict[str, Any] = result_document(result, truth=truth)
+    return document

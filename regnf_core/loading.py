@@ -33,7 +33,7 @@ def load_field(
 
     path = Path(path)
     if path.suffix.lower() in MESH_SUFFIXES:
-        return MeshField.from_file(path).to(device)
+        return MeshField.load(path).to(device)
     return open_field(safe_field_path(path, description, cache_dir), device)
 
 
