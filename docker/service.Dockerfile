@@ -19,10 +19,15 @@ RUN groupadd --system --gid 10001 regnf \
     && useradd --system --uid 10001 --gid regnf --home-dir /tmp --no-create-home regnf \
     && install --directory --owner regnf --group regnf --mode 0750 /var/lib/regnf
 COPY --from=build /opt/regnf /opt/regnf
+COPY docker/serve_api.py /opt/regnf/serve_api.py
+# A container's loopback is of no use to anyone outside it. Listening elsewhere needs REGNF_API_TOKENS, or
+# REGNF_ALLOW_UNAUTHENTICATED=true where something else keeps strangers out.
 ENV PATH=/opt/regnf/bin:$PATH \
     HOME=/tmp \
     PYTHONUNBUFFERED=1 \
     PYTHONDONTWRITEBYTECODE=1 \
+    REGNF_HOST=0.0.0.0 \
+    REGNF_PORT=8080 \
     REGNF_STATE_DIR=/var/lib/regnf
 USER 10001:10001
 WORKDIR /var/lib/regnf
@@ -30,5 +35,4 @@ VOLUME ["/var/lib/regnf"]
 EXPOSE 8080
 HEALTHCHECK --interval=15s --timeout=5s --start-period=20s --retries=3 \
     CMD ["python", "-c", "import urllib.request as r; r.urlopen('http://127.0.0.1:8080/healthz', timeout=4)"]
-CMD ["python", "-m", "uvicorn", "--factory", "service.app:create_app", "--host", "0.0.0.0", "--port", "8080", \
-     "--no-server-header", "--timeout-graceful-shutdown", "15"]
+CMD ["python", "/opt/regnf/serve_api.py"]

@@ -1,0 +1,70 @@
+"""What the service image starts: it refuses to serve strangers, and serves otherwise, until it is told to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.docker.files import ROOT
+from tests.redis_server import private_redis
+
+SCRIPT = ROOT / "docker" / "serve_api.py"
+
+
+def environment(folder: Path, **settings: str) -> dict[str, str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    named = {f"REGNF_{name.upper()}": value for name, value in settings.items()}
+    return kept | {"PYTHONPATH": str(ROOT), "REGNF_STATE_DIR": str(folder)} | named
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def test_refuses_to_serve_strangers(tmp_path: Path) -> None:
+    run = subprocess.run(
+        [sys.executable, SCRIPT],
+        env=environment(tmp_path, host="0.0.0.0", port="0", redis_url="unix:///nowhere/socket"),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 2
+    assert run.stderr.startswith("UNAUTHENTICATED_PUBLIC_BIND: ")
+
+
+@pytest.mark.parametrize(("tokens", "status"), [("[]", 200), ('["open-sesame"]', 401)])
+def test_serves_until_told_to_stop(tmp_path: Path, tokens: str, status: int) -> None:
+    port = free_port()
+    with private_redis() as url:
+        settings = environment(tmp_path, host="127.0.0.1", port=str(port), redis_url=url, api_tokens=tokens)
+        process = subprocess.Popen([sys.executable, SCRIPT], env=settings)
+        try:
+            wait_for(f"http://127.0.0.1:{port}/healthz", process)
+            assert httpx.get(f"http://127.0.0.1:{port}/jobs").status_code == status
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.wait(timeout=30)
+
+
+def wait_for(address: str, process: subprocess.Popen[bytes]) -> None:
+    """Returns once the address answers with 200; fails when the process ends or half a minute has passed."""
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        assert process.poll() is None, "the server has ended"
+        try:
+            if httpx.get(address).status_code == 200:
+                return
+        except httpx.TransportError:
+            time.sleep(0.1)
+    pytest.fail(f"{address} does not answer")
