@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -103,7 +103,9 @@ class Bench:
 @contextmanager
 def bench(folder: Path, **settings: object) -> Iterator[Bench]:
     """A bench below ``folder``; every worker is gone when it closes."""
-    with private_redis() as url, connect(url) as redis:
+    with ExitStack() as stack:
+        url = str(settings.get("redis_url") or stack.enter_context(private_redis()))
+        redis = stack.enter_context(connect(url))
         environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
         environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import NoSurfaceError
+from service.settings import Settings
 from worker.jobs import delivery
 from worker.registration import run_attempt
 
@@ -49,6 +50,11 @@ class TinyEngine:
         """Goes on until it is stopped, reporting all the while."""
         while True:
             report("optimising", 0.5)
+            time.sleep(0.01)
+
+    def wait_for_file(self, report: Report) -> None:
+        """Goes on once the file `go` is in the state folder."""
+        while not (Settings().state_dir / "go").exists():
             time.sleep(0.01)
 
     def hang(self, report: Report) -> None:
