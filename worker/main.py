@@ -23,7 +23,7 @@ def run_worker(settings: Settings) -> None:
     context = Context.from_settings(settings)
     scratch = Scratch(settings.scratch_dir)
     try:
-        RegnfWorker(context, scratch).work(logging_level=None)
+        RegnfWorker(context, scratch).serve()
     finally:
         scratch.remove()
 

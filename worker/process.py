@@ -16,6 +16,7 @@ from typing import Any
 
 from redis.exceptions import RedisError
 from rq import Worker
+from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 
 from service.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
@@ -62,6 +63,15 @@ class RegnfWorker(Worker):
         self._late = False
         self._give_back_at: float | None = None
         self._given_back = False
+
+    def serve(self) -> None:
+        """Work until told to stop, be it while starting."""
+        signal.signal(signal.SIGINT, self.request_stop)
+        signal.signal(signal.SIGTERM, self.request_stop)
+        try:
+            self.work(logging_level=None)
+        except StopRequested:
+            self.teardown()  # type: ignore[no-untyped-call]
 
     # one job
 
@@ -141,8 +151,3 @@ class RegnfWorker(Worker):
     def request_force_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Told to stop again: at once."""
         self._give_back_at = time.monotonic()
-
-
-def ignore_terminal_interrupts() -> None:
-    """Ctrl+C reaches every process of the terminal; only the one in charge acts on it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -28,6 +28,6 @@ if __name__ == "__main__":
     context = tiny_context()
     scratch = Scratch(context.settings.scratch_dir)
     try:
-        process.RegnfWorker(context, scratch).work(logging_level=None)
+        process.RegnfWorker(context, scratch).serve()
     finally:
         scratch.remove()
