@@ -1,0 +1,75 @@
+"""The result document: everything about a registration that fits into JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+
+import regnf_core
+from regnf_core.metrics import errors_against_truth
+from regnf_core.result import Alternative, IterationRecord, RegistrationResult
+from regnf_core.sim3 import Sim3
+from regnf_core.symmetry import Symmetries
+
+
+def result_document(
+    result: RegistrationResult,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    device: torch.device | str = "cpu",
+) -> dict[str, Any]:
+    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
+
+    ``symmetries`` are the object's: rotation error and MSSD are the least over them. ``device`` is where it ran.
+    """
+    metrics = dict(result.metrics)
+    if truth is not None:
+        metrics |= errors_against_truth(result.T_object_scene, truth, result.object_samples.points, symmetries)
+    return {
+        "verdict": result.verdict,
+        "verdict_reason": result.verdict_reason,
+        "T_object_scene": result.T_object_scene.to_dict(),
+        "T_scene_object": result.T_object_scene.inverse().to_dict(),
+        "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
+        "alternatives": [_alternative(other) for other in result.alternatives],
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "metrics": {name: _json_number(value) for name, value in metrics.items()},
+        "seed": result.seed,
+        "options": result.options,
+        "engine": {
+            "name": "regnf",
+            "version": regnf_core.__version__,
+            "device": str(device),
+            "torch": torch.__version__,
+        },
+    }
+
+
+def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
+    """One plain entry an iteration: the loss, its parts, the kernel, and T_object_scene as a row-major 4x4 matrix."""
+    return [
+        {
+            "iteration": record.iteration,
+            "loss": _json_number(record.loss),
+            "residual_scene": _json_number(record.residual_scene),
+            "residual_object": _json_number(record.residual_object),
+            "regulariser": _json_number(record.regulariser),
+            "kernel_shape": record.kernel_shape,
+            "kernel_scale": record.kernel_scale,
+            "scene_samples": record.scene_samples,
+            "object_samples": record.object_samples,
+            "T_object_scene": {"matrix": record.T_object_scene.matrix().tolist()},
+        }
+        for record in trace
+    ]
+
+
+def _alternative(other: Alternative) -> dict[str, Any]:
+    return {"T_object_scene": other.T_object_scene.to_dict(), "score": other.score, "relation": other.relation}
+
+
+def _json_number(value: float) -> float | None:
+    """JSON knows neither NaN nor infinity."""
+    return value if math.isfinite(value) else None
