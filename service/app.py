@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import cache
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -75,9 +76,7 @@ def create_app(
     app.state.services = services
     for router in _ROUTERS:
         app.include_router(router)
-    # read before the second mounting, which is the same contract under another prefix
-    contract = build_contract(app)
-    app.openapi = lambda: contract  # type: ignore[method-assign]
+    app.openapi = cache(lambda: build_contract(app))  # type: ignore[method-assign]
     for router in _ROUTERS:
         app.include_router(router, prefix="/v1", include_in_schema=False)
     app.mount("/static", StaticFiles(directory=Path(__file__).with_name("web")), name="static")
@@ -87,7 +86,8 @@ def create_app(
 
 def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        app.openapi()  # takes a while, so not while somebody waits for an answer
         reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
         with stopping_on_signals(services.stopping):
             yield

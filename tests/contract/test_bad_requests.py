@@ -1,0 +1,255 @@
+"""Registration requests that are refused: the reason, the pointer, nothing left behind, and the next one works."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.contract.world import BOX, World, assert_refused
+
+UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
+IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+def matrix(*changes: tuple[int, int, Any]) -> dict[str, Any]:
+    rows = [list(row) for row in IDENTITY]
+    for row, column, value in changes:
+        rows[row][column] = value
+    return {"T_object_scene": rows}
+
+
+@pytest.fixture(autouse=True)
+def _nothing_stays_and_the_next_works(world: World) -> Iterator[None]:
+    request = world.valid_request()
+    yield
+    assert world.records.list_jobs(None, 10, None) == []
+    assert world.queue.registrations == []
+    assert world.client.post("/register", json=request).status_code == 202
+
+
+def post(world: World, body: Any, **headers: str) -> Any:
+    # json.dumps writes NaN and Infinity, which httpx would not
+    content = body if isinstance(body, bytes) else json.dumps(body).encode()
+    return world.client.post("/register", content=content, headers={"Content-Type": "application/json"} | headers)
+
+
+@pytest.mark.parametrize(
+    ("box", "pointer"),
+    [
+        (None, "/detection"),
+        ([], "/detection"),
+        ([BOX, BOX], "/detection"),
+        ({}, "/detection/centre"),
+        ("the chair", "/detection"),
+        (UNIT | {"centre": [float("nan"), 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": [0, float("inf"), 0]}, "/detection/centre/1"),
+        (UNIT | {"centre": [0, 0, float("-inf")]}, "/detection/centre/2"),
+        (UNIT | {"centre": [1e308, 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": [10**400, 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": ["0", 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": [True, 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": [None, 0, 0]}, "/detection/centre/0"),
+        (UNIT | {"centre": [0, 0]}, "/detection/centre"),
+        (UNIT | {"centre": [0, 0, 0, 0]}, "/detection/centre"),
+        (UNIT | {"size": [1, 0, 1]}, "/detection/size/1"),
+        (UNIT | {"size": [1, -1, 1]}, "/detection/size/1"),
+        (UNIT | {"size": [1, 1, float("nan")]}, "/detection/size/2"),
+        (UNIT | {"rotation_quaternion_xyzw": [0, 0, 0, 0]}, "/detection"),
+        (UNIT | {"rotation_quaternion_xyzw": [0, 0, 1]}, "/detection/rotation_quaternion_xyzw"),
+        (UNIT | {"rotation_quaternion_xyzw": [0, 0, 0, 1e308]}, "/detection/rotation_quaternion_xyzw/3"),
+        (UNIT | {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "/detection/rotation"),
+        (UNIT | {"score": 1.5}, "/detection/score"),
+        (UNIT | {"score": -0.1}, "/detection/score"),
+        (UNIT | {"score": True}, "/detection/score"),
+        (UNIT | {"score": float("nan")}, "/detection/score"),
+        (UNIT | {"label": ""}, "/detection/label"),
+        (UNIT | {"label": "a" * 201}, "/detection/label"),
+        (UNIT | {"label": "a\r\nX-Bad: 1"}, "/detection/label"),
+        (UNIT | {"label": "a\u202eb"}, "/detection/label"),
+        (UNIT | {"label": "a\0b"}, "/detection/label"),
+        (UNIT | {"id": 1}, "/detection/id"),
+        ({"min": [0, 0, 0], "max": [1, -1, 1]}, "/detection"),
+        ({"min": [0, 0, 0], "max": [1, 0, 1]}, "/detection"),
+        ({"min": [0, 0, 0]}, "/detection/max"),
+        (UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, "/detection/centre"),
+    ],
+)
+def test_boxes(world: World, box: Any, pointer: str) -> None:
+    problem = assert_refused(post(world, world.valid_request() | {"detection": box}), 422, "INVALID_DETECTION")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+@pytest.mark.parametrize(
+    ("options", "pointer"),
+    [
+        (None, "/options"),
+        ({"unknown": 1}, "/options/unknown"),
+        ({"sampling": {"unknown": 1}}, "/options/sampling/unknown"),
+        ({"preset": "fastest"}, "/options/preset"),
+        ({"sampling": {"views": 0}}, "/options/sampling/views"),
+        ({"sampling": {"views": -1}}, "/options/sampling/views"),
+        ({"sampling": {"views": 10**9}}, "/options/sampling/views"),
+        ({"sampling": {"views": "5"}}, "/options/sampling/views"),
+        ({"sampling": {"views": True}}, "/options/sampling/views"),
+        ({"sampling": {"views": 5.5}}, "/options/sampling/views"),
+        ({"sampling": {"up_axis": "w"}}, "/options/sampling/up_axis"),
+        ({"sampling": {"scene_camera_distance": float("nan")}}, "/options/sampling/scene_camera_distance"),
+        ({"optimisation": {"iterations": 10**12}}, "/options/optimisation/iterations"),
+        ({"optimisation": {"translation_rate": float("inf")}}, "/options/optimisation/translation_rate"),
+        ({"optimisation": []}, "/options/optimisation"),
+    ],
+)
+def test_options(world: World, options: Any, pointer: str) -> None:
+    problem = assert_refused(post(world, world.valid_request() | {"options": options}), 422, "INVALID_OPTIONS")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        matrix((2, 2, -1)),
+        matrix((0, 0, 2)),
+        matrix((0, 1, 0.5)),
+        matrix((3, 3, 2)),
+        matrix((3, 0, 1)),
+        matrix((0, 3, float("nan"))),
+        matrix((0, 3, 1e308)),
+        matrix((0, 0, True)),
+        matrix((0, 0, 0), (1, 1, 0), (2, 2, 0)),
+        {"T_object_scene": IDENTITY[:3]},
+        {"T_object_scene": [row[:3] for row in IDENTITY]},
+        {"T_scene_object": IDENTITY},
+        IDENTITY,
+    ],
+)
+def test_transforms(world: World, truth: Any) -> None:
+    assert_refused(post(world, world.valid_request() | {"ground_truth": truth}), 422, "INVALID_TRANSFORM")
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer"),
+    [
+        ({"seed": -1}, "/seed"),
+        ({"seed": 2**32}, "/seed"),
+        ({"seed": 2**64}, "/seed"),
+        ({"seed": 1.5}, "/seed"),
+        ({"seed": "1"}, "/seed"),
+        ({"seed": True}, "/seed"),
+        ({"seed": None}, "/seed"),
+        ({"scene": "abc"}, "/scene"),
+        ({"scene": "A" * 64}, "/scene"),
+        ({"scene": "../" * 20 + "aaaa"}, "/scene"),
+        ({"scene": {"field": "a" * 64, "more": 1}}, "/scene"),
+        ({"object": None}, "/object"),
+        ({"unknown": 1}, "/unknown"),
+        ({"<script>": 1}, ""),
+    ],
+)
+def test_requests(world: World, change: dict[str, Any], pointer: str) -> None:
+    answer = post(world, world.valid_request() | change)
+    problem = assert_refused(answer, 422, "INVALID_REQUEST")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+    assert "script" not in answer.text
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "reason"),
+    [
+        (b"", 400, "MALFORMED_JSON"),
+        (b"{", 400, "MALFORMED_JSON"),
+        (b"null", 422, "INVALID_REQUEST"),
+        (b"[]", 422, "INVALID_REQUEST"),
+        (b'"x"', 422, "INVALID_REQUEST"),
+        (b'{"seed": 1, "seed": 2}', 400, "MALFORMED_JSON"),
+        (b'{"detection": {"min": [], "min": []}}', 400, "MALFORMED_JSON"),
+        ('{"seed": 1}'.encode("utf-16"), 400, "MALFORMED_JSON"),
+        ('{"seed": 1}'.encode("utf-16-le"), 400, "MALFORMED_JSON"),
+        (b"\xef\xbb\xbf{}", 400, "MALFORMED_JSON"),
+        (b'{"a": "\xff"}', 400, "MALFORMED_JSON"),
+        (b'{"a": "\\ud800"}', 400, "MALFORMED_JSON"),
+        (b"[" * 100_000, 400, "MALFORMED_JSON"),
+        (b"[" * 100_000 + b"]" * 100_000, 400, "MALFORMED_JSON"),
+        (b"[" * 40 + b"]" * 40, 400, "MALFORMED_JSON"),
+        (b'{"seed": ' + b"9" * 5000 + b"}", 400, "MALFORMED_JSON"),
+        (b" " * (2 << 20), 413, "REQUEST_TOO_LARGE"),
+    ],
+)
+def test_bodies(world: World, body: bytes, status: int, reason: str) -> None:
+    assert_refused(post(world, body), status, reason)
+
+
+def test_a_body_of_fifty_megabytes_is_refused_by_count(world: World) -> None:
+    pieces = (b" " * (1 << 20) for _ in range(50))
+    answer = world.client.post("/register", content=pieces, headers={"Content-Type": "application/json"})
+    assert_refused(answer, 413, "REQUEST_TOO_LARGE")
+
+
+@pytest.mark.parametrize("kind", ["", "text/plain", "application/xml", "application/x-www-form-urlencoded"])
+def test_other_media_types_are_refused(world: World, kind: str) -> None:
+    answer = post(world, world.valid_request(), **{"Content-Type": kind})
+    assert_refused(answer, 415, "UNSUPPORTED_MEDIA_TYPE")
+
+
+def test_compressed_bodies_are_refused(world: World) -> None:
+    assert_refused(post(world, b"{}", **{"Content-Encoding": "gzip"}), 415, "UNSUPPORTED_MEDIA_TYPE")
+
+
+@pytest.mark.parametrize("key", ["", "k" * 256, "a\tb", "schl\u00fcssel".encode()])
+def test_idempotency_keys(world: World, key: Any) -> None:
+    answer = world.client.post("/register", json=world.valid_request(), headers={"Idempotency-Key": key})
+    assert_refused(answer, 400, "INVALID_IDEMPOTENCY_KEY")
+
+
+def test_unknown_and_rejected_fields(world: World) -> None:
+    for name in ("scene", "object"):
+        problem = assert_refused(post(world, world.valid_request() | {name: "0" * 64}), 404, "FIELD_NOT_FOUND")
+        assert problem["errors"][0]["pointer"] == f"/{name}"
+    rejected = world.rejected_field("bad")
+    problem = assert_refused(post(world, world.valid_request() | {"object": rejected}), 422, "FIELD_REJECTED")
+    assert "FIELD_SHAPES_MISMATCH" in problem["errors"][0]["detail"]
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        {"min": [1.1, 0, 0], "max": [1.2, 1, 1]},
+        {"centre": [150.0, 50.0, 200.0], "size": [500.0, 20.0, 40.0]} | {"centre": [-1500.0, 50.0, 200.0]},
+        # its corner points at the scene's corner, but stays short of it: only a slanted axis tells
+        {"centre": [1.8, 1.8, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0.38268343, 0.92387953]},
+    ],
+)
+def test_a_box_wholly_outside_the_scene(world: World, box: dict[str, Any]) -> None:
+    assert_refused(post(world, world.valid_request() | {"detection": box}), 422, "DETECTION_OUTSIDE_SCENE")
+
+
+@pytest.mark.parametrize("wait", ["99999", "-1", "31", "1.5", "soon", "true"])
+def test_waits_beyond_reason(world: World, wait: str) -> None:
+    problem = assert_refused(world.client.get(f"/jobs/x?wait={wait}"), 400, "INVALID_QUERY")
+    assert problem["errors"][0]["parameter"] == "wait"
+
+
+@pytest.mark.parametrize("limit", ["0", "-1", "201", "x"])
+def test_limits_beyond_reason(world: World, limit: str) -> None:
+    for path in ("/jobs", "/fields"):
+        assert_refused(world.client.get(path, params={"limit": limit}), 400, "INVALID_QUERY")
+
+
+@pytest.mark.parametrize(
+    "token", ["x", "", "!!!", "bnVsbA", "W10", "WzEsMl0", "W05hTiwiYSJd", "WzFlOTk5LCJhIl0", "W1tbW1tbW1tb"]
+)
+def test_forged_page_tokens(world: World, token: str) -> None:
+    for path in ("/jobs", "/fields"):
+        assert_refused(world.client.get(path, params={"page_token": token}), 400, "INVALID_PAGE_TOKEN")
+
+
+@pytest.mark.parametrize("status", ["done", "", "accepted,running"])
+def test_unknown_states(world: World, status: str) -> None:
+    assert_refused(world.client.get("/jobs", params={"status": status}), 400, "INVALID_QUERY")
+
+
+def test_dry_run_is_yes_or_no(world: World) -> None:
+    answer = world.client.post("/register?dry_run=perhaps", json=world.valid_request())
+    assert_refused(answer, 400, "INVALID_QUERY")

@@ -1,0 +1,138 @@
+"""Fields over HTTP: upload, look, list, delete."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+
+from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
+
+A, B = field_bytes("a"), field_bytes("b")
+
+
+def content_digest(data: bytes) -> str:
+    return f"sha-256=:{base64.b64encode(hashlib.sha256(data).digest()).decode()}:"
+
+
+def test_put_stores_the_bytes_and_queues_their_import(world: World) -> None:
+    answer = world.client.put(f"/fields/{sha256(A)}", content=A, headers={"Content-Digest": content_digest(A)})
+    assert answer.status_code == 201
+    assert answer.headers["location"] == f"/fields/{sha256(A)}"
+    document = answer.json()
+    assert (document["state"], document["bytes"], document["sha256"]) == ("validating", len(A), sha256(A))
+    assert world.blobs.blobs == {f"fields/{sha256(A)}/original": A}
+    assert world.queue.imports == [(sha256(A), 1)]
+
+
+def test_the_same_upload_twice_is_one_field(world: World) -> None:
+    assert [world.client.put(f"/fields/{sha256(A)}", content=A).status_code for _ in range(2)] == [201, 200]
+    assert world.queue.imports == [(sha256(A), 1)]
+
+
+def test_an_upload_that_was_never_queued_is_queued_by_the_next(world: World) -> None:
+    world.client.put(f"/fields/{sha256(A)}", content=A)
+    world.queue.imports.clear()
+    world.client.put(f"/fields/{sha256(A)}", content=A)
+    assert world.queue.imports == [(sha256(A), 1)]
+
+
+def test_bytes_that_are_held_safely_are_not_kept_again(world: World) -> None:
+    known = world.ready_field("a")
+    assert world.client.put(f"/fields/{known}", content=field_bytes("a")).status_code == 200
+    assert world.blobs.blobs == {}
+
+
+def test_a_rejected_field_can_be_uploaded_again(world: World) -> None:
+    known = world.rejected_field("a")
+    assert world.client.get(f"/fields/{known}").json()["error"]["reason"] == "FIELD_SHAPES_MISMATCH"
+    answer = world.client.put(f"/fields/{known}", content=A)
+    assert answer.status_code == 201
+    assert (answer.json()["state"], answer.json()["error"]) == ("validating", None)
+    assert world.queue.imports[-1] == (known, 2)
+    assert f"fields/{known}/original" in world.blobs.blobs
+
+
+def test_post_computes_the_digest(world: World) -> None:
+    answer = world.client.post("/fields", content=A)
+    assert (answer.status_code, answer.headers["location"]) == (201, f"/fields/{sha256(A)}")
+
+
+def test_post_takes_a_description_beside_the_file(world: World) -> None:
+    said = {"family": "neus-facto", "level_mask": 8, "hash": {"features_per_level": 2}, "label": "room"}
+    files = {"file": ("room.ckpt", A), "description": (None, json.dumps(said), "application/json")}
+    answer = world.client.post("/fields", files=files)
+    assert answer.status_code == 201, answer.text
+    assert (answer.json()["label"], answer.json()["description"]) == (
+        "room",
+        {"family": "neus-facto", "level_mask": 8, "hash": {"features_per_level": 2}},
+    )
+    assert world.blobs.blobs == {f"fields/{sha256(A)}/original": A}
+
+
+def test_bytes_held_as_another_function_are_not_silently_that_one(world: World) -> None:
+    def post(said: dict[str, object]) -> object:
+        return world.client.post("/fields", files={"file": ("a", A), "description": (None, json.dumps(said))})
+
+    assert post({"level_mask": 8}).status_code == 201
+    assert post({"level_mask": 8, "label": "named later"}).json()["label"] == "named later"
+    assert_refused(post({"level_mask": 4}), 409, "FIELD_DESCRIPTION_DIFFERS")
+    assert world.client.put(f"/fields/{sha256(A)}", content=A).status_code == 200
+
+
+def test_get_and_head_tell_what_is_held(world: World) -> None:
+    known = world.ready_field("a")
+    document = world.client.get(f"/fields/{known}").json()
+    assert (document["state"], document["report"]["bounds"][0]) == ("ready", [-1.0, -1.0, -1.0])
+    head = world.client.head(f"/fields/{known}")
+    assert (head.status_code, head.content) == (200, b"")
+    assert head.headers["etag"] == world.client.get(f"/fields/{known}").headers["etag"]
+    assert world.client.head(f"/fields/{sha256(B)}").status_code == 404
+
+
+def test_get_may_wait_for_the_import(world: World) -> None:
+    world.client.put(f"/fields/{sha256(A)}", content=A)
+    waited = world.client.get(f"/fields/{sha256(A)}", params={"wait": 1})
+    assert (waited.json()["state"], waited.headers["retry-after"]) == ("validating", "1")
+
+
+def test_lists_go_page_by_page_and_by_label(world: World) -> None:
+    known = [world.ready_field(name) for name in "abc"]
+    world.records.update_field(known[1], label="chair")
+    first = world.client.get("/fields", params={"limit": 2}).json()
+    second = world.client.get("/fields", params={"limit": 2, "page_token": first["next_page_token"]}).json()
+    assert [field["sha256"] for field in first["fields"] + second["fields"]] == known[::-1]
+    assert second["next_page_token"] is None
+    labelled = world.client.get("/fields", params={"label": "chair"}).json()
+    assert [field["sha256"] for field in labelled["fields"]] == [known[1]]
+
+
+def test_delete_leaves_nothing(world: World) -> None:
+    world.client.put(f"/fields/{sha256(A)}", content=A)
+    assert world.client.delete(f"/fields/{sha256(A)}").status_code == 204
+    assert world.blobs.blobs == {}
+    assert_refused(world.client.get(f"/fields/{sha256(A)}"), 404, "FIELD_NOT_FOUND")
+    assert_refused(world.client.delete(f"/fields/{sha256(A)}"), 404, "FIELD_NOT_FOUND")
+
+
+def test_a_field_that_a_job_needs_is_not_deleted(world: World) -> None:
+    job_id = world.submit()
+    scene = world.valid_request()["scene"]
+    assert_refused(world.client.delete(f"/fields/{scene}"), 409, "FIELD_IN_USE")
+    world.succeed(job_id)
+    assert world.client.delete(f"/fields/{scene}").status_code == 204
+
+
+def test_v1_is_the_same_service(world: World) -> None:
+    answer = world.client.put(f"/v1/fields/{sha256(A)}", content=A)
+    assert answer.headers["location"] == f"/v1/fields/{sha256(A)}"
+    assert world.client.get(f"/fields/{sha256(A)}").json()["links"]["self"] == f"/fields/{sha256(A)}"
+
+
+def test_uploads_far_larger_than_a_block_arrive_whole(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    world = make_world(tmp_path, max_upload_bytes=8 << 20)
+    data = field_bytes("large", 3 * (1 << 20) + 17)
+    pieces = (data[start : start + 65_521] for start in range(0, len(data), 65_521))
+    answer = world.client.put(f"/fields/{sha256(data)}", content=pieces)
+    assert (answer.status_code, answer.json()["bytes"]) == (201, len(data))
+    assert world.blobs.blobs[f"fields/{sha256(data)}/original"] == data

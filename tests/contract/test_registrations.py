@@ -1,0 +1,188 @@
+"""POST /register: what becomes a job, and what was one already."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
+
+
+def post(world: World, headers: dict[str, str] | None = None, **changes: Any) -> Any:
+    return world.client.post("/register", json=world.valid_request() | changes, headers=headers)
+
+
+def test_a_request_becomes_a_job_and_reaches_the_queue(world: World) -> None:
+    answer = post(world, seed=7)
+    assert answer.status_code == 202
+    job = answer.json()
+    assert answer.headers["location"] == f"/jobs/{job['id']}" == job["links"]["self"]
+    assert answer.headers["retry-after"] == "1"
+    assert (job["status"], job["queue_position"], job["attempts"]) == ("accepted", 1, 1)
+    assert (job["inputs"]["seed"], job["inputs"]["scene"]) == (7, sha256(field_bytes("scene")))
+    assert world.queue.registrations == [(job["id"], 1)]
+
+
+def test_the_record_holds_the_canonical_request(world: World) -> None:
+    job_id = post(world, options={"sampling": {"views": 9}}).json()["id"]
+    record = world.records.get_job(job_id)
+    assert record is not None
+    detection = record.request["detection"]
+    assert detection["rotation_quaternion_xyzw"] == [0.0, 0.0, 0.0, 1.0]
+    assert [round(value, 9) for value in detection["centre"] + detection["size"]] == [-0.15, -0.05, 0.2, 0.5, 0.5, 0.4]
+    assert (detection["label"], detection["score"]) == (None, None)
+    assert record.request["options"]["sampling"]["views"] == 9
+    assert record.request["options"]["optimisation"]["iterations"] == 200
+    assert (record.request["seed"], record.request["ground_truth"]) == (0, None)
+    assert set(record.request) == {"scene", "object", "detection", "options", "seed", "ground_truth"}
+
+
+def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
+    request = world.valid_request()
+    box = {"centre": [0, 0.25, 0.5], "size": [1, 1, 1]}
+    turned = box | {"rotation_quaternion_xyzw": [0, 0, 0, -3]}
+    spellings = [
+        request | {"detection": box},
+        request | {"detection": {"min": [-0.5, -0.25, 0.0], "max": [0.5, 0.75, 1.0]}, "seed": 0},
+        request
+        | {"scene": {"field": request["scene"]}, "detection": box | {"rotation_quaternion_xyzw": [0, 0, 0, -3]}},
+        request | {"detection": box | {"label": None}, "options": {"optimisation": {"iterations": 200}}},
+    ]
+    assert len({world.client.post("/register", json=body).json()["id"] for body in spellings}) == 1
+    assert len(world.queue.registrations) == 1
+
+
+def test_what_differs_in_anything_is_another_job(world: World) -> None:
+    truth = {"T_object_scene": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}
+    changes: list[dict[str, Any]] = [
+        {},
+        {"seed": 1},
+        {"options": {"sampling": {"views": 6}}},
+        {"detection": BOX | {"label": "chair"}},
+        {"ground_truth": truth},
+        {"scene": world.valid_request()["object"]},
+    ]
+    assert len({post(world, **change).json()["id"] for change in changes}) == len(changes)
+
+
+def test_an_identical_finished_job_answers_200(world: World) -> None:
+    world.succeed(world.submit())
+    answer = post(world)
+    assert (answer.status_code, answer.json()["status"]) == (200, "successful")
+    assert "result" in answer.json()["links"]
+
+
+def test_a_failed_job_is_started_anew(world: World) -> None:
+    job_id = world.submit()
+    world.fail(job_id, reason="NO_INITIAL_TRANSFORM")
+    answer = post(world)
+    assert (answer.status_code, answer.json()["attempts"], answer.json()["error"]) == (202, 2, None)
+    assert world.queue.registrations[-1] == (job_id, 2)
+
+
+def test_a_job_that_was_never_queued_is_queued_by_the_next_call(world: World) -> None:
+    job_id = world.submit()
+    world.queue.registrations.clear()
+    assert post(world).status_code == 202
+    assert world.queue.registrations == [(job_id, 1)]
+
+
+def test_fields_that_are_still_validating_are_accepted(world: World) -> None:
+    request = world.valid_request()
+    data = field_bytes("late")
+    world.client.put(f"/fields/{sha256(data)}", content=data)
+    assert world.client.post("/register", json=request | {"object": sha256(data)}).status_code == 202
+
+
+def test_prefer_wait_answers_once_the_job_has_finished(world: World) -> None:
+    def finish() -> None:
+        deadline = time.monotonic() + 10
+        while not world.queue.registrations and time.monotonic() < deadline:
+            time.sleep(0.01)
+        world.succeed(world.queue.registrations[0][0])
+
+    world.valid_request()
+    worker = threading.Thread(target=finish)
+    worker.start()
+    answer = post(world, headers={"Prefer": "respond-async, wait=20"})
+    worker.join()
+    assert (answer.status_code, answer.json()["status"]) == (200, "successful")
+    assert answer.headers["preference-applied"] == "wait=20"
+
+
+def test_prefer_wait_gives_up_in_time(world: World) -> None:
+    answer = post(world, headers={"Prefer": "wait=1"})
+    assert (answer.status_code, answer.json()["status"]) == (202, "accepted")
+
+
+def test_a_dry_run_starts_nothing(world: World) -> None:
+    answer = world.client.post("/register?dry_run=true", json=world.valid_request())
+    assert answer.status_code == 200
+    assert answer.json()["valid"] is True
+    assert world.records.list_jobs(None, 10, None) == []
+    assert answer.json()["id"] == post(world).json()["id"]
+
+
+def test_an_idempotency_key_returns_the_first_answer_even_of_a_failed_job(world: World) -> None:
+    key = {"Idempotency-Key": "run-1"}
+    job_id = post(world, headers=key).json()["id"]
+    world.fail(job_id, reason="NO_INITIAL_TRANSFORM")
+    again = post(world, headers=key)
+    assert (again.status_code, again.json()["status"], again.json()["attempts"]) == (200, "failed", 1)
+    assert post(world, headers={"Idempotency-Key": "run-2"}).json()["attempts"] == 2
+
+
+def test_an_idempotency_key_belongs_to_one_request(world: World) -> None:
+    key = {"Idempotency-Key": "run-1"}
+    assert post(world, headers=key).status_code == 202
+    assert_refused(post(world, headers=key, seed=1), 422, "IDEMPOTENCY_KEY_REUSED")
+
+
+def test_a_full_queue_says_when_to_come_back(tmp_path: Path) -> None:
+    world = make_world(tmp_path, max_queued_jobs=1)
+    first = world.submit()
+    answer = post(world, seed=1)
+    assert_refused(answer, 503, "QUEUE_FULL")
+    assert int(answer.headers["retry-after"]) > 0
+    assert post(world).json()["id"] == first
+    world.succeed(first)
+    assert post(world, seed=1).status_code == 202
+
+
+def one_shot(scene: bytes, object_: bytes, question: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "request": (None, json.dumps(question), "application/json"),
+        "scene": ("scene.ckpt", scene),
+        "object": ("object.ckpt", object_),
+    }
+
+
+def test_one_shot_uploads_both_fields_and_registers_them(world: World) -> None:
+    scene, object_ = field_bytes("one"), field_bytes("two")
+    answer = world.client.post("/register", files=one_shot(scene, object_, {"detection": BOX}))
+    assert answer.status_code == 202, answer.text
+    assert world.queue.imports == [(sha256(scene), 1), (sha256(object_), 1)]
+    assert world.queue.registrations == [(answer.json()["id"], 1)]
+    for sha, data in ((sha256(scene), scene), (sha256(object_), object_)):
+        assert world.blobs.blobs[f"fields/{sha}/original"] == data
+    by_reference = {"scene": sha256(scene), "object": sha256(object_), "detection": BOX}
+    assert world.client.post("/register", json=by_reference).json()["id"] == answer.json()["id"]
+
+
+def test_one_shot_keeps_nothing_of_a_request_that_is_refused(world: World) -> None:
+    question = {"detection": BOX, "options": {"unknown": 1}}
+    answer = world.client.post("/register", files=one_shot(field_bytes("one"), field_bytes("two"), question))
+    assert_refused(answer, 422, "INVALID_OPTIONS")
+    missing = {"scene": ("scene", field_bytes("one")), "request": (None, json.dumps({"detection": BOX}))}
+    assert_refused(world.client.post("/register", files=missing), 400, "MISSING_PART")
+    assert world.blobs.blobs == {}
+    assert world.records.list_fields(None, 10, None) == []
+
+
+def test_a_one_shot_dry_run_keeps_nothing(world: World) -> None:
+    files = one_shot(field_bytes("one"), field_bytes("two"), {"detection": BOX})
+    assert world.client.post("/register?dry_run=true", files=files).json()["valid"] is True
+    assert world.blobs.blobs == {}

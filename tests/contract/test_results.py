@@ -1,0 +1,106 @@
+"""Results and artifacts over HTTP."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.contract.world import RESULT, World, assert_refused
+
+DATA = bytes(range(256)) * 4
+
+
+@pytest.fixture
+def job_id(world: World) -> str:
+    made = world.submit()
+    world.succeed(made, {"scene_points.ply": DATA, "trace.json": b"[]", "private.key": b"not an artifact"})
+    return made
+
+
+def test_the_result_lists_its_artifacts(world: World, job_id: str) -> None:
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert {name: document[name] for name in RESULT} == RESULT
+    listed = {entry["name"]: entry for entry in document["artifacts"]}
+    assert set(listed) == {"result.json", "scene_points.ply", "trace.json"}
+    assert world.client.get(listed["scene_points.ply"]["url"]).content == DATA
+    assert listed["scene_points.ply"]["bytes"] == len(DATA)
+
+
+def test_a_result_comes_when_it_is_there_and_not_before(world: World) -> None:
+    job_id = world.submit(seed=1)
+    for path in ("result", "artifacts/trace.json"):
+        answer = world.client.get(f"/jobs/{job_id}/{path}")
+        assert_refused(answer, 409, "JOB_NOT_READY")
+        assert answer.headers["retry-after"] == "1"
+
+
+def test_a_failed_job_answers_with_its_own_problem(world: World) -> None:
+    job_id = world.submit(seed=1)
+    detail = "12 surface points were found; 500 are needed."
+    world.fail(job_id, reason="NO_SURFACE_IN_DETECTION", title="No surface", status=422, detail=detail, found=12)
+    problem = assert_refused(world.client.get(f"/jobs/{job_id}/result"), 422, "NO_SURFACE_IN_DETECTION")
+    assert (problem["detail"], problem["found"]) == (detail, 12)
+    assert world.client.get(f"/jobs/{job_id}").json()["error"]["detail"] == detail
+
+
+def test_a_reason_that_only_the_engine_knows_passes_through(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.fail(job_id, reason="SOMETHING_NEW", title="New", status=422, detail="never seen here")
+    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 422, "SOMETHING_NEW")
+
+
+def test_a_dismissed_job_has_no_result(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.client.post(f"/jobs/{job_id}/cancel")
+    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 409, "JOB_DISMISSED")
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "stop"),
+    [("bytes=0-9", 0, 10), ("bytes=1000-", 1000, 1024), ("bytes=-24", 1000, 1024), ("bytes=1020-9999", 1020, 1024)],
+)
+def test_one_range_is_honoured(world: World, job_id: str, asked: str, start: int, stop: int) -> None:
+    answer = world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (206, DATA[start:stop])
+    assert answer.headers["content-range"] == f"bytes {start}-{stop - 1}/1024"
+    assert answer.headers["content-length"] == str(stop - start)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    ["bytes=0-1,2-3", "bytes=" + ",".join(f"{i}-{i}" for i in range(10_000)), "bytes=5-1", "bytes=-", "items=0-1", "x"],
+)
+def test_other_ranges_get_the_whole(world: World, job_id: str, asked: str) -> None:
+    answer = world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
+    assert (answer.status_code, answer.content) == (200, DATA)
+
+
+@pytest.mark.parametrize("asked", ["bytes=1024-", "bytes=99999999999-", "bytes=-0"])
+def test_a_range_past_the_end_is_refused(world: World, job_id: str, asked: str) -> None:
+    answer = world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
+    assert_refused(answer, 416, "RANGE_NOT_SATISFIABLE")
+    assert answer.headers["content-range"] == "bytes */1024"
+
+
+def test_etags_save_bytes_and_guard_ranges(world: World, job_id: str) -> None:
+    path = f"/jobs/{job_id}/artifacts/scene_points.ply"
+    head = world.client.head(path)
+    assert (head.status_code, head.content, head.headers["content-length"]) == (200, b"", "1024")
+    etag = head.headers["etag"]
+    assert world.client.get(path, headers={"If-None-Match": etag}).status_code == 304
+    assert world.client.get(path, headers={"Range": "bytes=0-9", "If-Range": etag}).status_code == 206
+    assert world.client.get(path, headers={"Range": "bytes=0-9", "If-Range": '"other"'}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "private.key", "preview.png", "manifest.json", "..%2fmanifest.json", "%2e%2e%2f%2e%2e%2fx", "trace.json%00",
+        "trace.json%0d%0aX-Bad:1", "%E2%80%AEnosj.ecart", "x" * 4000, "/etc/passwd", "../manifest.json",
+    ],
+)  # fmt: skip
+def test_only_the_fixed_names_are_artifacts(world: World, job_id: str, name: str) -> None:
+    answer = world.client.get(f"/jobs/{job_id}/artifacts/{name}")
+    assert answer.status_code == 404
+    assert answer.json()["reason"] in ("ARTIFACT_NOT_FOUND", "NOT_FOUND")
+    assert "X-Bad" not in answer.headers
+    assert world.client.get(f"/jobs/{job_id}/artifacts/trace.json").content == b"[]"

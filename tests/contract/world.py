@@ -1,0 +1,135 @@
+"""A service in one process over stores in memory, and the small things that tests ask of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+from service.app import create_app
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.records import JobRecord
+from service.settings import Settings
+from tests.contract.asgi import client_of
+
+BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
+BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
+NOBODY = "0" * 32
+
+
+def field_bytes(name: str, size: int = 600) -> bytes:
+    """Bytes that begin as a safetensors file does; different for each name."""
+    header = json.dumps({"__metadata__": {"name": name}}).encode()
+    return (len(header).to_bytes(8, "little") + header).ljust(size, b"\0")
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def transform(scale: float = 1.0) -> dict[str, Any]:
+    matrix = [[scale, 0, 0, 0], [0, scale, 0, 0], [0, 0, scale, 0], [0, 0, 0, 1]]
+    return {"matrix": matrix, "scale": scale, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]}
+
+
+RESULT = {
+    "verdict": "registered",
+    "verdict_reason": "SURFACES_AGREE",
+    "T_object_scene": transform(2.0),
+    "T_scene_object": transform(0.5),
+    "alternatives": [],
+    "metrics": {"residual_rms": 0.001},
+    "seed": 0,
+}
+
+
+@dataclass
+class World:
+    """The service, its stores, and a client."""
+
+    settings: Settings
+    records: InMemoryRecordStore
+    blobs: InMemoryBlobStore
+    queue: InMemoryJobQueue
+    client: httpx.Client
+
+    def ready_field(self, name: str, bounds: list[list[float]] | None = None) -> str:
+        """A field that was uploaded and whose import went well; its SHA-256."""
+        data = field_bytes(name)
+        answer = self.client.put(f"/fields/{sha256(data)}", content=data)
+        assert answer.status_code == 201, answer.text
+        self.blobs.delete(f"fields/{sha256(data)}/original")
+        self.records.update_field(sha256(data), attempt=1, state="ready", report={"bounds": bounds or BOUNDS})
+        return sha256(data)
+
+    def rejected_field(self, name: str) -> str:
+        data = field_bytes(name)
+        self.client.put(f"/fields/{sha256(data)}", content=data)
+        self.blobs.delete_prefix(f"fields/{sha256(data)}")
+        error = {"reason": "FIELD_SHAPES_MISMATCH", "title": "Shapes", "status": 422, "detail": "the shapes do not fit"}
+        self.records.update_field(sha256(data), attempt=1, state="rejected", error=error)
+        return sha256(data)
+
+    def submit(self, **changes: Any) -> str:
+        """Post a registration; the job's id."""
+        answer = self.client.post("/register", json=self.valid_request() | changes)
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["id"])
+
+    def valid_request(self) -> dict[str, Any]:
+        """A request between two fields that are there, uploading them the first time."""
+        scene, object_ = sha256(field_bytes("scene")), sha256(field_bytes("object"))
+        for name, known in (("scene", scene), ("object", object_)):
+            if self.records.get_field(known) is None:
+                self.ready_field(name)
+        return {"scene": scene, "object": object_, "detection": BOX}
+
+    def run(self, job_id: str) -> JobRecord:
+        """What a worker does first."""
+        record = self.records.get_job(job_id)
+        assert record is not None
+        return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
+
+    def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None) -> None:
+        """What a worker leaves behind in the end."""
+        attempt = self.run(job_id).attempt
+        files = {"result.json": json.dumps(RESULT).encode()} | (artifacts or {})
+        for name, data in files.items():
+            self.blobs.put(f"jobs/{job_id}/{attempt}/{name}", data)
+        listed = [
+            {"name": name, "bytes": len(data), "media_type": "application/octet-stream", "sha256": sha256(data)}
+            for name, data in files.items()
+        ]
+        self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps({"attempt": attempt, "artifacts": listed}).encode())
+        self.records.update_job(job_id, attempt, status="successful")
+
+    def fail(self, job_id: str, **error: Any) -> None:
+        attempt = self.run(job_id).attempt
+        self.records.update_job(job_id, attempt, status="failed", error=error)
+
+
+def make_world(folder: Path, **settings: Any) -> World:
+    """A fresh service; ``settings`` override what suits tests."""
+    usual = {"state_dir": folder, "redis_url": None, "upload_stall_s": 2.0, "max_upload_bytes": 4096}
+    chosen = Settings(**(usual | settings))
+    records, blobs, queue = InMemoryRecordStore(chosen.retention_s), InMemoryBlobStore(), InMemoryJobQueue()
+    app = create_app(chosen, records, blobs, queue)
+    return World(chosen, records, blobs, queue, client_of(app))
+
+
+def assert_refused(answer: httpx.Response, status: int, reason: str) -> dict[str, Any]:
+    """The answer is a whole problem with this status and reason; returns it."""
+    assert answer.headers["content-type"] == "application/problem+json", answer.text
+    problem: dict[str, Any] = answer.json()
+    assert (answer.status_code, problem["reason"]) == (status, reason), answer.text
+    assert problem["status"] == status
+    assert problem["type"] == f"/docs#{reason}"
+    assert problem["title"]
+    assert problem["detail"]
+    assert problem["request_id"] == answer.headers["x-request-id"]
+    assert "Traceback" not in answer.text
+    return problem
