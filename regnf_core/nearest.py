@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -18,3 +19,10 @@ class NearestNeighbours:
         """Distance (N,) to the nearest point and its number (N,), for points (N, 3). Not differentiable."""
         distance, index = self._tree.query(points.detach().cpu().numpy())
         return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
+
+
+def spacing(points: Tensor) -> float:
+    """The typical gap of a cloud (N, 3): the median distance from a point to its third neighbour."""
+    array = points.detach().cpu().numpy()
+    distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
+    return float(np.median(distance.reshape(len(array), -1)[:, -1]))

@@ -92,6 +92,11 @@ def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: Sa
     return hits.points[grown.contains(hits.points)]
 
 
+def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+    """(N,) bool: which points (N, 3) of the scene lie in the slightly grown box and above the ground."""
+    return detection.contains(points, _BOX_MARGIN) & _above_ground(points, detection, options)
+
+
 def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
     """(N,) bool: which points are above the lowest ``ground_fraction`` of the box's height."""
     up = axis_vector(options.up_axis)
