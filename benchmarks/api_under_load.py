@@ -23,10 +23,10 @@ from pathlib import Path
 
 import httpx
 import numpy as np
-from tests.core.importing.checkpoints import write_full_size_checkpoint
 
 from regnf_cli.local_service import api_process, running_service
 from regnf_cli.remote import RemoteService
+from tests.core.importing.checkpoints import write_full_size_checkpoint
 
 DATA = Path(__file__).resolve().parents[1] / "examples" / "data"
 POLL_EVERY_S = 0.02

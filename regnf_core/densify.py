@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
-from regnf_core.nearest import spacing
+from regnf_core.nearest import gaps
 from regnf_core.result import SurfaceSamples
 
-_REACH = 2.0  # new points lie up to this many typical gaps from an old one
+_REACH = 1.5  # new points lie up to this many gaps from an old one
+_LARGEST_GAP = 4.0  # typical gaps; a lone stray point must not draw all new ones
 _NEWTON_STEPS = 2
 _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
 _MIN_SLOPE = 0.25  # squared gradient below which a Newton step is not trusted to its full length
@@ -31,9 +32,13 @@ def densify(
     missing = count - samples.points.shape[0]
     if missing <= 0:
         return samples
-    gap = spacing(samples.points)
-    seeds = torch.randint(samples.points.shape[0], (missing,), generator=generator).to(samples.points.device)
-    shake = (_REACH * gap * (2.0 * torch.rand(missing, 3, generator=generator) - 1.0)).to(samples.points)
+    local = gaps(samples.points).cpu()
+    gap = float(local.median())
+    local = local.clamp_max(_LARGEST_GAP * gap)
+    # By the area that a point stands for, so that sparsely seen parts are filled first.
+    seeds = torch.multinomial(local.square() + 1e-12, missing, replacement=True, generator=generator)
+    shake = _REACH * local[seeds].unsqueeze(-1) * (2.0 * torch.rand(missing, 3, generator=generator) - 1.0)
+    seeds, shake = seeds.to(samples.points.device), shake.to(samples.points)
     normals = samples.normals[seeds]
     points = samples.points[seeds] + shake - (shake * normals).sum(-1, keepdim=True) * normals
     for _ in range(_NEWTON_STEPS):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -21,8 +20,8 @@ class NearestNeighbours:
         return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
 
 
-def spacing(points: Tensor) -> float:
-    """The typical gap of a cloud (N, 3): the median distance from a point to its third neighbour."""
+def gaps(points: Tensor) -> Tensor:
+    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbour: how sparse the cloud is there."""
     array = points.detach().cpu().numpy()
     distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
-    return float(np.median(distance.reshape(len(array), -1)[:, -1]))
+    return torch.as_tensor(distance.reshape(len(array), -1)[:, -1]).to(points)
