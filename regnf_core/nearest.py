@@ -21,7 +21,7 @@ class NearestNeighbours:
 
 
 def gaps(points: Tensor) -> Tensor:
-    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbour: how sparse the cloud is there."""
+    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbour: how sparse it is there."""
     array = points.detach().cpu().numpy()
     distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
     return torch.as_tensor(distance.reshape(len(array), -1)[:, -1]).to(points)
