@@ -20,7 +20,7 @@ from regnf_core.tracing import clip_to_region, first_hits, shortest_step
 MIN_POINTS = 50
 _BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
-_CLEARANCE = 0.6  # a camera keeps at least this many box diagonals from the centre: outside the box, whatever its turn
+_CLEARANCE = 0.75  # a camera keeps this many box diagonals from the centre at least: outside the box, with room to see
 
 
 def sample_scene(
