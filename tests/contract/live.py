@@ -72,7 +72,7 @@ def live_service(folder: Path, with_worker: bool = True, **settings: object) -> 
         plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
         usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
         environment = plain | {f"REGNF_{name.upper()}": str(value) for name, value in (usual | settings).items()}
-        command = ["uvicorn", "service.app:create_app", "--factory", "--fd", str(listener.fileno()), "--no-access-log"]
+        command = ["regnf_cli.api_process", str(listener.fileno())]
         with _process(folder, "api", command, environment, listener.fileno()) as api:
             if not with_worker:
                 live = Live(listener.getsockname()[1], folder, api, None)

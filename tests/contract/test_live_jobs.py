@@ -86,6 +86,7 @@ def test_a_registration_from_request_to_artifacts(client: httpx.Client, fields: 
     for entry in result.json()["artifacts"]:
         data = client.get(entry["url"]).content
         assert (len(data), sha256(data)) == (entry["bytes"], entry["sha256"])
+        assert client.head(entry["url"]).headers["content-length"] == str(len(data))
         assert client.get(entry["url"], headers={"Range": "bytes=0-3"}).content == data[:4]
     assert {"result.json", "trace.json", "aligned.ply"} <= {entry["name"] for entry in result.json()["artifacts"]}
     assert client.get(job["links"]["view"]).status_code == 200

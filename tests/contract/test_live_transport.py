@@ -201,25 +201,18 @@ def test_events_arrive_as_they_happen(live: Live) -> None:
 
 
 def test_told_to_stop_it_ends_open_streams_and_waits_and_leaves(tmp_path: Path) -> None:
-    with live_service(tmp_path, with_worker=False) as ending, ending.client() as client:
+    with live_service(tmp_path, with_worker=False) as ending, ending.client() as client, ending.connect() as waiter:
         job_id = submit(client)
-        waited: list[int] = []
-
-        def wait() -> None:
-            with ending.client() as waiting:
-                waited.append(waiting.get(f"/jobs/{job_id}", params={"wait": 30}).status_code)
-
-        waiter = threading.Thread(target=wait)
-        waiter.start()
+        waiter.sendall(head_of("GET", f"/jobs/{job_id}?wait=30"))
         with client.stream("GET", f"/jobs/{job_id}/events") as stream:
             lines = stream.iter_lines()
             while not next(lines).startswith("data: "):
                 pass
+            # the stream was asked for after the wait, so both are being served now
             ending.api.terminate()
             rest = list(lines)
-        waiter.join()
         assert rest[-1:] in ([], [""])
-        assert waited == [200]
+        assert waiter.recv(1024).startswith(b"HTTP/1.1 200")
         try:
             ending.api.wait(20)
         except subprocess.TimeoutExpired:

@@ -93,3 +93,20 @@ def test_event_ids_that_nobody_gave(world: World, given: Any) -> None:
     world.succeed(job_id)
     answer = world.client.get(f"/jobs/{job_id}/events", headers={"Last-Event-ID": given})
     assert_refused(answer, 400, "INVALID_EVENT_ID")
+
+
+@pytest.mark.parametrize(
+    ("path", "allowed"),
+    [
+        ("/fields/" + "0" * 64, "DELETE, GET, HEAD, PUT"),
+        ("/v1/fields", "GET, POST"),
+        ("/jobs/x", "DELETE, GET"),
+        ("/jobs/x/cancel", "POST"),
+        ("/healthz", "GET"),
+        ("/static/favicon.svg", "GET, HEAD"),
+    ],
+)
+def test_the_allow_header_names_every_method_of_an_address(world: World, path: str, allowed: str) -> None:
+    answer = world.client.request("PATCH", path)
+    assert_refused(answer, 405, "METHOD_NOT_ALLOWED")
+    assert answer.headers["allow"] == allowed
