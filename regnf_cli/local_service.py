@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 START_DEADLINE_S = 30
+STOP_DEADLINE_S = 30
 _LISTENING = "0A"  # in /proc/net/tcp
 
 
@@ -31,7 +32,7 @@ def running_service(state_dir: Path) -> Iterator[str]:
         yield _address(server)
     finally:
         server.send_signal(signal.SIGTERM)
-        server.wait(timeout=30)
+        server.communicate(timeout=STOP_DEADLINE_S)
 
 
 def _address(server: subprocess.Popen[str]) -> str:
