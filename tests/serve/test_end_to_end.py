@@ -28,7 +28,7 @@ Client = httpx.Client
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     with (
-        running_service(tmp_path_factory.mktemp("state")) as address,
+        running_service(tmp_path_factory.mktemp("state"), threads=1) as address,
         httpx.Client(base_url=address, timeout=60) as client,
     ):
         yield client
