@@ -73,3 +73,5 @@ class RegistrationResult:
     options: dict[str, Any]
     alternatives: list[Alternative] = field(default_factory=list)
     covariance: Tensor | None = None
+    surroundings: SurfaceSamples | None = None
+    """The scene's surface round the detection, for viewers."""
