@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -38,6 +39,7 @@ class InMemoryRecordStore:
         self._events: dict[str, list[JobEvent]] = {}
         self._tombstones: set[str] = set()
         self._fields: dict[str, FieldRecord] = {}
+        self._attempts_at_deleted: dict[str, int] = {}
         self._remembered: dict[str, tuple[str, float]] = {}
 
     def now(self) -> float:
@@ -177,7 +179,9 @@ class InMemoryRecordStore:
     def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
         with self._changed:
             known = self._fields.get(record.sha256)
-            fresh = record if known is None else transitions.restarted_field(known, record, self.now())
+            before = self._attempts_at_deleted.get(record.sha256, 0)
+            first = replace(record, attempt=record.attempt + before)
+            fresh = first if known is None else transitions.restarted_field(known, record, self.now())
             if fresh is None:
                 assert known is not None
                 return known, False
@@ -208,7 +212,10 @@ class InMemoryRecordStore:
 
     def delete_field(self, sha256: str) -> bool:
         with self._changed:
-            return self._fields.pop(sha256, None) is not None
+            known = self._fields.pop(sha256, None)
+            if known is not None:
+                self._attempts_at_deleted[sha256] = known.attempt
+            return known is not None
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])

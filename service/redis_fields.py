@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from service import transitions
@@ -12,10 +12,16 @@ from service.redis_documents import PREFIX, Command, RedisDocuments, text
 
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
+_ATTEMPTS_KEPT_S = str(48 * 3600)
+"""How long a deleted field's count of attempts is kept: longer than any word about them lives elsewhere."""
 
 
 def _key(sha256: str) -> str:
     return f"{PREFIX}field:{sha256}"
+
+
+def _attempts_key(sha256: str) -> str:
+    return f"{PREFIX}field:{sha256}:attempts"
 
 
 class RedisFieldRecords(RedisDocuments):
@@ -40,12 +46,17 @@ class RedisFieldRecords(RedisDocuments):
         while True:
             document, now = self._read(_key(record.sha256))
             known = FieldRecord(**document) if document is not None else None
-            fresh = transitions.restarted_field(known, record, now) if known is not None else record
+            fresh = self._first(record) if known is None else transitions.restarted_field(known, record, now)
             if fresh is None:
                 assert known is not None
                 return known, False
             if self._save_field(known.version if known is not None else 0, fresh):
                 return fresh, True
+
+    def _first(self, record: FieldRecord) -> FieldRecord:
+        """The new field, its attempts counted on from those at a deleted one: whatever still works at them is stale."""
+        before: Any = self._redis.get(_attempts_key(record.sha256))
+        return record if before is None else replace(record, attempt=record.attempt + int(before))
 
     def get_field(self, sha256: str) -> FieldRecord | None:
         document, _ = self._read(_key(sha256))
@@ -72,8 +83,15 @@ class RedisFieldRecords(RedisDocuments):
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
     def delete_field(self, sha256: str) -> bool:
-        with self._redis.pipeline() as pipeline:
-            pipeline.delete(_key(sha256))
-            pipeline.zrem(_CREATED, sha256)
-            pipeline.srem(_VALIDATING, sha256)
-            return bool(pipeline.execute()[0])
+        while True:
+            document, _ = self._read(_key(sha256))
+            if document is None:
+                return False
+            commands: list[Command] = [
+                ("DEL", _key(sha256)),
+                ("ZREM", _CREATED, sha256),
+                ("SREM", _VALIDATING, sha256),
+                ("SET", _attempts_key(sha256), str(document["attempt"]), "EX", _ATTEMPTS_KEPT_S),
+            ]
+            if self._compare_and_set(_key(sha256), document["version"], commands) == "OK":
+                return True

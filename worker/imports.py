@@ -12,7 +12,7 @@ from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import RegnfError
-from service.records import StaleAttemptError
+from service.records import FieldRecord, StaleAttemptError
 from worker.context import Context
 from worker.engine import Importer
 from worker.problems import fault, new_incident, problem
@@ -40,11 +40,13 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         logger.info("import %s attempt %d is somebody else's", sha256, attempt)
         return
     try:
-        report = _standing_report(context, sha256) or _work(context, sha256, field.description, importer)
+        report = _standing_report(context, field) or _work(context, field, importer)
     except RedisError:
         raise
     except RegnfError as error:
         reject(context, sha256, attempt, problem(error.reason, str(error)))
+    except StaleAttemptError as error:
+        _retire(context, sha256, attempt, error)
     except JobTimeoutException:
         reject(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
     except Exception as error:
@@ -72,30 +74,49 @@ def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
     try:
         context.records.update_field(sha256, attempt=attempt, **changes)
     except StaleAttemptError as error:
-        logger.info("import %s attempt %d has no say any more: %s", sha256, attempt, error)
-        if context.records.get_field(sha256) is None:
-            context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
+        _retire(context, sha256, attempt, error)
     else:
         logger.info("import %s attempt %d ended: %s", sha256, attempt, changes["state"])
 
 
-def _standing_report(context: Context, sha256: str) -> dict[str, Any] | None:
-    """What an earlier attempt found that died before it could say so."""
+def _retire(context: Context, sha256: str, attempt: int, error: StaleAttemptError) -> None:
+    logger.info("import %s attempt %d has no say any more: %s", sha256, attempt, error)
+    if context.records.get_field(sha256) is None:
+        context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
+
+
+def _standing_report(context: Context, field: FieldRecord) -> dict[str, Any] | None:
+    """What an earlier attempt found that died before it could say so, if it took the file for the same function."""
     try:
-        with context.blobs.open(f"fields/{sha256}/report.json") as file:
-            report: dict[str, Any] = json.load(file)
+        with context.blobs.open(_report(field.sha256)) as file:
+            standing: dict[str, Any] = json.load(file)
     except FileNotFoundError:
         return None
-    return report
+    report: dict[str, Any] = standing["report"]
+    return report if standing["description"] == field.description else None
 
 
-def _work(context: Context, sha256: str, description: dict[str, Any], importer: Importer) -> dict[str, Any]:
+def _report(sha256: str) -> str:
+    return f"fields/{sha256}/report.json"
+
+
+def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str, Any]:
+    """Import the upload. Raises StaleAttemptError, nothing stored, when the field was deleted meanwhile."""
+    sha256, description = field.sha256, field.description
     with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(_original(sha256)) as upload:
         folder = Path(temporary)
         report: dict[str, Any] = importer(upload, folder, description)
+        _require_current(context, field)
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
             while chunk := source.read(1 << 20):
                 writer.write(chunk)
             writer.commit(f"fields/{sha256}/field.safetensors")
-    context.blobs.put(f"fields/{sha256}/report.json", json.dumps(report).encode())
+    context.blobs.put(_report(sha256), json.dumps({"description": description, "report": report}).encode())
     return report
+
+
+def _require_current(context: Context, field: FieldRecord) -> None:
+    """Somebody may have deleted the field, and uploaded it anew: what lies there now is no longer ours to touch."""
+    now = context.records.get_field(field.sha256)
+    if now is None or now.attempt != field.attempt or now.state != "validating":
+        raise StaleAttemptError("the field was deleted or is imported anew")

@@ -108,7 +108,7 @@ def _work(context: Context, record: JobRecord, make_engine: Callable[[], Registr
 def _field(context: Context, sha256: str, pulse: Pulse) -> Iterator[Path]:
     """The safe field file, once its import has ended.
 
-    Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_NOT_READY), FieldsNotReadyError.
+    Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
     """
     deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
     while (field := _usable(context, sha256)).state == "validating":
@@ -130,5 +130,5 @@ def _usable(context: Context, sha256: str) -> FieldRecord:
     settings = context.settings
     longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
     if field.state == "validating" and context.records.now() - field.updated > longest:
-        raise InvalidInputError(f"field {sha256} was not imported in time", reason="FIELD_NOT_READY")
+        raise InvalidInputError(f"field {sha256} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
     return field

@@ -423,6 +423,17 @@ def test_a_lost_import_starts_anew(store: RecordStore) -> None:
         store.retry_import(SCENE, 3)
 
 
+def test_a_field_that_was_deleted_counts_its_attempts_on(store: RecordStore) -> None:
+    store.create_field(field(store))
+    store.retry_import(SCENE, 1)
+    assert store.delete_field(SCENE)
+    again, created = store.create_field(field(store))
+    assert (created, again.attempt, again.requeues) == (True, 3, 0)
+    for old in (1, 2):
+        with pytest.raises(StaleAttemptError):
+            store.update_field(SCENE, attempt=old, state="rejected")
+
+
 def test_fields_are_listed_and_deleted(store: RecordStore) -> None:
     for number, label in enumerate(["chair", "table", "chair"]):
         store.create_field(field(store, str(number) * 64, float(number), label))
