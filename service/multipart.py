@@ -83,7 +83,10 @@ def _parameter(header: str, name: str) -> str | None:
     """One parameter of a structured header such as Content-Disposition or Content-Type."""
     message = Message()
     message["content-type"] = header.replace("\r", " ").replace("\n", " ")
-    value = message.get_param(name)
+    try:
+        value = message.get_param(name)
+    except ValueError:  # a continuation (RFC 2231) numbered with more digits than an integer may have
+        return None
     return value if isinstance(value, str) else None
 
 

@@ -142,6 +142,11 @@ def test_multipart_that_breaks_off_is_refused(world: World) -> None:
     assert_refused(world.client.post("/fields", content=FILE, headers=headers), 400, "MALFORMED_MULTIPART")
 
 
+def test_a_boundary_continued_beyond_all_counting_is_refused(world: World) -> None:
+    headers = {"Content-Type": f"multipart/form-data; boundary*{'9' * 5000}=x"}
+    assert_refused(world.client.post("/fields", content=b"x", headers=headers), 400, "MALFORMED_MULTIPART")
+
+
 @pytest.mark.parametrize("boundary", ["y" * 71, "", '"'])
 def test_boundaries_that_cannot_be_used_are_refused(world: World, boundary: str) -> None:
     headers = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
