@@ -8,8 +8,9 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from redis import Redis
 from redis.exceptions import RedisError
 from starlette.middleware import Middleware
@@ -22,6 +23,7 @@ from service.contract import build_contract
 from service.dependencies import Services, off_loop
 from service.local_blobs import LocalBlobStore
 from service.middleware import RequestContext, TokenGate
+from service.query import refuse_unknown_parameters
 from service.queue import JobQueue
 from service.reaper import Reaper
 from service.records import RecordStore
@@ -35,7 +37,10 @@ from service.waiting import pause
 
 logger = logging.getLogger(__name__)
 _REAP_EVERY_S = 15.0
-_ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router, pages.router, meta.router)
+_STRICT = [Depends(refuse_unknown_parameters)]
+_ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
+# links that people pass on and probes gather parameters that nobody meant
+_LENIENT_ROUTERS = (pages.router, meta.router)
 
 
 class ConfigurationError(RuntimeError):
@@ -74,14 +79,19 @@ def create_app(
         middleware=[Middleware(RequestContext), Middleware(TokenGate, tokens=settings.api_tokens)],
     )
     app.state.services = services
-    for router in _ROUTERS:
-        app.include_router(router)
+    _include_routers(app)
     app.openapi = cache(lambda: build_contract(app))  # type: ignore[method-assign]
-    for router in _ROUTERS:
-        app.include_router(router, prefix="/v1", include_in_schema=False)
+    _include_routers(app, prefix="/v1", include_in_schema=False)
     app.mount("/static", StaticFiles(directory=Path(__file__).with_name("web")), name="static")
     problems.install(app)
     return app
+
+
+def _include_routers(app: FastAPI, **how: Any) -> None:
+    for router in _ROUTERS:
+        app.include_router(router, dependencies=_STRICT, **how)
+    for router in _LENIENT_ROUTERS:
+        app.include_router(router, **how)
 
 
 def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:

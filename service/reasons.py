@@ -22,7 +22,11 @@ REASONS: dict[str, Reason] = {
     "MALFORMED_JSON": Reason(
         400, "Malformed JSON", "The body is not one JSON value in UTF-8, names a member twice, or nests too deeply."
     ),
-    "INVALID_QUERY": Reason(400, "Invalid query", "`errors` names the parameters of the wrong type or out of range."),
+    "INVALID_QUERY": Reason(
+        400,
+        "Invalid query",
+        "`errors` names the parameters that are unknown, given twice, of the wrong type or out of range.",
+    ),
     "INVALID_PAGE_TOKEN": Reason(400, "Invalid page token", "Use `next_page_token` of the page before, unchanged."),
     "INVALID_HEADER": Reason(400, "Invalid header", "A request header does not follow its grammar or its limits."),
     "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is no id of an event of this service."),

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.contract.world import BOX, World, assert_refused
+from tests.contract.world import BOX, NOBODY, World, assert_refused
 
 UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
 IDENTITY = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -253,3 +253,26 @@ def test_unknown_states(world: World, status: str) -> None:
 def test_dry_run_is_yes_or_no(world: World) -> None:
     answer = world.client.post("/register?dry_run=perhaps", json=world.valid_request())
     assert_refused(answer, 400, "INVALID_QUERY")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "named", "why"),
+    [
+        ("POST", "/register?dryrun=true", "dryrun", "unknown"),
+        ("POST", "/v1/register?dry_run=true&dry_run=false", "dry_run", "given twice"),
+        ("GET", "/jobs?limits=1&limit=1", "limits", "unknown"),
+        ("GET", f"/fields/{NOBODY * 2}?wait=0&Wait=1", "Wait", "unknown"),
+        ("GET", "/fields?%0d%0aX=1", "", "unknown"),
+        ("PUT", f"/fields/{NOBODY * 2}?label=chair", "label", "unknown"),
+    ],
+)
+def test_parameters_that_are_not_known_are_refused(world: World, method: str, path: str, named: str, why: str) -> None:
+    answer = world.client.request(method, path, json=world.valid_request() if method == "POST" else None)
+    problem = assert_refused(answer, 400, "INVALID_QUERY")
+    assert problem["errors"] == [{"parameter": named, "detail": why}]
+    assert world.queue.registrations == []
+
+
+@pytest.mark.parametrize("path", ["/healthz?probe=1", "/docs?from=mail", "/v1/version?x"])
+def test_pages_and_probes_take_no_offence_at_parameters(world: World, path: str) -> None:
+    assert world.client.get(path).status_code == 200
