@@ -34,7 +34,8 @@ def register(
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
-    raise CancelledError. The preset `robust` has its own engine, :mod:`regnf_core.robust`. Deterministic for a seed, on one machine and with the same number of threads.
+    raise CancelledError. Deterministic for a seed, on one machine and with the same number of
+    threads. What follows is the preset `paper`; the preset `robust` has an engine of its own, regnf_core.robust.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()

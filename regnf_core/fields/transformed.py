@@ -1,4 +1,4 @@
-"""A field seen in another frame: the same surface after a similarity transform, distances in the other frame's units."""
+"""A field seen in another frame: the same surface after a similarity, distances in the other frame's units."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Cells:
 
 
 def surface_cells(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int) -> Cells:
-    """The cells along the surface within low..high (3,), ``levels`` times subdivided from ``base`` along the longest edge.
+    """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times.
 
     ``value`` tells the signed distance (N,) at points (N, 3). May be empty.
     """

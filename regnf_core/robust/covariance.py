@@ -37,7 +37,8 @@ def covariance(r: Residuals, places: Tensor, width: float) -> Tensor:
     count = centres.shape[0]
     meat = sums.T @ sums * (count / max(count - 7, 1))
     bread = torch.linalg.pinv(H[0])
-    return INFLATION * bread @ meat @ bread
+    cov: Tensor = INFLATION * bread @ meat @ bread
+    return cov
 
 
 def in_object_units(cov: Tensor, T_work: Sim3, scene: WorkingFrame, obj: WorkingFrame) -> Tensor:

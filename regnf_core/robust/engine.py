@@ -49,7 +49,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Finalists, best first, the evidence on them, the candidate each search began with, and the object's symmetries."""
+    """Finalists, best first, the evidence on them, where each one started, and the object's symmetries."""
 
     finalists: Finalists
     evidence: Evidence
@@ -104,9 +104,7 @@ def refine_candidates(
     found = None
     T = candidates
     for stage in STAGES:
-        found = run_stage(
-            scene, obj, problem.A, problem.B, T, stage, ex, generator, found.trail if found else None
-        )
+        found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, found.trail if found else None)
         T = found.T
     assert found is not None
     best = select(T, torch.tensor([0]))

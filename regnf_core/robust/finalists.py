@@ -17,7 +17,7 @@ from regnf_core.sim3 import Sim3
 
 @dataclass(frozen=True)
 class Step:
-    """One iteration of all poses: T (H,), robust costs (H,), mean |r| of both directions (H,), (H,), object diameters."""
+    """One iteration of all poses: T (H,), robust costs (H,), mean |r| each way (H,), (H,), object diameters."""
 
     T: Sim3
     costs: Tensor
@@ -29,7 +29,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Stage:
-    """Refine with kernel ``widths`` on ``points`` a side; keep at most ``keep`` poses within ``margin`` of the best score."""
+    """Refine with kernel ``widths`` on ``points`` a side; keep at most ``keep``, within ``margin`` of the best."""
 
     points: int
     widths: tuple[float, ...]
@@ -71,7 +71,7 @@ class Trail:
 
 @dataclass(frozen=True, eq=False)
 class Finalists:
-    """Poses (H,), best first, with their scores (H,), their residuals on the stage's samples, and how they came there."""
+    """Poses (H,), best first, their scores (H,), their residuals on the stage's samples, and how they came there."""
 
     T: Sim3
     scores: Tensor

@@ -27,7 +27,7 @@ class WorkingFrame:
         """Points (N, 3) of the working frame in the field's frame, float64."""
         return points.double().cpu() * self.length + self.centre
 
-    def T_field_work(self) -> Sim3:
+    def to_field(self) -> Sim3:
         """The working frame's points in the field's frame."""
         return Sim3(
             torch.tensor(self.length, dtype=torch.float64), torch.eye(3, dtype=torch.float64), self.centre.clone()

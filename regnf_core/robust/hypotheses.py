@@ -7,7 +7,6 @@ detection box itself (bad when it is loose).
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from regnf_core.robust.poses import join

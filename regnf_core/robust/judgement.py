@@ -14,7 +14,7 @@ from torch import Tensor
 
 from regnf_core.options import RobustOptions
 from regnf_core.result import Verdict
-from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, residuals
+from regnf_core.robust.residuals import DistanceModel, Samples, residuals
 from regnf_core.robust.search import disagreement
 from regnf_core.sim3 import Sim3
 

@@ -83,7 +83,8 @@ def _step(r: Residuals, width: float, damping: Tensor, fix_scale: bool) -> Tenso
         extra = extra + torch.tensor([0.0] * 6 + [1e9], dtype=torch.float64)
     step = -torch.linalg.solve(H + torch.diag_embed(extra), b)
     longest = step.abs().amax(-1, keepdim=True)
-    return step * (_LARGEST_STEP / longest.clamp_min(_LARGEST_STEP))
+    short: Tensor = step * (_LARGEST_STEP / longest.clamp_min(_LARGEST_STEP))
+    return short
 
 
 def _choose(better: Tensor, first: Sim3, second: Sim3) -> Sim3:

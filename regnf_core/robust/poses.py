@@ -40,7 +40,8 @@ def displacement(T: Sim3, reference: Sim3, points: Tensor) -> Tensor:
     (H,): how far apart two poses place the object, measured in the frame it is placed in and scaled to its own units.
     """
     placed, other = T.inverse().apply(points.double()), reference.inverse().apply(points.double())
-    return reference.scale * (placed - other).norm(dim=-1).amax(-1)
+    apart: Tensor = reference.scale * (placed - other).norm(dim=-1).amax(-1)
+    return apart
 
 
 def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) -> Tensor:

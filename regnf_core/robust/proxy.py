@@ -17,7 +17,7 @@ _PLANE_SPACINGS = 2.0  # nearer than this the tangent plane is the better distan
 class ProxyField:
     """Distance and gradient near oriented surface points (N, 3), in their frame, on a grid of 40 cells an edge.
 
-    The grid covers the points' box grown by ``margin`` on every side; farther out, distances grow with the way to the grid.
+    The grid covers the points' box grown by ``margin`` on every side; beyond it, distances grow with the way there.
     """
 
     def __init__(self, points: Tensor, normals: Tensor, spacing: float, margin: float) -> None:

@@ -94,7 +94,7 @@ def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) 
     T_work = select(poses, torch.tensor(winner))
     T = _in_field_frames(problem, T_work)
     alternatives = []
-    for i in rivals:
+    for i in rivals if decision != "rejected" else []:
         other = _in_field_frames(problem, select(poses, torch.tensor(i)))
         alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T)))
     diameter = problem.obj.frame.length
@@ -132,7 +132,7 @@ def _residuals(problem: Problem, T_work: Sim3) -> dict[str, Tensor]:
 
 
 def _in_field_frames(problem: Problem, T_work: Sim3) -> Sim3:
-    return problem.obj.frame.T_field_work() @ T_work @ problem.scene.frame.T_field_work().inverse()
+    return problem.obj.frame.to_field() @ T_work @ problem.scene.frame.to_field().inverse()
 
 
 def _surface(samples: Samples, out_of: Any) -> SurfaceSamples:

@@ -95,4 +95,5 @@ def _ask(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _cosine(gradient: Tensor, normals: Tensor) -> Tensor:
-    return (gradient * normals).sum(-1) / gradient.norm(dim=-1).clamp_min(1e-6)
+    cosine: Tensor = (gradient * normals).sum(-1) / gradient.norm(dim=-1).clamp_min(1e-6)
+    return cosine

@@ -86,9 +86,7 @@ def sample_scene_surface(
     bounds = frame.into(scene.bounds)
     found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
     if len(found) < MIN_POINTS:
-        raise NoSurfaceError(
-            f"only {len(found)} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION"
-        )
+        raise NoSurfaceError(f"only {len(found)} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION")
     return SampledField(field, frame, found, cells.edge)
 
 

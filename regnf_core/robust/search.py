@@ -66,10 +66,7 @@ def search(
         parts = [_refine(scene, obj, few_A, few_B, part, one) for part in _chunks(T)]
         T = Sim3(*(torch.cat([getattr(p[0], n) for p in parts]) for n in ("scale", "rotation", "translation")))
         scores = torch.cat([p[1] for p in parts])
-        if one.apart > 0.0:
-            kept = distinct(T, scores, extremes, one.apart, one.keep)
-        else:
-            kept = scores.argsort()[: one.keep]
+        kept = distinct(T, scores, extremes, one.apart, one.keep) if one.widths else scores.argsort()[: one.keep]
         T, scores = select(T, kept), scores[kept]
     return T, scores
 
@@ -84,4 +81,4 @@ def _refine(
 
 
 def _chunks(T: Sim3) -> list[Sim3]:
-    return [select(T, part) for part in torch.arange(T.scale.shape[0]).split(_CHUNK)]
+    return [select(T, part) for part in torch.split(torch.arange(T.scale.shape[0]), _CHUNK)]

@@ -72,7 +72,7 @@ def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> 
         angle = float(omega.norm())
         if angle < 0.1 or angle > 3.0:  # half turns say little: what is round has others too
             continue
-        axis = omega / omega.norm()
+        axis: Tensor = omega / omega.norm()
         scores = disagreement(residuals(obj, obj, B, B, _rigid(turns_about(axis, _AXIS_TURNS))), _WIDTH)
         if bool((scores <= itself + _ALIKE).all()):
             return axis
@@ -82,4 +82,5 @@ def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> 
 def _about(T: Sim3, axis: Tensor) -> Tensor:
     """(K,) bool: which of the transforms turn about the axis."""
     omega = T.log()[:, 3:6]
-    return (omega @ axis).abs() >= 0.97 * omega.norm(dim=-1)
+    about: Tensor = (omega @ axis).abs() >= 0.97 * omega.norm(dim=-1)
+    return about
