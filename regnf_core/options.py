@@ -120,12 +120,13 @@ class RobustOptions:
     """Share of the samples kept from the refinement, for the verdict."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
     """Largest |residual| of a sample on which both fields agree."""
-    min_inlier_share: _Ratio = 0.7
-    """Least share of agreeing samples, in each direction; under it: LOW_OVERLAP."""
+    min_inlier_share: _Ratio = 0.6
+    """Least share of agreeing samples, in each direction; under it: LOW_OVERLAP. More is asked of accurate fields."""
     min_explained_share: _Ratio = 0.4
     """Least share of all that stands in the box that the object explains; under it: SCENE_UNEXPLAINED."""
     max_free_space_violations: _Ratio = 0.2
-    """Largest share of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED."""
+    """Largest share of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED.
+    Less is allowed of accurate fields."""
     max_hidden_share: _Ratio = 0.75
     """Largest share of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05

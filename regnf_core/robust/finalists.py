@@ -102,7 +102,7 @@ def run_stage(
             Step(T_now, costs, size[:, :n].mean(1), size[:, n:].mean(1), stage.widths[iteration], stage.points)
         )
 
-    refined = minimise(scene, obj, few_A, few_B, T, list(stage.widths), on_iteration=record)
+    refined = minimise(scene, obj, few_A, few_B, T, list(stage.widths), adaptive=True, on_iteration=record)
     scores = disagreement(refined.residuals, stage.score_width)
     kept = distinct(refined.T, scores, extremes, apart, stage.keep)
     kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]

@@ -20,6 +20,10 @@ from regnf_core.sim3 import Sim3
 
 _SCORE_WIDTH = 0.015  # object diameters
 _REACH = 0.1  # object diameters from the object's surface: scene points farther off belong to something else
+_CLEAN_VIOLATIONS, _VIOLATIONS_PER_NOISE = 0.05, 20.0
+_CLEAN_SHARE, _SHARE_PER_NOISE = 0.87, 45.0
+"""Where the inliers agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing
+(a chair without its cushion); where they agree to a hundredth, it may be the fields' errors."""
 _SAME_SIDE = 0.5  # least cosine of the normals of an inlier
 
 
@@ -85,9 +89,14 @@ def verdict(evidence: Evidence, index: int, rivals: int, options: RobustOptions)
     """
     if not float(evidence.hidden[index]) <= options.max_hidden_share:
         return "rejected", "TOO_LITTLE_SURFACE"
-    if not float(evidence.violations[index]) <= options.max_free_space_violations:
+    noise = float(evidence.residual_rms[index])
+    if not float(evidence.violations[index]) <= min(
+        options.max_free_space_violations, _CLEAN_VIOLATIONS + _VIOLATIONS_PER_NOISE * noise
+    ):
         return "rejected", "FREE_SPACE_VIOLATED"
-    if not min(float(evidence.share_object[index]), float(evidence.share_scene[index])) >= options.min_inlier_share:
+    if not float(evidence.share_object[index]) >= options.min_inlier_share:
+        return "rejected", "LOW_OVERLAP"
+    if not float(evidence.share_scene[index]) >= max(options.min_inlier_share, _CLEAN_SHARE - _SHARE_PER_NOISE * noise):
         return "rejected", "LOW_OVERLAP"
     if not float(evidence.share_explained[index]) >= options.min_explained_share:
         return "rejected", "SCENE_UNEXPLAINED"

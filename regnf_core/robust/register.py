@@ -16,12 +16,14 @@ from regnf_core.robust.covariance import covariance, in_object_units
 from regnf_core.robust.engine import Outcome, Problem, find_candidates, prepare, refine_candidates
 from regnf_core.robust.finalists import LAST, Trail
 from regnf_core.robust.judgement import verdict
-from regnf_core.robust.poses import select
+from regnf_core.robust.levenberg import fitting_width
+from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.relation import relation
 from regnf_core.robust.residuals import Samples, residuals
 from regnf_core.run import Run
 from regnf_core.sim3 import Sim3
 
+_RIVALS_APART = 0.1  # object diameters: poses closer together are one answer with its uncertainty
 _GEMAN_MCCLURE = -2.0  # as the shape of Barron's general kernel
 
 
@@ -85,11 +87,9 @@ def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) 
     """The winner by the held-out samples, its rivals, verdict, covariance and residuals."""
     evidence, poses = outcome.evidence, outcome.finalists.T
     winner = int(evidence.scores.argmin())
-    rivals = [
-        i
-        for i in evidence.scores.argsort().tolist()
-        if i != winner and float(evidence.scores[i]) <= float(evidence.scores[winner]) + options.robust.rival_margin
-    ]
+    ranked = distinct(poses, evidence.scores, problem.extremes, _RIVALS_APART, poses.scale.numel())
+    close = evidence.scores <= evidence.scores[winner] + options.robust.rival_margin
+    rivals = [i for i in ranked.tolist() if i != winner and close[i]]
     decision, reason = verdict(evidence, winner, len(rivals), options.robust)
     T_work = select(poses, torch.tensor(winner))
     T = _in_field_frames(problem, T_work)
@@ -113,8 +113,7 @@ def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
     A, B = problem.A, problem.B
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
     r = residuals(problem.scene.field, problem.obj.field, A, B, batch)
-    places = torch.cat([T_work.apply(A.points), B.points])
-    cov = covariance(r, places, LAST.widths[-1])
+    cov = covariance(r, fitting_width(r, LAST.widths[-1]))
     return in_object_units(cov, T_work, problem.scene.frame, problem.obj.frame)
 
 
