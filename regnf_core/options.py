@@ -130,7 +130,8 @@ class RobustOptions:
     max_hidden_share: _Ratio = 0.75
     """Largest share of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
-    """Poses whose score is within this of the best one explain the data as well, and are all listed."""
+    """Poses whose score (0..1) is within this of the best one's, plus 0.15 times that one, explain the data as well:
+    all of them are listed."""
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,13 @@ from torch import Tensor
 
 from regnf_core.box import OrientedBox
 from regnf_core.cameras import axis_vector
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
-from regnf_core.result import Phase
 from regnf_core.robust.extremes import extreme_points
 from regnf_core.robust.finalists import LAST, STAGES, Finalists, run_stage
 from regnf_core.robust.hypotheses import seeds
 from regnf_core.robust.judgement import Evidence, gather_evidence
-from regnf_core.robust.poses import join, select
+from regnf_core.robust.poses import displacement, join, select
 from regnf_core.robust.proxy import ProxyField
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.rotations import super_fibonacci, turns_about
@@ -30,6 +29,7 @@ SCALE_FACTORS = (0.85, 1.0, 1.18)
 _REACH = 0.2  # working units round the samples that a proxy covers
 _YAW_SHARE = 10  # rotations of the full search for each turn about a given axis
 _EXTREMES = 16
+_SAME_POSE = 0.06  # object diameters
 _FEWEST = 30  # samples in front of the supports; with fewer, the supports are kept after all
 
 
@@ -58,8 +58,8 @@ class Outcome:
 
 
 def prepare(
-    scene: CountingField | SdfField,
-    obj: CountingField | SdfField,
+    scene: SdfField,
+    obj: SdfField,
     detection: OrientedBox,
     options: RobustOptions,
     generator: torch.Generator,
@@ -107,14 +107,24 @@ def refine_candidates(
         found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, found.trail if found else None)
         T = found.T
     assert found is not None
-    best = select(T, torch.tensor([0]))
-    twins = symmetry.T @ best if symmetry.T.scale.numel() else select(T, torch.tensor([], dtype=torch.long))
-    count = twins.scale.numel()
-    trail = found.trail.keep(torch.cat([torch.arange(T.scale.numel()), torch.zeros(count, dtype=torch.long)]))
+    twins = _missing_twins(T, symmetry, ex)
+    descent = torch.cat([torch.arange(T.scale.numel()), torch.zeros(twins.scale.numel(), dtype=torch.long)])
+    trail = found.trail.keep(descent)
     last = run_stage(scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail)
     evidence = gather_evidence(scene, obj, problem.A_held, problem.B_held, last.T, options)
     T_initial = last.trail.steps[0].T
     return Outcome(last, evidence, T_initial, symmetry)
+
+
+def _missing_twins(T: Sim3, symmetry: SelfSymmetry, extremes: Tensor) -> Sim3:
+    """The best pose (the first of T) turned by each of the object's symmetries, without those that T holds already."""
+    if symmetry.T.scale.numel() == 0:
+        return select(T, torch.tensor([], dtype=torch.long))
+    twins = symmetry.T @ select(T, torch.tensor([0]))
+    nearest = torch.stack(
+        [displacement(twins, select(T, torch.tensor(i)), extremes) for i in range(T.scale.numel())]
+    ).amin(0)
+    return select(twins, nearest > _SAME_POSE)
 
 
 def _rotations(options: RobustOptions) -> Tensor:
@@ -125,6 +135,3 @@ def _rotations(options: RobustOptions) -> Tensor:
 
 def _proxy(samples: Samples, spacing: float) -> ProxyField:
     return ProxyField(samples.on_surface(), samples.normals, spacing, _REACH)
-
-
-PHASES: tuple[Phase, ...] = ("sampling", "initialising", "optimising", "verifying")

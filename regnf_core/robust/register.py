@@ -24,6 +24,7 @@ from regnf_core.run import Run
 from regnf_core.sim3 import Sim3
 
 _RIVALS_APART = 0.1  # object diameters: poses closer together are one answer with its uncertainty
+_MARGIN_PER_SCORE = 0.15  # the worse the fields agree at all, the less a difference says
 _GEMAN_MCCLURE = -2.0  # as the shape of Barron's general kernel
 
 
@@ -88,7 +89,8 @@ def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) 
     evidence, poses = outcome.evidence, outcome.finalists.T
     winner = int(evidence.scores.argmin())
     ranked = distinct(poses, evidence.scores, problem.extremes, _RIVALS_APART, poses.scale.numel())
-    close = evidence.scores <= evidence.scores[winner] + options.robust.rival_margin
+    best = float(evidence.scores[winner])
+    close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
     rivals = [i for i in ranked.tolist() if i != winner and close[i]]
     decision, reason = verdict(evidence, winner, len(rivals), options.robust)
     T_work = select(poses, torch.tensor(winner))
@@ -96,7 +98,7 @@ def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) 
     alternatives = []
     for i in rivals if decision != "rejected" else []:
         other = _in_field_frames(problem, select(poses, torch.tensor(i)))
-        alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T)))
+        alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T, outcome.symmetry.axis)))
     diameter = problem.obj.frame.length
     metrics = {
         **evidence.of(winner),

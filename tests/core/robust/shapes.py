@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from regnf_core.box import OrientedBox
 from regnf_core.fields.transformed import TransformedField
@@ -51,6 +52,27 @@ def table_room(T_object_scene: Sim3) -> AnalyticField:
     return union([floor, seen_from(slab_table(), T_object_scene)])
 
 
+def can() -> AnalyticField:
+    """An upright cylinder with a narrower neck on top: every turn about z carries it onto itself, nothing else does."""
+
+    def formula(points: Tensor) -> Tensor:
+        radial = points[:, :2].square().sum(-1).add(1e-12).sqrt()
+        parts = []
+        for radius, low, high in ((0.3, -0.4, 0.2), (0.15, 0.1, 0.4)):
+            q = torch.stack([radial - radius, (points[:, 2] - (low + high) / 2).abs() - (high - low) / 2])
+            parts.append(q.clamp_min(0).square().sum(0).add(1e-20).sqrt() + q.amax(0).clamp_max(0))
+        return torch.stack(parts).amin(0)
+
+    return AnalyticField(formula, [[-0.6, -0.6, -0.6], [0.6, 0.6, 0.6]])
+
+
+def can_room() -> AnalyticField:
+    """The can standing on a floor, 0.6 of its size."""
+    T_object_scene = Sim3.from_quaternion(1.0 / 0.6, [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -0.41])
+    floor = boxes([([-1.0, -1.0, -0.06], [1.0, 1.0, 0.0])])
+    return union([floor, seen_from(can(), T_object_scene)])
+
+
 def reframed(scene_pose: Sim3, object_pose: Sim3) -> tuple[TransformedField, TransformedField, OrientedBox, Sim3]:
     """The room and the chair, each seen in another frame, with the box and the true T_object_scene there.
 
@@ -84,6 +106,8 @@ def run(
 
 __all__: Sequence[str] = (
     "ROBUST",
+    "can",
+    "can_room",
     "detection",
     "placement_error",
     "pose_distance",

@@ -13,6 +13,8 @@ from regnf_core.sim3 import Sim3
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import (
     ROBUST,
+    can,
+    can_room,
     detection,
     placement_error,
     pose_distance,
@@ -83,3 +85,11 @@ def test_the_same_seed_gives_the_same_numbers_and_the_report_is_whole() -> None:
     assert first.covariance is not None
     assert first.covariance.shape == (7, 7)
     assert (torch.linalg.eigvalsh(first.covariance) > 0).all()
+
+
+def test_a_can_has_a_free_axis_and_it_is_told() -> None:
+    result = run(can_room(), can(), OrientedBox.from_corners([-0.2, -0.2, 0.0], [0.2, 0.2, 0.5]))
+    assert result.verdict == "ambiguous"
+    free = [a.relation for a in result.alternatives if "as any turn about this axis" in a.relation]
+    assert len(free) >= 4
+    assert all("about z" in relation for relation in free)
