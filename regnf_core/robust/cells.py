@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.robust.exterior import FreeSpace
+
 _REACH = 1.15 * 0.5 * 3**0.5
 """Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""
 _TIGHTENINGS = 8
@@ -27,23 +29,35 @@ class Cells:
 
     def near(self) -> Cells:
         """The cells that may hold surface."""
-        kept = self.values.abs() <= _REACH * self.edge
-        return Cells(self.centres[kept], self.values[kept], self.edge)
+        return self[self.values.abs() <= _REACH * self.edge]
+
+    def __getitem__(self, index: Tensor) -> Cells:
+        return Cells(self.centres[index], self.values[index], self.edge)
 
     def extent(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (3,) of all cells."""
         return self.centres.amin(0) - self.edge / 2, self.centres.amax(0) + self.edge / 2
 
 
-def surface_cells(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int) -> Cells:
+def surface_cells(
+    value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int
+) -> tuple[Cells, FreeSpace]:
     """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times.
 
-    ``value`` tells the signed distance (N,) at points (N, 3). May be empty.
+    ``value`` tells the signed distance (N,) at points (N, 3). The cells may be none. With them comes what the values
+    tell of the free space, on a grid of the finest cells.
     """
-    cells = _grid(value, low, high, base).near()
-    for _ in range(levels):
-        cells = _split(value, cells).near()
-    return cells
+    cells = _grid(value, low, high, base)
+    start = cells.extent()[0]
+    finest = cells.edge / 2**levels
+    size = ((cells.extent()[1] - start) / finest).round().long().tolist()
+    space = FreeSpace(start, finest, torch.zeros(size, dtype=torch.bool))
+    for level in range(levels + 1):
+        if level > 0:
+            cells = _split(value, cells.near())
+        space.mark(cells.centres[cells.values > _REACH * cells.edge], 2 ** (levels - level))
+    space.mark(cells.centres[cells.values > 0], 1)
+    return cells.near(), space
 
 
 def tighten(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> tuple[Tensor, Tensor]:

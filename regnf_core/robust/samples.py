@@ -49,8 +49,9 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     field = WorkingField(obj, rough)
     low, high = rough.into(low).double(), rough.into(high).double()
     inner = tighten(field.value, low, high, _OBJECT_BASE)
-    cells = surface_cells(field.value, *inner, _OBJECT_BASE, _LEVELS)
+    cells, space = surface_cells(field.value, *inner, _OBJECT_BASE, _LEVELS)
     found = _settle(field, cells, limit, generator)
+    found = found[space.sees(found.points, found.normals)]
     inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
     found = found[inside]
     if len(found) < MIN_POINTS:
@@ -80,9 +81,11 @@ def sample_scene_surface(
     def value(local: Tensor) -> Tensor:
         return field.value(local.to(rotation) @ rotation.T)
 
-    cells = surface_cells(value, -half, half, _SCENE_BASE, _LEVELS)
+    cells, space = surface_cells(value, -half, half, _SCENE_BASE, _LEVELS)
     cells = Cells(cells.centres @ rotation.T, cells.values, cells.edge)
     found = _settle(field, cells, limit, generator)
+    axes = rotation.to(found.points)
+    found = found[space.sees(found.points @ axes, found.normals @ axes)]
     bounds = frame.into(scene.bounds)
     found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
     if len(found) < MIN_POINTS:
