@@ -13,16 +13,20 @@ from contextlib import contextmanager
 from pathlib import Path
 
 START_DEADLINE_S = 30
+STOP_DEADLINE_S = 30
+_LISTENING = "0A"  # in /proc/net/tcp
 
 
 @contextmanager
-def running_service(state_dir: Path) -> Iterator[str]:
+def running_service(state_dir: Path, **settings: object) -> Iterator[str]:
     """Start `regnf serve` with its state under ``state_dir``; yields its address.
 
+    ``settings`` are those of the service by name; REGNF_* of this process' environment are not passed on.
     Its log is ``state_dir``/serve.log. Raises RuntimeError when it does not listen within half a minute.
     """
     state_dir.mkdir(parents=True, exist_ok=True)
     environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    environment |= {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
     command = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir)]
     with (state_dir / "serve.log").open("w") as log:
         server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment)
@@ -30,7 +34,7 @@ def running_service(state_dir: Path) -> Iterator[str]:
         yield _address(server)
     finally:
         server.send_signal(signal.SIGTERM)
-        server.wait(timeout=30)
+        server.communicate(timeout=STOP_DEADLINE_S)
 
 
 def _address(server: subprocess.Popen[str]) -> str:
@@ -47,18 +51,22 @@ def _address(server: subprocess.Popen[str]) -> str:
 
 
 def api_process(address: str) -> int:
-    """The process that listens at the address, found through /proc (Linux)."""
+    """The API's process at the address, found through /proc (Linux).
+
+    The supervisor holds the listening socket too, so that a restart of the API drops no connection: it is passed over.
+    """
     port = int(address.rsplit(":", 1)[1])
-    inodes = {
-        line.split()[9]
+    sockets = {
+        f"socket:[{line.split()[9]}]"
         for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
-        if int(line.split()[1].split(":")[1], 16) == port and line.split()[3] == "0A"
+        if int(line.split()[1].split(":")[1], 16) == port and line.split()[3] == _LISTENING
     }
     for folder in Path("/proc").glob("[0-9]*/fd"):
         try:
-            links = [os.readlink(entry) for entry in folder.iterdir()]
-        except OSError:
+            holds = any(os.readlink(entry) in sockets for entry in folder.iterdir())
+            command = (folder.parent / "cmdline").read_bytes().decode(errors="replace").split("\0")
+        except OSError:  # another user's process, or one that has just ended
             continue
-        if any(f"socket:[{inode}]" in links for inode in inodes):
+        if holds and "regnf_cli.api_process" in command:
             return int(folder.parent.name)
-    raise RuntimeError(f"no process listens at {address}")
+    raise RuntimeError(f"no API process listens at {address}")

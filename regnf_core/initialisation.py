@@ -6,6 +6,7 @@ Both clouds are centred first. The transform found is rigid; its scale is 1, as 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -44,13 +45,22 @@ def initial_transform(
     scene_cloud = _described(scene_samples, scene_centre, options.voxel_size)
     object_cloud = _described(object_samples, object_centre, options.voxel_size)
     found: list[Sim3] = []
-    for draw in range(options.draws):
-        T_centred = _ransac_and_icp(scene_cloud, object_cloud, options, seed + _SEED_STRIDE * draw)
-        if T_centred is not None:
-            found.append(Sim3.from_translation(object_centre) @ T_centred @ Sim3.from_translation(-scene_centre))
+    with _quiet_open3d():
+        for draw in range(options.draws):
+            T_centred = _ransac_and_icp(scene_cloud, object_cloud, options, seed + _SEED_STRIDE * draw)
+            if T_centred is not None:
+                found.append(Sim3.from_translation(object_centre) @ T_centred @ Sim3.from_translation(-scene_centre))
     if not found:
         raise InitialisationError("feature matching found no transform between the two surfaces")
     return found[0] if len(found) == 1 else min(found, key=disagreement)
+
+
+def _quiet_open3d() -> AbstractContextManager[Any]:
+    """Open3D writes its warnings to standard output, which belongs to the caller."""
+    import open3d
+
+    context: AbstractContextManager[Any] = open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error)
+    return context
 
 
 def _centre(samples: SurfaceSamples) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 
 from regnf_core.agreement import disagreement, object_residuals, scene_residuals
 from regnf_core.box import OrientedBox
+from regnf_core.densify import densify
 from regnf_core.extent import surface_extent
 from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.initialisation import initial_transform
@@ -14,11 +15,12 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.result import IterationRecord, ProgressCallback, RegistrationResult
 from regnf_core.robust.register import register_robust
 from regnf_core.run import STARTS, Run
-from regnf_core.sampling import sample_object, sample_scene, thin_out
+from regnf_core.sampling import in_detection, sample_object, sample_scene, thin_out
 from regnf_core.shape import diameter
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import verify
 
+_SHOWN_SAMPLES = 10_000  # of each surface, for pictures and viewers
 _SCORING_SAMPLES = 400
 _SCORING_CAP = 0.1  # object diameters; a residual beyond it says no more than "wrong"
 
@@ -74,11 +76,19 @@ def register(
     T = refined.T_object_scene
     with run.phase("verifying"):
         verification = verify(scene, obj, detection, extent, T, options.sampling, object_diameter)
+        shown_A = densify(
+            scene,
+            scene_samples,
+            _SHOWN_SAMPLES,
+            generator,
+            lambda points: in_detection(points, detection, options.sampling),
+        )
+        shown_B = densify(obj, object_samples, _SHOWN_SAMPLES, generator, extent.contains)
         residuals = {
-            "scene_points": scene_samples.points,
-            "scene_residuals": scene_residuals(scene, obj, scene_samples.points, T),
-            "object_points": object_samples.points,
-            "object_residuals": object_residuals(scene, obj, object_samples.points, T),
+            "scene_points": shown_A.points,
+            "scene_residuals": scene_residuals(scene, obj, shown_A.points, T),
+            "object_points": shown_B.points,
+            "object_residuals": object_residuals(scene, obj, shown_B.points, T),
         }
     run.report("verifying", 1.0)
     return RegistrationResult(
@@ -86,8 +96,8 @@ def register(
         verdict_reason=verification.reason,
         T_object_scene=T,
         T_object_scene_initial=T_initial,
-        scene_samples=scene_samples,
-        object_samples=object_samples,
+        scene_samples=shown_A,
+        object_samples=shown_B,
         metrics={
             **verification.metrics,
             "object_diameter": object_diameter,

@@ -20,7 +20,7 @@ from regnf_core.tracing import clip_to_region, first_hits, shortest_step
 MIN_POINTS = 50
 _BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
-_CLEARANCE = 0.6  # a camera keeps at least this many box diagonals from the centre: outside the box, whatever its turn
+_CLEARANCE = 0.75  # a camera keeps this many box diagonals from the centre at least: outside the box, with room to see
 
 
 def sample_scene(
@@ -90,6 +90,11 @@ def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: Sa
     last = torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
     hits = first_hits(field, rays, entry, last, shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal)
     return hits.points[grown.contains(hits.points)]
+
+
+def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+    """(N,) bool: which points (N, 3) of the scene lie in the slightly grown box and above the ground."""
+    return detection.contains(points, _BOX_MARGIN) & _above_ground(points, detection, options)
 
 
 def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any, Literal
 
 import yaml
@@ -67,6 +68,16 @@ def _mend(operation: dict[str, Any]) -> None:
     if schema.get("$ref", "").endswith("/HTTPValidationError"):
         del responses["422"]
     operation["responses"] = dict(sorted(responses.items()))
+
+
+def allowed_methods(contract: dict[str, Any], path: str) -> list[str]:
+    """The methods that a path answers to, below whatever prefix; none for one the contract does not know."""
+    found = set()
+    for template, operations in contract["paths"].items():
+        pattern = re.sub(r"\\{[^}]+\\}", "[^/]+", re.escape(template))
+        if re.fullmatch(f"(/v1)?{pattern}", path):
+            found |= {method.upper() for method in operations}
+    return sorted(found)
 
 
 class _Dumper(yaml.SafeDumper):

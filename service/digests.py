@@ -6,6 +6,7 @@ import base64
 import binascii
 import re
 
+from service.body import CLOSE
 from service.problems import Problem
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -27,7 +28,7 @@ def announced_digest(header: str | None) -> str | None:
     for member in header.split(","):
         match = _MEMBER.fullmatch(member)
         if match is None:
-            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.", headers={"Connection": "close"})
+            raise Problem("INVALID_DIGEST", "Content-Digest is not sha-256=:base64:.", headers=CLOSE)
         if match.group(1) == "sha-256":
             return _decoded(match.group(2))
     return None
@@ -39,5 +40,5 @@ def _decoded(text: str) -> str:
     except binascii.Error:
         value = b""
     if len(value) != 32:
-        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.", headers={"Connection": "close"})
+        raise Problem("INVALID_DIGEST", "Content-Digest holds no SHA-256.", headers=CLOSE)
     return value.hex()

@@ -13,11 +13,11 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
 
+from service.body import CLOSE
 from service.problems import Problem
 
 _MAX_HEADER_BYTES = 4096
 _MAX_HEADERS = 8
-_CLOSE = {"Connection": "close"}
 
 
 class Sink(Protocol):
@@ -91,7 +91,7 @@ def boundary_of(request: Request) -> str:
     """The boundary that the Content-Type announces. Raises Problem MALFORMED_MULTIPART."""
     boundary = _parameter(request.headers.get("content-type", ""), "boundary")
     if not boundary or not boundary.isascii() or len(boundary) > 70:
-        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.", headers=_CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "The Content-Type names no usable boundary.", headers=CLOSE)
     return boundary
 
 
@@ -109,7 +109,7 @@ async def read_parts(
         try:
             events = collector.feed(data)
         except FormParserError as error:
-            raise Problem("MALFORMED_MULTIPART", headers=_CLOSE) from error
+            raise Problem("MALFORMED_MULTIPART", headers=CLOSE) from error
         for part, content in events:
             if content is None:
                 _admit(part, parts, files, texts)
@@ -118,21 +118,21 @@ async def read_parts(
             else:
                 _add_text(part, content, texts[part.name])
     if not collector.ended:
-        raise Problem("MALFORMED_MULTIPART", "The body ends before its closing boundary.", headers=_CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "The body ends before its closing boundary.", headers=CLOSE)
     return {name: bytes(part.text) for name, part in parts.items()}
 
 
 def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], texts: Mapping[str, int]) -> None:
     if part.name not in files and part.name not in texts:
-        raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.", headers=_CLOSE)
+        raise Problem("UNKNOWN_PART", f"Known parts: {', '.join([*files, *texts])}.", headers=CLOSE)
     if part.name in parts:
-        raise Problem("DUPLICATE_PART", headers=_CLOSE)
+        raise Problem("DUPLICATE_PART", headers=CLOSE)
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
-        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=_CLOSE)
+        raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=CLOSE)
     parts[part.name] = part
 
 
 def _add_text(part: _Part, content: bytes, limit: int) -> None:
     if len(part.text) + len(content) > limit:
-        raise Problem("REQUEST_TOO_LARGE", f"The part takes at most {limit} bytes.", headers=_CLOSE)
+        raise Problem("REQUEST_TOO_LARGE", f"The part takes at most {limit} bytes.", headers=CLOSE)
     part.text += content

@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
 from service.blobs import StorageFullError
+from service.contract import allowed_methods
 from service.reasons import REASONS
 from service.records import QueueFullError, RecordError
 
@@ -145,13 +146,15 @@ def json_instance(path: str) -> str | None:
 
 async def _answer(request: Request, error: Exception) -> JSONResponse:
     problem = problem_of(error)
-    if problem.status >= 500 and problem.reason != "QUEUE_FULL":
-        # type and place only for what callers can provoke; the whole trace for what they should never reach
-        logger.error(
-            "%s request_id=%s",
-            problem.reason,
-            getattr(request.state, "request_id", None),
-            exc_info=error if problem.reason == "INTERNAL" else None,
+    request_id = getattr(request.state, "request_id", None)
+    if problem.reason == "INTERNAL":
+        logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error)
+    elif problem.status >= 500:
+        logger.warning("%s request_id=%s: %s", problem.reason, request_id, type(error).__name__)
+    if problem.reason == "METHOD_NOT_ALLOWED":
+        # the framework names the methods of the first route that fits, not of the address
+        problem.headers["Allow"] = (
+            ", ".join(allowed_methods(request.app.openapi(), request.scope["path"])) or "GET, HEAD"
         )
     return problem_response(problem, request.scope)
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from regnf_core.cameras import axis_vector
 from regnf_core.diagnostics.splats import Floats, Surfels, View, render, view_from
+from regnf_core.nearest import gaps
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import INLIER_DISTANCE
@@ -19,7 +21,7 @@ _PANEL = 480
 _OVERSAMPLING = 2
 _CAPTION = 52
 _ELEVATION = np.radians(28.0)
-_DISC_SHARE = 1.35  # disc radius over the median distance to the nearest neighbour: closes the gaps
+_DISC_SHARE = 1.5  # disc radius over the typical gap of the cloud: closes the gaps
 _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable without telling red from green
     [[0.18, 0.20, 0.46], [0.19, 0.42, 0.56], [0.16, 0.62, 0.54], [0.53, 0.79, 0.34], [0.98, 0.88, 0.18]]
 )
@@ -34,7 +36,7 @@ def preview(result: RegistrationResult) -> Image.Image:
     direction = _best_direction(scene, up)
     edge = _PANEL * _OVERSAMPLING
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
-    radius = _DISC_SHARE * max(_spacing(scene.points), _spacing(end.points))
+    radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
     residual = _residual_surfels(result, scene, end)
     panels = [_panel(cloud, view, radius) for cloud in (Surfels.join(scene, start), Surfels.join(scene, end), residual)]
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
@@ -84,14 +86,6 @@ def _best_direction(scene: Surfels, up: Floats) -> Floats:
     shown = np.clip(scene.normals @ candidates.T, 0.0, None).sum(0)
     best: Floats = candidates[int(shown.argmax())]
     return best
-
-
-def _spacing(points: Floats) -> float:
-    """Median distance from a point to its third neighbour, which stands for the gap that a disc must bridge."""
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(points).query(points, k=min(4, len(points)))
-    return float(np.median(distance[:, -1]))
 
 
 def _panel(cloud: Surfels, view: View, radius: float) -> Image.Image:

@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 _AMBIENT = 0.45
 _STEEPEST = 0.12  # a disc seen at a grazing angle is drawn as if its normal leaned this much towards the viewer
 
+_DEPTH_STEPS = 256.0  # steps of the depth buffer a pixel
+
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -57,29 +60,40 @@ def render(surfels: Surfels, view: View, size: int, radius: float, background: F
 
     Discs turned away from the viewer are lit from behind as well, so that hollow shapes stay readable.
     """
-    seen = (surfels.points - view.centre) @ view.axes.T * view.pixels_per_unit  # x right, y up, z towards the viewer
+    seen = ((surfels.points - view.centre) @ view.axes.T * view.pixels_per_unit).astype(np.float32)  # right, up, near
     normals = surfels.normals @ view.axes.T
     normals = np.where(normals[:, 2:] < 0, -normals, normals)
-    reach = int(np.ceil(radius * view.pixels_per_unit))
-    window = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), -1).reshape(
-        -1, 2
-    )  # (W, 2)
-    column, row = seen[:, 0] + size / 2, size / 2 - seen[:, 1]
-    x = np.floor(column)[:, None] + window[None, :, 0]  # (N, W) pixels
-    y = np.floor(row)[:, None] + window[None, :, 1]
-    dx, dy = x + 0.5 - column[:, None], -(y + 0.5 - row[:, None])
-    steep = np.maximum(normals[:, 2:], _STEEPEST)
-    dz = -(normals[:, :1] * dx + normals[:, 1:2] * dy) / steep
-    inside = (
-        (dx**2 + dy**2 + dz**2 <= (radius * view.pixels_per_unit) ** 2) & (x >= 0) & (x < size) & (y >= 0) & (y < size)
-    )
-    source, _ = np.nonzero(inside)
-    depth = (seen[:, 2:] + dz)[inside]
-    order = np.argsort(depth, kind="stable")  # far to near: the nearest is written last
-    pixel = (y[inside] * size + x[inside]).astype(np.int64)[order]
+    nearest = _nearest_surfels(seen, normals.astype(np.float32), size, radius * view.pixels_per_unit)
     picture = np.broadcast_to(background, (size * size, 3)).copy()
-    picture[pixel] = (surfels.colours * _shade(normals)[:, None])[source[order]]
+    hit = nearest >= 0
+    picture[hit] = (surfels.colours * _shade(normals)[:, None])[nearest[hit]]
     return picture.reshape(size, size, 3)
+
+
+def _nearest_surfels(seen: Singles, normals: Singles, size: int, radius: float) -> NDArray[np.int64]:
+    """(size * size,) index of the disc nearest to the viewer in each pixel, -1 where there is none.
+
+    seen: (N, 3) centres, pixels from the middle · normals: (N, 3) towards the viewer · radius: pixels.
+    Works through the discs' window row by row. A pixel keeps the largest of 64-bit keys with the depth in the upper and
+    the index in the lower half, so that one maximum decides and no sorting is needed.
+    """
+    keys = np.full(size * size, -1, dtype=np.int64)
+    column, row = seen[:, :1] + size / 2, size / 2 - seen[:, 1:2]
+    slope = normals[:, :2] / np.maximum(normals[:, 2:], np.float32(_STEEPEST))
+    floor = float(seen[:, 2].min()) - radius / _STEEPEST - 1.0
+    reach = int(np.ceil(radius))
+    x = np.floor(column).astype(np.int32) + np.arange(-reach, reach + 1, dtype=np.int32)  # (N, W) pixels
+    dx = x + np.float32(0.5) - column
+    for offset in range(-reach, reach + 1):
+        y = np.floor(row).astype(np.int32) + offset  # (N, 1)
+        dy = row - y - np.float32(0.5)
+        dz = -(slope[:, :1] * dx + slope[:, 1:] * dy)
+        inside = (dx * dx + dy * dy + dz * dz <= radius * radius) & (x >= 0) & (x < size) & (y >= 0) & (y < size)
+        source = np.nonzero(inside)[0]
+        depth = ((seen[:, 2:] + dz)[inside] - floor) * _DEPTH_STEPS
+        pixel = (y * size + x)[inside]
+        np.maximum.at(keys, pixel, (depth.astype(np.int64) << 32) | source)
+    return np.where(keys >= 0, keys & 0xFFFFFFFF, -1)
 
 
 def _shade(normals: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +13,7 @@ from regnf_core.cameras import axis_vector
 from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.extremes import extreme_points
-from regnf_core.robust.finalists import LAST, STAGES, Finalists, run_stage
+from regnf_core.robust.finalists import LAST, STAGES, Finalists, Trail, run_stage
 from regnf_core.robust.hypotheses import seeds
 from regnf_core.robust.judgement import Evidence, gather_evidence
 from regnf_core.robust.poses import displacement, join, select
@@ -26,6 +27,7 @@ from regnf_core.robust.support import support
 from regnf_core.sim3 import Sim3
 
 SCALE_FACTORS = (0.85, 1.0, 1.18)
+ITERATIONS = sum(len(stage.widths) for stage in (*STAGES, LAST))
 _REACH = 0.2  # working units round the samples that a proxy covers
 _YAW_SHARE = 10  # rotations of the full search for each turn about a given axis
 _EXTREMES = 16
@@ -97,20 +99,30 @@ def find_candidates(
 
 
 def refine_candidates(
-    problem: Problem, candidates: Sim3, symmetry: SelfSymmetry, options: RobustOptions, generator: torch.Generator
+    problem: Problem,
+    candidates: Sim3,
+    symmetry: SelfSymmetry,
+    options: RobustOptions,
+    generator: torch.Generator,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Outcome:
-    """Refine on the fields, add the winner's twins under the object's symmetries, refine all that is left, judge."""
+    """Refine on the fields, add the winner's twins under the object's symmetries, refine all that is left, judge.
+
+    ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
+    """
     scene, obj, ex = problem.scene.field, problem.obj.field, problem.extremes
     found = None
     T = candidates
     for stage in STAGES:
-        found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, found.trail if found else None)
+        found = run_stage(
+            scene, obj, problem.A, problem.B, T, stage, ex, generator, found.trail if found else Trail(), on_step
+        )
         T = found.T
     assert found is not None
     twins = _missing_twins(T, symmetry, ex)
     descent = torch.cat([torch.arange(T.scale.numel()), torch.zeros(twins.scale.numel(), dtype=torch.long)])
     trail = found.trail.keep(descent)
-    last = run_stage(scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail)
+    last = run_stage(scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail, on_step)
     evidence = gather_evidence(scene, obj, problem.A_held, problem.B_held, last.T, options)
     T_initial = last.trail.steps[0].T
     return Outcome(last, evidence, T_initial, symmetry)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -13,6 +14,8 @@ from regnf_core.robust.residuals import DistanceModel, Residuals, Samples
 from regnf_core.robust.samples import some
 from regnf_core.robust.search import disagreement
 from regnf_core.sim3 import Sim3
+
+_APART = 0.03  # object diameters: candidates closer together have met in one minimum
 
 
 @dataclass(frozen=True)
@@ -88,12 +91,12 @@ def run_stage(
     stage: Stage,
     extremes: Tensor,
     generator: torch.Generator,
-    trail: Trail | None = None,
-    apart: float = 0.03,
+    trail: Trail,
+    on_step: Callable[[], None],
 ) -> Finalists:
     """Refine every pose of the batch on the stage's share of the samples, and keep the best distinct ones."""
     few_A, few_B = some(A, stage.points, generator), some(B, stage.points, generator)
-    trail = Trail(list(trail.steps)) if trail else Trail()
+    trail = Trail(list(trail.steps))
 
     def record(iteration: int, T_now: Sim3, r: Residuals, costs: Tensor) -> None:
         size = r.values.abs()
@@ -101,10 +104,11 @@ def run_stage(
         trail.steps.append(
             Step(T_now, costs, size[:, :n].mean(1), size[:, n:].mean(1), stage.widths[iteration], stage.points)
         )
+        on_step()
 
     refined = minimise(scene, obj, few_A, few_B, T, list(stage.widths), adaptive=True, on_iteration=record)
     scores = disagreement(refined.residuals, stage.score_width)
-    kept = distinct(refined.T, scores, extremes, apart, stage.keep)
+    kept = distinct(refined.T, scores, extremes, _APART, stage.keep)
     kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]
     r = refined.residuals
     chosen = Residuals(r.values[kept], r.jacobian[kept], r.cosines[kept], r.scene_count)

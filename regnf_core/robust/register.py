@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import torch
@@ -13,14 +15,14 @@ from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, IterationRecord, ProgressCallback, RegistrationResult, SurfaceSamples
 from regnf_core.robust.covariance import covariance, in_object_units
-from regnf_core.robust.engine import Outcome, Problem, find_candidates, prepare, refine_candidates
+from regnf_core.robust.engine import ITERATIONS, Outcome, Problem, find_candidates, prepare, refine_candidates
 from regnf_core.robust.finalists import LAST, Trail
 from regnf_core.robust.judgement import verdict
 from regnf_core.robust.levenberg import fitting_width
 from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.relation import relation
 from regnf_core.robust.residuals import Samples, residuals
-from regnf_core.run import Run
+from regnf_core.run import STARTS, Run
 from regnf_core.sim3 import Sim3
 
 _RIVALS_APART = 0.1  # object diameters: poses closer together are one answer with its uncertainty
@@ -49,7 +51,7 @@ def register_robust(
     with run.phase("initialising"):
         candidates, symmetry = find_candidates(problem, detection, options.robust, generator)
     with run.phase("optimising"):
-        outcome = refine_candidates(problem, candidates, symmetry, options.robust, generator)
+        outcome = refine_candidates(problem, candidates, symmetry, options.robust, generator, _steps(run))
     with run.phase("verifying"):
         ending = _conclude(problem, outcome, options)
     run.report("verifying", 1.0)
@@ -70,6 +72,13 @@ def register_robust(
         alternatives=ending.alternatives,
         covariance=ending.covariance,
     )
+
+
+def _steps(run: Run) -> Callable[[], None]:
+    """What to call after each iteration: reports the share done, and lets the caller cancel."""
+    taken = count(1)
+    span = STARTS["verifying"] - STARTS["optimising"]
+    return lambda: run.report("optimising", STARTS["optimising"] + span * next(taken) / ITERATIONS)
 
 
 @dataclass(frozen=True)
@@ -120,14 +129,14 @@ def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
 
 
 def _residuals(problem: Problem, T_work: Sim3) -> dict[str, Tensor]:
-    """Per held-out sample, as results carry them: points in their own frames, residuals in object units."""
-    A, B, size = problem.A_held, problem.B_held, problem.obj.frame.length
+    """Of every sample, as results carry them: points in their own frames, residuals in object units."""
+    A, B, size = problem.foreground, problem.obj.samples, problem.obj.frame.length
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
     r = residuals(problem.scene.field, problem.obj.field, A, B, batch)
     return {
-        "scene_points": problem.scene.frame.out_of(A.points).float(),
+        "scene_points": problem.scene.frame.out_of(A.on_surface()).float(),
         "scene_residuals": r.values[0, : r.scene_count] * size,
-        "object_points": problem.obj.frame.out_of(B.points).float(),
+        "object_points": problem.obj.frame.out_of(B.on_surface()).float(),
         "object_residuals": r.values[0, r.scene_count :] * size,
     }
 

@@ -78,7 +78,7 @@ async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
     "/openapi.yaml",
     summary="This contract",
     response_class=Response,
-    responses={200: {"content": {"application/yaml": {"schema": {"type": "string"}}}}},
+    responses={200: {"content": {"application/yaml": {"schema": {"type": "object"}}}}},
 )
 async def openapi_yaml(request: Request) -> Response:
     return Response(contract_yaml(request.app), media_type="application/yaml")

@@ -96,7 +96,11 @@ async def register(
     dry_run: Annotated[bool, Query(description="Check everything, start nothing.")] = False,
     prefer: Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")] = None,
     idempotency_key: Annotated[
-        str | None, Header(description="Kept for 24 hours: the same key with another request is refused.")
+        str | None,
+        Header(
+            description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
+            json_schema_extra={"minLength": 1, "maxLength": 255},
+        ),
     ] = None,
 ) -> JSONResponse:
     """The same request twice is one job: its id follows from what is asked. A job that failed is started anew."""

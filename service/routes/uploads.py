@@ -48,7 +48,7 @@ async def put_field(
     request: Request,
     services: ServicesDep,
     prefix: PrefixDep,
-    sha256: Annotated[str, Path(description="SHA-256 of the file, 64 lower-case hexadecimal digits.")],
+    sha256: Annotated[str, Path(description="SHA-256 of the file.", json_schema_extra={"pattern": "^[0-9a-f]{64}$"})],
     content_digest: Annotated[str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.")] = None,
 ) -> JSONResponse:
     """The file's bytes as they are: an archive of torch.save, or safetensors. Repeat it freely: 200 when held."""

@@ -178,9 +178,7 @@ def raw_call(app: Any, messages: list[dict[str, Any]], headers: list[tuple[bytes
 
 def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any) -> None:
     slow = make_world(tmp_path, upload_stall_s=0.05)
-    status, problem = raw_call(
-        slow.client._transport._inner.app, [{"type": "http.request", "body": GOOD[:100], "more_body": True}]
-    )
+    status, problem = raw_call(slow.app, [{"type": "http.request", "body": GOOD[:100], "more_body": True}])
     assert (status, problem["reason"]) == (408, "UPLOAD_STALLED")
     assert slow.blobs.blobs == {}
     slow.client.close()
@@ -191,10 +189,13 @@ def test_aborted_uploads_leave_nothing(tmp_path: Any) -> None:
 
     world = make_world(tmp_path)
     store = LocalBlobStore(tmp_path / "blobs")
-    object.__setattr__(world.client._transport._inner.app.state.services, "blobs", store)
-    messages = [{"type": "http.request", "body": GOOD[:300], "more_body": True}, {"type": "http.disconnect"}]
+    object.__setattr__(world.app.state.services, "blobs", store)
+    messages: list[dict[str, Any]] = [
+        {"type": "http.request", "body": GOOD[:300], "more_body": True},
+        {"type": "http.disconnect"},
+    ]
     for _ in range(50):
-        status, problem = raw_call(world.client._transport._inner.app, messages)
+        status, problem = raw_call(world.app, messages)
         assert (status, problem["reason"]) == (400, "UPLOAD_INCOMPLETE")
     assert [path for path in (tmp_path / "blobs").rglob("*") if path.is_file()] == []
     world.client.close()

@@ -5,6 +5,10 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from pathlib import Path
+from typing import Any
+
+import httpx
 
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
@@ -60,7 +64,7 @@ def test_post_computes_the_digest(world: World) -> None:
 
 def test_post_takes_a_description_beside_the_file(world: World) -> None:
     said = {"family": "neus-facto", "level_mask": 8, "hash": {"features_per_level": 2}, "label": "room"}
-    files = {"file": ("room.ckpt", A), "description": (None, json.dumps(said), "application/json")}
+    files: dict[str, Any] = {"file": ("room.ckpt", A), "description": (None, json.dumps(said), "application/json")}
     answer = world.client.post("/fields", files=files)
     assert answer.status_code == 201, answer.text
     assert (answer.json()["label"], answer.json()["description"]) == (
@@ -71,7 +75,7 @@ def test_post_takes_a_description_beside_the_file(world: World) -> None:
 
 
 def test_bytes_held_as_another_function_are_not_silently_that_one(world: World) -> None:
-    def post(said: dict[str, object]) -> object:
+    def post(said: dict[str, object]) -> httpx.Response:
         return world.client.post("/fields", files={"file": ("a", A), "description": (None, json.dumps(said))})
 
     assert post({"level_mask": 8}).status_code == 201
@@ -129,7 +133,7 @@ def test_v1_is_the_same_service(world: World) -> None:
     assert world.client.get(f"/fields/{sha256(A)}").json()["links"]["self"] == f"/fields/{sha256(A)}"
 
 
-def test_uploads_far_larger_than_a_block_arrive_whole(tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_uploads_far_larger_than_a_block_arrive_whole(tmp_path: Path) -> None:
     world = make_world(tmp_path, max_upload_bytes=8 << 20)
     data = field_bytes("large", 3 * (1 << 20) + 17)
     pieces = (data[start : start + 65_521] for start in range(0, len(data), 65_521))

@@ -47,8 +47,7 @@ def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
     spellings = [
         request | {"detection": box},
         request | {"detection": {"min": [-0.5, -0.25, 0.0], "max": [0.5, 0.75, 1.0]}, "seed": 0},
-        request
-        | {"scene": {"field": request["scene"]}, "detection": box | {"rotation_quaternion_xyzw": [0, 0, 0, -3]}},
+        request | {"scene": {"field": request["scene"]}, "detection": turned},
         request | {"detection": box | {"label": None}, "options": {"optimisation": {"iterations": 200}}},
     ]
     assert len({world.client.post("/register", json=body).json()["id"] for body in spellings}) == 1
@@ -176,7 +175,10 @@ def test_one_shot_keeps_nothing_of_a_request_that_is_refused(world: World) -> No
     question = {"detection": BOX, "options": {"unknown": 1}}
     answer = world.client.post("/register", files=one_shot(field_bytes("one"), field_bytes("two"), question))
     assert_refused(answer, 422, "INVALID_OPTIONS")
-    missing = {"scene": ("scene", field_bytes("one")), "request": (None, json.dumps({"detection": BOX}))}
+    missing: dict[str, Any] = {
+        "scene": ("scene", field_bytes("one")),
+        "request": (None, json.dumps({"detection": BOX})),
+    }
     assert_refused(world.client.post("/register", files=missing), 400, "MISSING_PART")
     assert world.blobs.blobs == {}
     assert world.records.list_fields(None, 10, None) == []

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from fastapi import FastAPI
 
 from service.app import create_app
 from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
@@ -55,6 +56,7 @@ class World:
     records: InMemoryRecordStore
     blobs: InMemoryBlobStore
     queue: InMemoryJobQueue
+    app: FastAPI
     client: httpx.Client
 
     def ready_field(self, name: str, bounds: list[list[float]] | None = None) -> str:
@@ -118,7 +120,7 @@ def make_world(folder: Path, **settings: Any) -> World:
     chosen = Settings(**(usual | settings))
     records, blobs, queue = InMemoryRecordStore(chosen.retention_s), InMemoryBlobStore(), InMemoryJobQueue()
     app = create_app(chosen, records, blobs, queue)
-    return World(chosen, records, blobs, queue, client_of(app))
+    return World(chosen, records, blobs, queue, app, client_of(app))
 
 
 def assert_refused(answer: httpx.Response, status: int, reason: str) -> dict[str, Any]:

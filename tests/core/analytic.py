@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from regnf_core.box import OrientedBox
 from regnf_core.sim3 import Sim3
 
 
@@ -133,3 +134,10 @@ def chair_pose(scale: float = 1.25, yaw: float = 0.6) -> Sim3:
     turned = Sim3.from_quaternion(scale, quaternion, [0.0, 0.0, 0.0])
     place = torch.tensor([[-0.2, -0.15, 0.0]], dtype=torch.float64)
     return Sim3(turned.scale, turned.rotation, foot - turned.apply(place)[0])
+
+
+def chair_box(T_object_scene: Sim3) -> OrientedBox:
+    """The axis-aligned detection of the chair in the scene."""
+    corners = torch.cartesian_prod(*(torch.tensor(pair) for pair in ([-0.24, 0.3], [-0.25, 0.25], [-0.4, 0.42])))
+    placed = T_object_scene.inverse().apply(corners.double())
+    return OrientedBox.from_corners(placed.amin(0).tolist(), placed.amax(0).tolist())

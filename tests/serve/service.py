@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
 
+from regnf_cli.service_errors import ServiceError
+from regnf_cli.state_lock import StateLock
 from tests.worker.bench import alive, eventually
 
 DEADLINE_S = 40.0
@@ -78,10 +81,17 @@ class Service:
         return not any(alive(pid) for pid in self.seen)
 
     def end(self) -> None:
-        self.process.kill()
-        self.process.wait()
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        """In good order if it still can; what a killed one left behind goes as the next start would have it."""
+        self.process.terminate()
+        try:
+            self.process.wait(DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        with suppress(ServiceError), StateLock(self.state_dir):
+            pass
 
 
 def environment(**settings: object) -> dict[str, str]:

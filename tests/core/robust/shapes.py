@@ -13,18 +13,14 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.result import RegistrationResult
 from regnf_core.sim3 import Sim3
-from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, seen_from, union
+from tests.core.analytic import AnalyticField, boxes, chair, chair_box, chair_pose, room, seen_from, union
 
 ROBUST = RegistrationOptions(preset="robust")
 
 
 def detection() -> OrientedBox:
-    """The box of the room's chair in the pose ``chair_pose()``, with a little air."""
-    corners = torch.cartesian_prod(
-        torch.tensor([-0.24, 0.30]), torch.tensor([-0.25, 0.25]), torch.tensor([-0.40, 0.42])
-    ).double()
-    seen = chair_pose().inverse().apply(corners)
-    return OrientedBox.from_corners(seen.amin(0).tolist(), seen.amax(0).tolist())
+    """The box of the room's chair in the pose ``chair_pose()``."""
+    return chair_box(chair_pose())
 
 
 def random_pose(seed: int, scale: float) -> Sim3:

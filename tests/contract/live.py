@@ -1,0 +1,112 @@
+"""The real thing: a private Redis, a worker process, and the application under uvicorn, all ended afterwards."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import httpx
+
+from tests.redis_server import private_redis
+
+DEADLINE_S = 60.0
+MAX_UPLOAD = 128 << 20
+_Value = TypeVar("_Value")
+
+
+def eventually(look: Callable[[], _Value | None], what: str, deadline_s: float = DEADLINE_S) -> _Value:
+    """What ``look`` returns once that is truthy. Fails after the deadline."""
+    end = time.monotonic() + deadline_s
+    while not (value := look()):
+        assert time.monotonic() < end, f"{what} did not come about within {deadline_s} s"
+        time.sleep(0.05)
+    return value
+
+
+@dataclass
+class Live:
+    """A running service: its address, its folder and the API's process."""
+
+    port: int
+    folder: Path
+    api: subprocess.Popen[bytes]
+    worker: subprocess.Popen[bytes] | None
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def client(self) -> httpx.Client:
+        return httpx.Client(base_url=self.address, timeout=60)
+
+    def connect(self) -> socket.socket:
+        """A bare connection, for clients that misbehave."""
+        return socket.create_connection(("127.0.0.1", self.port), timeout=DEADLINE_S)
+
+    def peak_memory(self) -> int:
+        """The most memory the API's process has ever held, bytes."""
+        lines = Path(f"/proc/{self.api.pid}/status").read_text().splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+
+    def files(self) -> set[str]:
+        """Every file in the blob store, unfinished ones included."""
+        root = self.folder / "blobs"
+        return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+
+    def log(self) -> str:
+        return "\n".join(path.read_text() for path in sorted(self.folder.glob("*.log")))
+
+
+@contextmanager
+def live_service(folder: Path, with_worker: bool = True, **settings: object) -> Iterator[Live]:
+    """Start everything; the API answers once this yields, and is ready if it has a worker."""
+    with private_redis() as redis_url, socket.create_server(("127.0.0.1", 0)) as listener:
+        plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+        usual = {"redis_url": redis_url, "state_dir": folder, "max_upload_bytes": MAX_UPLOAD, "device": "cpu"}
+        environment = plain | {f"REGNF_{name.upper()}": str(value) for name, value in (usual | settings).items()}
+        command = ["regnf_cli.api_process", str(listener.fileno())]
+        with _process(folder, "api", command, environment, listener.fileno()) as api:
+            if not with_worker:
+                live = Live(listener.getsockname()[1], folder, api, None)
+                eventually(lambda: _status(live, "/healthz") == 200, f"the API; {live.log()}")
+                yield live
+                return
+            with _process(folder, "worker", ["worker.main"], environment) as worker:
+                live = Live(listener.getsockname()[1], folder, api, worker)
+                eventually(lambda: _status(live, "/readyz") == 200, f"readiness; {live.log()}")
+                yield live
+
+
+@contextmanager
+def _process(
+    folder: Path, name: str, module: list[str], environment: dict[str, str], *passed: int
+) -> Iterator[subprocess.Popen[bytes]]:
+    with (folder / f"{name}.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *module], env=environment, stdout=log, stderr=log, pass_fds=passed
+        )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _status(live: Live, path: str) -> int:
+    try:
+        return httpx.get(live.address + path, timeout=5).status_code
+    except httpx.TransportError:
+        assert live.api.poll() is None, live.log()
+        return 0

@@ -1,0 +1,53 @@
+"""Tokens: with any configured, every call but the probe and the page's own files needs one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.contract.world import NOBODY, World, assert_refused, make_world
+
+TOKENS = frozenset({"first-token", "second-token"})
+CALLS = [
+    ("GET", "/"), ("GET", "/readyz"), ("GET", "/version"), ("GET", "/openapi.yaml"), ("GET", "/docs"),
+    ("GET", "/jobs"), ("GET", f"/jobs/{NOBODY}"), ("GET", f"/jobs/{NOBODY}/events"), ("GET", f"/jobs/{NOBODY}/result"),
+    ("GET", f"/jobs/{NOBODY}/artifacts/trace.json"), ("POST", f"/jobs/{NOBODY}/cancel"), ("DELETE", f"/jobs/{NOBODY}"),
+    ("POST", "/register"), ("GET", "/fields"), ("POST", "/fields"), ("PUT", f"/fields/{NOBODY * 2}"),
+    ("GET", f"/fields/{NOBODY * 2}"), ("DELETE", f"/fields/{NOBODY * 2}"), ("GET", "/v1/jobs"), ("GET", "/nowhere"),
+    ("POST", f"/jobs/{NOBODY}/view"), ("GET", f"/jobs/{NOBODY}/view/x"),
+]  # fmt: skip
+
+
+@pytest.fixture
+def guarded(tmp_path: Path) -> Iterator[World]:
+    made = make_world(tmp_path, api_tokens=TOKENS)
+    with made.client:
+        yield made
+
+
+@pytest.mark.parametrize(("method", "path"), CALLS)
+def test_without_a_token(guarded: World, method: str, path: str) -> None:
+    answer = guarded.client.request(method, path)
+    assert_refused(answer, 401, "UNAUTHENTICATED")
+    assert answer.headers["www-authenticate"].startswith("Bearer")
+
+
+@pytest.mark.parametrize(
+    "given", ["", "Bearer", "Bearer ", "Bearer third-token", "Bearer first-token2", "Basic first-token", "first-token"]
+)
+def test_with_a_wrong_token(guarded: World, given: str) -> None:
+    assert_refused(guarded.client.get("/jobs", headers={"Authorization": given}), 401, "UNAUTHENTICATED")
+
+
+@pytest.mark.parametrize("given", ["Bearer first-token", "bearer second-token"])
+def test_with_a_good_token(guarded: World, given: str) -> None:
+    assert guarded.client.get("/jobs", headers={"Authorization": given}).status_code == 200
+
+
+def test_the_probe_and_the_page_are_open_and_tell_nothing(guarded: World) -> None:
+    assert guarded.client.get("/healthz").json() == {"status": "ok"}
+    page = guarded.client.get(f"/jobs/{NOBODY}/view")
+    assert (page.status_code, page.headers["content-type"]) == (200, "text/html; charset=utf-8")
+    assert guarded.client.get("/static/js/app.js").status_code == 200

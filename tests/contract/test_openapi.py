@@ -1,0 +1,136 @@
+"""openapi.yaml is what the service does: same text, true examples, known reasons, valid answers."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
+
+from service.reasons import REASONS
+from service.routes.examples import OBJECT, REGISTER_EXAMPLES, SCENE
+from tests.contract.world import World
+
+ROOT = Path(__file__).resolve().parents[2]
+CONTRACT: dict[str, Any] = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
+
+
+def operations() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    for path, methods in CONTRACT["paths"].items():
+        for method, operation in methods.items():
+            yield method, path, operation
+
+
+def test_the_committed_contract_is_the_one_that_is_served(world: World) -> None:
+    committed = (ROOT / "openapi.yaml").read_text(encoding="utf-8")
+    hint = "run scripts/write_openapi.py"
+    assert world.client.get("/openapi.yaml").text == committed, hint
+
+
+def test_the_script_writes_what_is_committed() -> None:
+    spec = importlib.util.spec_from_file_location("write_openapi", ROOT / "scripts" / "write_openapi.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    assert script.current_contract() == script.TARGET.read_text(encoding="utf-8")
+
+
+def test_every_reference_leads_somewhere() -> None:
+    text = (ROOT / "openapi.yaml").read_text(encoding="utf-8")
+    named = set(re.findall(r"#/components/schemas/(\w+)", text))
+    assert named <= set(CONTRACT["components"]["schemas"])
+
+
+def test_every_refusal_is_in_the_table_of_reasons() -> None:
+    for method, path, operation in operations():
+        for status, answer in operation["responses"].items():
+            if "application/problem+json" in answer.get("content", {}):
+                reasons = re.findall(r"`([A-Z_]+)`", answer["description"])
+                assert reasons, (method, path, status)
+                assert {REASONS[reason].status for reason in reasons} == {int(status)}, (method, path)
+
+
+def examples() -> list[Any]:
+    found = []
+    for method, path, operation in operations():
+        for kind, content in operation.get("requestBody", {}).get("content", {}).items():
+            for name, example in content.get("examples", {}).items():
+                found.append(pytest.param(method, path, kind, example["value"], id=f"{method}-{path}-{name}"))
+    return found
+
+
+def test_there_are_examples() -> None:
+    assert len(examples()) == len(REGISTER_EXAMPLES)
+
+
+def register_example_fields(world: World) -> None:
+    """Fields under the hashes that the examples name."""
+    from service.records import FieldRecord
+
+    now = world.records.now()
+    for sha in (SCENE, OBJECT):
+        world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
+        world.records.update_field(sha, attempt=1, state="ready", report={"bounds": [[-1, -1, -1], [1, 1, 1]]})
+
+
+@pytest.mark.parametrize(("method", "path", "kind", "value"), examples())
+def test_every_example_is_accepted(world: World, method: str, path: str, kind: str, value: Any) -> None:
+    assert kind == "application/json"
+    register_example_fields(world)
+    answer = world.client.request(method, path, json=value)
+    assert answer.status_code == 202, answer.text
+    validator("RegisterRequest").validate(value)
+
+
+def validator(name: str) -> Draft202012Validator:
+    return Draft202012Validator({"$ref": f"#/components/schemas/{name}", "components": CONTRACT["components"]})
+
+
+def test_answers_are_valid_by_the_contract(world: World) -> None:
+    job_id = world.submit()
+    scene = world.valid_request()["scene"]
+    for path, schema in [
+        ("/", "IndexDocument"),
+        ("/healthz", "HealthDocument"),
+        ("/readyz", "ReadyDocument"),
+        ("/version", "VersionDocument"),
+        ("/fields", "FieldPage"),
+        (f"/fields/{scene}", "FieldDocument"),
+        ("/jobs", "JobPage"),
+        (f"/jobs/{job_id}", "JobDocument"),
+        (f"/jobs/{job_id}/result", "ProblemDocument"),
+        ("/nowhere", "ProblemDocument"),
+    ]:
+        validator(schema).validate(world.client.get(path).json())
+    world.succeed(job_id)
+    validator("JobDocument").validate(world.client.get(f"/jobs/{job_id}").json())
+    validator("ResultDocument").validate(world.client.get(f"/jobs/{job_id}/result").json())
+    dry = world.client.post("/register?dry_run=true", json=world.valid_request())
+    validator("DryRunDocument").validate(dry.json())
+
+
+def test_bad_requests_are_bad_by_the_contract_too() -> None:
+    good = REGISTER_EXAMPLES["shortest"]["value"]
+    validator("RegisterRequest").validate(good)
+    changes: list[dict[str, Any]] = [
+        {"seed": -1},
+        {"unknown": 1},
+        {"scene": "x"},
+        {"detection": {}},
+        {"options": {"unknown": 1}},
+    ]
+    for change in changes:
+        assert list(validator("RegisterRequest").iter_errors(good | change)), change
+
+
+def test_the_documents_list_every_reason_and_address() -> None:
+    errors = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
+    assert [reason for reason in REASONS if f"`{reason}`" not in errors] == []
+    api = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert [path for _, path, _ in operations() if f"`{path}`" not in api and f" {path}`" not in api] == []

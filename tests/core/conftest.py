@@ -1,0 +1,45 @@
+"""One registration of the analytic chair, shared by the tests that look at its result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from regnf_core.box import OrientedBox
+from regnf_core.options import RegistrationOptions
+from regnf_core.registration import register
+from regnf_core.result import RegistrationResult
+from regnf_core.sim3 import Sim3
+from tests.core.analytic import chair, chair_box, chair_pose, room
+
+QUICK = {
+    "sampling": {"pixel_stride": 12},
+    "optimisation": {"iterations": 120, "samples_per_iteration": 800},
+    "resampling": {"max_samples": 2000},
+}
+"""Options that keep a test's registration to a few seconds."""
+
+
+@dataclass(frozen=True)
+class ChairRun:
+    """A finished registration with everything that went into it."""
+
+    truth: Sim3
+    detection: OrientedBox
+    result: RegistrationResult
+
+
+@pytest.fixture(scope="session")
+def chair_run() -> ChairRun:
+    """The chair at scale 1.25 in the room, registered with QUICK options and seed 1."""
+    truth = chair_pose(1.25)
+    detection = chair_box(truth)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        result = register(room(truth), chair(), detection, RegistrationOptions.from_dict(QUICK), seed=1)
+    finally:
+        torch.set_num_threads(threads)
+    return ChairRun(truth, detection, result)

@@ -1,0 +1,198 @@
+"""Whole registrations: the analytic chair at scale 1.25, wrong objects, seeds, progress, cancelling."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from regnf_core.box import OrientedBox
+from regnf_core.errors import CancelledError, InitialisationError, InvalidInputError
+from regnf_core.metrics import errors_against_truth
+from regnf_core.options import OptimisationOptions, RegistrationOptions
+from regnf_core.registration import register
+from regnf_core.result import Phase
+from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
+from tests.core.conftest import QUICK, ChairRun
+
+OPTIONS = RegistrationOptions.from_dict(QUICK)
+BRIEF = replace(OPTIONS, optimisation=OptimisationOptions(iterations=12, samples_per_iteration=200))
+
+
+def test_the_chair_is_registered(chair_run: ChairRun) -> None:
+    result = chair_run.result
+    assert (result.verdict, result.verdict_reason) == ("registered", "SURFACES_AGREE")
+    errors = errors_against_truth(result.T_object_scene, chair_run.truth, result.object_samples.points)
+    assert errors["rotation_error_rad"] < 0.02
+    assert errors["translation_error_share"] < 0.02
+    assert errors["scale_error_share"] < 0.02
+    assert errors["mssd_share"] < 0.03
+
+
+def test_the_result_is_complete(chair_run: ChairRun) -> None:
+    result = chair_run.result
+    names = {"residual_rms", "inlier_share_scene", "inlier_share_object", "iterations", "field_evaluations"}
+    phases = {f"seconds_{phase}" for phase in ("sampling", "initialising", "optimising", "verifying")}
+    assert names | phases <= set(result.metrics)
+    assert result.seed == 1
+    assert result.options == OPTIONS.to_dict()
+    assert float(result.T_object_scene_initial.scale) == pytest.approx(1.0, abs=1e-9)
+    assert [record.iteration for record in result.trace] == list(range(len(result.trace)))
+    assert len(result.residuals["scene_points"]) == len(result.residuals["scene_residuals"])
+    assert len(result.residuals["object_points"]) == len(result.residuals["object_residuals"])
+
+
+def test_the_trace_keeps_each_iterations_transform(chair_run: ChairRun) -> None:
+    trace = chair_run.result.trace
+    torch.testing.assert_close(
+        trace[0].T_object_scene.matrix(), chair_run.result.T_object_scene_initial.matrix(), rtol=0, atol=1e-9
+    )
+    scales = torch.stack([record.T_object_scene.scale for record in trace])
+    assert float(scales[0]) == pytest.approx(1.0)
+    assert float(scales[-1]) == pytest.approx(1.25, rel=0.02)
+    assert float((scales[1:] - scales[:-1]).abs().max()) < 0.02  # Adam's steps are about the rate, 0.01
+
+
+def test_field_evaluations_are_counted() -> None:
+    counts: list[int] = []
+
+    class Recording(AnalyticField):
+        def signed_distance(self, points: torch.Tensor) -> torch.Tensor:
+            counts.append(len(points))
+            return super().signed_distance(points)
+
+        def signed_distance_and_gradient(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            counts.append(len(points))
+            return super().signed_distance_and_gradient(points)
+
+    T = chair_pose()
+    scene, obj = room(T), chair()
+    recorded = Recording(scene.formula, scene.bounds.tolist()), Recording(obj.formula, obj.bounds.tolist())
+    result = register(*recorded, chair_box(T), BRIEF)
+    assert result.metrics["field_evaluations"] == sum(counts)
+
+
+def test_progress_names_the_phases_in_order_and_never_falls() -> None:
+    T = chair_pose()
+    seen: list[tuple[Phase, float]] = []
+    register(room(T), chair(), chair_box(T), BRIEF, progress=lambda phase, done: seen.append((phase, done)))
+    assert list(dict.fromkeys(phase for phase, _ in seen)) == ["sampling", "initialising", "optimising", "verifying"]
+    shares = [done for _, done in seen]
+    assert shares == sorted(shares)
+    assert (shares[0], shares[-1]) == (0.0, 1.0)
+    assert sum(phase == "optimising" for phase, _ in seen) >= 12
+
+
+def test_a_progress_callback_may_cancel() -> None:
+    T = chair_pose()
+    iterations = 0
+
+    def stop(phase: Phase, done: float) -> None:
+        nonlocal iterations
+        iterations += phase == "optimising"
+        if iterations > 3:
+            raise CancelledError("enough")
+
+    with pytest.raises(CancelledError):
+        register(room(T), chair(), chair_box(T), BRIEF, progress=stop)
+    assert iterations == 4
+
+
+def test_a_wrong_object_is_never_registered() -> None:
+    T = chair_pose()
+    result = register(room(T), table(), chair_box(T), OPTIONS)
+    assert result.verdict == "rejected"
+    assert result.verdict_reason in {"LOW_OVERLAP", "LARGE_RESIDUAL"}
+
+
+def test_a_ball_offers_no_features_to_match() -> None:
+    T = chair_pose()
+    with pytest.raises(InitialisationError):
+        register(room(T), sphere(0.35), chair_box(T), OPTIONS)
+
+
+def test_the_same_seed_gives_the_same_result() -> None:
+    T = chair_pose()
+    first, again = (register(room(T), chair(), chair_box(T), BRIEF, seed=7) for _ in range(2))
+    assert torch.equal(first.T_object_scene.matrix(), again.T_object_scene.matrix())
+    assert torch.equal(first.residuals["scene_points"], again.residuals["scene_points"])
+
+
+_OTHER_PROCESS = """
+import torch
+torch.set_num_threads(1)
+from tests.core.analytic import chair, chair_box, chair_pose, room
+from tests.core.test_registration import BRIEF
+from regnf_core.registration import register
+T = chair_pose()
+result = register(room(T), chair(), chair_box(T), BRIEF, seed=7)
+print(result.T_object_scene.matrix().numpy().tobytes().hex())
+"""
+
+
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_result_in_another_process() -> None:
+    root = Path(__file__).resolve().parents[2]
+    printed = [
+        subprocess.run(
+            [sys.executable, "-c", _OTHER_PROCESS], cwd=root, capture_output=True, text=True, check=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert len(printed[0]) > 200
+    assert printed[0] == printed[1]
+
+
+def test_it_stops_early_once_the_residuals_are_small() -> None:
+    T = chair_pose(scale=1.0)
+    options = RegistrationOptions.from_dict({**QUICK, "optimisation": {"stop_residual": 0.01}})
+    result = register(room(T), chair(), chair_box(T), options, seed=1)
+    assert result.metrics["converged"] == 1.0
+    last = result.trace[-1]
+    assert len(result.trace) < 200
+    assert max(last.residual_scene, last.residual_object) <= 0.01
+    torch.testing.assert_close(result.T_object_scene.matrix(), last.T_object_scene.matrix())
+
+
+def test_a_field_that_breaks_down_on_the_way_is_reported() -> None:
+    T = chair_pose()
+    calls = 0
+    scene = room(T)
+
+    def late(points: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        value = scene.formula(points)
+        return value * torch.nan if calls > 60 else value
+
+    with pytest.raises(InvalidInputError) as caught:
+        register(AnalyticField(late, scene.bounds.tolist()), chair(), chair_box(T), OPTIONS)
+    assert caught.value.reason == "FIELD_NOT_FINITE"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [0.8, 1.25])
+def test_golden_chair_with_published_options(scale: float) -> None:
+    T = chair_pose(scale)
+    result = register(room(T), chair(), chair_box(T), seed=2)
+    errors = errors_against_truth(result.T_object_scene, T, result.object_samples.points)
+    assert result.verdict == "registered"
+    assert errors["rotation_error_rad"] < 0.03
+    assert errors["translation_error_share"] < 0.03
+    assert errors["scale_error_share"] < 0.02
+
+
+def test_an_oriented_detection_serves_as_well_as_an_upright_one() -> None:
+    T = chair_pose(1.0, yaw=0.6)
+    back = T.inverse()
+    box = OrientedBox(
+        back.apply(torch.tensor([[0.03, 0.0, 0.01]], dtype=torch.float64))[0],
+        torch.tensor([0.56, 0.52, 0.84], dtype=torch.float64),
+        back.rotation,
+    )
+    result = register(room(T), chair(), box, OPTIONS, seed=1)
+    assert result.verdict == "registered"

@@ -1,0 +1,56 @@
+"""The application as a whole: what it loads, what it needs, and how it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.app import ConfigurationError, create_app
+from service.settings import Settings
+from service.shutdown import stopping_on_signals
+from service.waiting import pause, wait_for
+
+
+def test_the_application_loads_neither_torch_nor_open3d() -> None:
+    code = "import sys, service.app; sys.exit(' '.join({'torch', 'open3d', 'worker', 'numpy'} & set(sys.modules)) or 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_it_says_what_it_needs(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="REGNF_REDIS_URL"):
+        create_app(Settings(state_dir=tmp_path, redis_url=None))
+
+
+def test_signals_end_long_answers_and_reach_the_server_too() -> None:
+    heard: list[int] = []
+
+    async def run() -> bool:
+        stopping = asyncio.Event()
+        with stopping_on_signals(stopping):
+            os.kill(os.getpid(), signal.SIGTERM)
+            return await pause(20.0, stopping)
+
+    before = signal.signal(signal.SIGTERM, lambda number, _: heard.append(number))
+    try:
+        assert asyncio.run(run()) is True
+        assert heard == [signal.SIGTERM]
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert heard == [signal.SIGTERM] * 2
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_waiting_ends_when_the_service_stops() -> None:
+    async def run() -> int:
+        stopping = asyncio.Event()
+        asyncio.get_running_loop().call_later(0.05, stopping.set)
+        return await wait_for(lambda: 1, lambda _: False, 60.0, stopping)
+
+    assert asyncio.run(asyncio.wait_for(run(), 20)) == 1
