@@ -32,17 +32,20 @@ def register(
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
+    T_object_scene_start: Sim3 | None = None,
 ) -> RegistrationResult:
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
     raise CancelledError. Deterministic for a seed, on one machine and with the same number of
     threads. What follows is the preset `paper`; the preset `robust` has an engine of its own, regnf_core.robust.
+    ``T_object_scene_start``, for the preset `robust` alone, is where to look first; everything else is searched only if
+    that fails.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()
     if options.preset == "robust":
-        return register_robust(scene, obj, detection, options, seed, progress)
+        return register_robust(scene, obj, detection, options, seed, progress, T_object_scene_start)
     run = Run(progress)
     scene, obj = CountingField(scene), CountingField(obj)
     generator = torch.Generator().manual_seed(seed)

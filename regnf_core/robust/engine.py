@@ -14,7 +14,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.extremes import extreme_points
 from regnf_core.robust.finalists import LAST, STAGES, Finalists, Trail, run_stage
-from regnf_core.robust.hypotheses import seeds
+from regnf_core.robust.hypotheses import seeds, seeds_about
 from regnf_core.robust.judgement import Evidence, gather_evidence
 from regnf_core.robust.poses import displacement, join, select
 from regnf_core.robust.proxy import ProxyField
@@ -31,6 +31,7 @@ ITERATIONS = sum(len(stage.widths) for stage in (*STAGES, LAST))
 _REACH = 0.2  # working units round the samples that a proxy covers
 _YAW_SHARE = 10  # rotations of the full search for each turn about a given axis
 _EXTREMES = 16
+_WARM_SEEDS = 63
 _SAME_POSE = 0.06  # object diameters
 _FEWEST = 30  # samples in front of the supports; with fewer, the supports are kept after all
 
@@ -79,21 +80,31 @@ def prepare(
 
 
 def find_candidates(
-    problem: Problem, detection: OrientedBox, options: RobustOptions, generator: torch.Generator
+    problem: Problem,
+    detection: OrientedBox,
+    options: RobustOptions,
+    generator: torch.Generator,
+    T_start: Sim3 | None = None,
 ) -> tuple[Sim3, SelfSymmetry]:
-    """Candidate poses (H,), best first, and the object's own symmetries, from the samples alone."""
+    """Candidate poses (H,), best first, and the object's own symmetries, from the samples alone.
+
+    With ``T_start``, a single pose in working frames, only its neighbourhood is searched.
+    """
     rotations = _rotations(options)
     obj_samples = problem.obj.samples
     scene_proxy = _proxy(problem.foreground, problem.scene.spacing)
     object_proxy = _proxy(obj_samples, problem.obj.spacing)
-    T = seeds(
-        problem.foreground.on_surface(),
-        obj_samples.on_surface(),
-        detection.rotation,
-        detection.size / detection.diagonal,
-        rotations,
-        torch.tensor(SCALE_FACTORS),
-    )
+    if T_start is not None:
+        T = seeds_about(T_start, _WARM_SEEDS, generator)
+    else:
+        T = seeds(
+            problem.foreground.on_surface(),
+            obj_samples.on_surface(),
+            detection.rotation,
+            detection.size / detection.diagonal,
+            rotations,
+            torch.tensor(SCALE_FACTORS),
+        )
     T, _ = search(scene_proxy, object_proxy, problem.foreground, obj_samples, T, problem.extremes, generator)
     return T, self_symmetry(object_proxy, obj_samples, problem.extremes, rotations, generator)
 

@@ -7,9 +7,10 @@ detection box itself (bad when it is loose).
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
-from regnf_core.robust.poses import join
+from regnf_core.robust.poses import join, perturb
 from regnf_core.sim3 import Sim3
 
 
@@ -29,6 +30,15 @@ def seeds(
     by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
     by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
     return join([by_moments, by_points, by_box])
+
+
+def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
+    """A pose and ``count`` perturbed copies: by about 10 degrees, 5 % of the object's size, 10 % of the scale."""
+    spread = torch.tensor([0.17] * 3 + [0.05] * 3 + [0.10], dtype=torch.float64)
+    steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
+    steps[0] = 0.0
+    same = [v.expand(count + 1, *v.shape) for v in (T_start.scale, T_start.rotation, T_start.translation)]
+    return perturb(Sim3(*same), steps)
 
 
 def _from_moments(scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor) -> Sim3:

@@ -37,9 +37,11 @@ def register_robust(
     options: RegistrationOptions,
     seed: int = 0,
     progress: ProgressCallback | None = None,
+    T_object_scene_start: Sim3 | None = None,
 ) -> RegistrationResult:
     """T_object_scene from nothing but two fields and a box, with a verdict, all equal poses and a covariance.
 
+    With ``T_object_scene_start`` its neighbourhood is searched first, and everything only if that ends in a rejection.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
     """
@@ -48,12 +50,10 @@ def register_robust(
     generator = torch.Generator().manual_seed(seed)
     with run.phase("sampling"):
         problem = prepare(scene, obj, detection, options.robust, generator)
-    with run.phase("initialising"):
-        candidates, symmetry = find_candidates(problem, detection, options.robust, generator)
-    with run.phase("optimising"):
-        outcome = refine_candidates(problem, candidates, symmetry, options.robust, generator, _steps(run))
-    with run.phase("verifying"):
-        ending = _conclude(problem, outcome, options)
+    T_start = None if T_object_scene_start is None else _in_working_frames(problem, T_object_scene_start)
+    outcome, ending = _attempt(problem, detection, options, generator, run, T_start)
+    if T_start is not None and ending.verdict == "rejected":
+        outcome, ending = _attempt(problem, detection, options, generator, run, None)
     run.report("verifying", 1.0)
     ending.metrics.update(run.seconds)
     ending.metrics["field_evaluations"] = float(scene.evaluations + obj.evaluations)
@@ -72,6 +72,22 @@ def register_robust(
         alternatives=ending.alternatives,
         covariance=ending.covariance,
     )
+
+
+def _attempt(
+    problem: Problem,
+    detection: OrientedBox,
+    options: RegistrationOptions,
+    generator: torch.Generator,
+    run: Run,
+    T_start: Sim3 | None,
+) -> tuple[Outcome, _Ending]:
+    with run.phase("initialising"):
+        candidates, symmetry = find_candidates(problem, detection, options.robust, generator, T_start)
+    with run.phase("optimising"):
+        outcome = refine_candidates(problem, candidates, symmetry, options.robust, generator, _steps(run))
+    with run.phase("verifying"):
+        return outcome, _conclude(problem, outcome, options)
 
 
 def _steps(run: Run) -> Callable[[], None]:
@@ -143,6 +159,10 @@ def _residuals(problem: Problem, T_work: Sim3) -> dict[str, Tensor]:
 
 def _in_field_frames(problem: Problem, T_work: Sim3) -> Sim3:
     return problem.obj.frame.to_field() @ T_work @ problem.scene.frame.to_field().inverse()
+
+
+def _in_working_frames(problem: Problem, T: Sim3) -> Sim3:
+    return problem.obj.frame.to_field().inverse() @ T @ problem.scene.frame.to_field()
 
 
 def _surface(samples: Samples, out_of: Any) -> SurfaceSamples:

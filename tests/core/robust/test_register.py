@@ -8,7 +8,9 @@ import pytest
 import torch
 
 from regnf_core.box import OrientedBox
+from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
+from regnf_core.robust.poses import perturb
 from regnf_core.sim3 import Sim3
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import (
@@ -93,3 +95,24 @@ def test_a_can_has_a_free_axis_and_it_is_told() -> None:
     free = [a.relation for a in result.alternatives if "as any turn about this axis" in a.relation]
     assert len(free) >= 4
     assert all("about z" in relation for relation in free)
+
+
+def test_a_warm_start_is_refined_and_a_wrong_one_does_no_harm() -> None:
+    near = perturbed(chair_pose(), torch.tensor([0.1, -0.1, 0.15, 0.02, 0.02, -0.02, 0.05]))
+    far = perturbed(chair_pose(), torch.tensor([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
+    for start in (near, far):
+        result = register(room(chair_pose()), chair(), detection(), ROBUST, T_object_scene_start=start)
+        assert result.verdict == "registered"
+        assert placement_error(result, chair_pose()) < 0.005
+
+
+def test_with_an_up_axis_only_turns_about_it_are_searched() -> None:
+    up = RegistrationOptions.from_dict({"preset": "robust", "robust": {"up_axis": "z", "rotations": 240}})
+    result = run(room(chair_pose()), chair(), detection(), up)
+    assert result.verdict == "registered"
+    assert placement_error(result, chair_pose()) < 0.005
+
+
+def perturbed(T: Sim3, step: torch.Tensor) -> Sim3:
+    moved = perturb(Sim3(T.scale[None], T.rotation[None], T.translation[None]), step[None].double())
+    return Sim3(moved.scale[0], moved.rotation[0], moved.translation[0])
