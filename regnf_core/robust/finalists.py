@@ -42,7 +42,7 @@ class Stage:
 
 
 STAGES = (
-    Stage(points=96, widths=(0.04, 0.03, 0.03, 0.02), score_width=0.02, keep=5, margin=0.15),
+    Stage(points=96, widths=(0.10, 0.07, 0.05, 0.035, 0.025, 0.02), score_width=0.02, keep=5, margin=0.15),
     Stage(points=300, widths=(0.02, 0.015, 0.01, 0.01), score_width=0.015, keep=3, margin=0.10),
 )
 LAST = Stage(points=700, widths=(0.01, 0.01, 0.008, 0.008, 0.008), score_width=0.015, keep=8, margin=1.0)

@@ -31,7 +31,7 @@ ROUNDS = (
     Round(points=48, widths=(), score_width=0.10, keep=500, apart=0.0),
     Round(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, apart=0.05),
     Round(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=40, apart=0.05),
-    Round(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=12, apart=0.05),
+    Round(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=10, apart=0.05),
 )
 """Widths and ``apart`` in object diameters. The first round only ranks the seeds."""
 
