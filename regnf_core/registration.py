@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from regnf_core.agreement import disagreement, object_residuals, scene_residuals
+from regnf_core.agreement import disagreement
 from regnf_core.box import OrientedBox
-from regnf_core.densify import densify
+from regnf_core.clouds import clouds_to_show
 from regnf_core.extent import surface_extent
 from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.initialisation import initial_transform
@@ -15,12 +15,11 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.result import IterationRecord, ProgressCallback, RegistrationResult
 from regnf_core.robust.register import register_robust
 from regnf_core.run import STARTS, Run
-from regnf_core.sampling import in_detection, sample_object, sample_scene, thin_out
+from regnf_core.sampling import sample_object, sample_scene, thin_out
 from regnf_core.shape import diameter
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import verify
 
-_SHOWN_SAMPLES = 10_000  # of each surface, for pictures and viewers
 _SCORING_SAMPLES = 400
 _SCORING_CAP = 0.1  # object diameters; a residual beyond it says no more than "wrong"
 
@@ -79,38 +78,30 @@ def register(
     T = refined.T_object_scene
     with run.phase("verifying"):
         verification = verify(scene, obj, detection, extent, T, options.sampling, object_diameter)
-        shown_A = densify(
-            scene,
-            scene_samples,
-            _SHOWN_SAMPLES,
-            generator,
-            lambda points: in_detection(points, detection, options.sampling),
-        )
-        shown_B = densify(obj, object_samples, _SHOWN_SAMPLES, generator, extent.contains)
-        residuals = {
-            "scene_points": shown_A.points,
-            "scene_residuals": scene_residuals(scene, obj, shown_A.points, T),
-            "object_points": shown_B.points,
-            "object_residuals": object_residuals(scene, obj, shown_B.points, T),
-        }
-    run.report("verifying", 1.0)
+    evaluations = scene.evaluations + obj.evaluations
+    with run.phase("exporting"):
+        samples = (scene_samples, object_samples)
+        clouds = clouds_to_show((scene, obj), samples, detection, extent, T, options.sampling, seed)
+    run.report("exporting", 1.0)
     return RegistrationResult(
         verdict=verification.verdict,
         verdict_reason=verification.reason,
         T_object_scene=T,
         T_object_scene_initial=T_initial,
-        scene_samples=shown_A,
-        object_samples=shown_B,
+        scene_samples=clouds.scene,
+        object_samples=clouds.object,
         metrics={
             **verification.metrics,
             "object_diameter": object_diameter,
             "iterations": float(len(refined.trace)),
             "converged": float(refined.converged),
-            "field_evaluations": float(scene.evaluations + obj.evaluations),
+            "field_evaluations": float(evaluations),
+            "field_evaluations_clouds": float(scene.evaluations + obj.evaluations - evaluations),
             **run.seconds,
         },
         trace=refined.trace,
-        residuals=residuals,
+        residuals=clouds.residuals,
+        surroundings=clouds.surroundings,
         seed=seed,
         options=options.to_dict(),
     )

@@ -8,7 +8,13 @@ from contextlib import contextmanager
 
 from regnf_core.result import Phase, ProgressCallback
 
-STARTS: dict[Phase, float] = {"sampling": 0.0, "initialising": 0.15, "optimising": 0.2, "verifying": 0.95}
+STARTS: dict[Phase, float] = {
+    "sampling": 0.0,
+    "initialising": 0.15,
+    "optimising": 0.2,
+    "verifying": 0.95,
+    "exporting": 0.98,
+}
 """The overall share done when each phase begins."""
 
 

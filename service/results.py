@@ -12,6 +12,7 @@ ARTIFACTS: dict[str, str] = {
     "scene_points.ply": "application/octet-stream",
     "object_points.ply": "application/octet-stream",
     "aligned.ply": "application/octet-stream",
+    "context_points.ply": "application/octet-stream",
     "residuals.npz": "application/octet-stream",
     "trace.json": "application/json",
     "transform.npy": "application/octet-stream",

@@ -16,6 +16,18 @@ from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sim3 import Sim3
 from regnf_core.symmetry import Symmetries
 
+CONTEXT_COLOUR = (0.80, 0.82, 0.85)
+_ALWAYS = (
+    "scene_points.ply",
+    "object_points.ply",
+    "aligned.ply",
+    "residuals.npz",
+    "trace.json",
+    "transform.npy",
+    "preview.png",
+    "result.json",
+)
+
 
 def write_artifacts(
     result: RegistrationResult, directory: Path, truth: Sim3 | None = None, symmetries: Symmetries | None = None
@@ -23,7 +35,8 @@ def write_artifacts(
     """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
 
     scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, coloured by
-    source), residuals.npz, trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
+    source), context_points.ply (the scene round the detection, where the result has it), residuals.npz,
+    trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
     """
     scene, obj = result.scene_samples, result.object_samples
     back = result.T_object_scene.inverse()
@@ -31,22 +44,17 @@ def write_artifacts(
     _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOUR))
     _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOUR))
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOUR), (placed, OBJECT_COLOUR))
+    names = list(_ALWAYS)
+    if result.surroundings is not None and len(result.surroundings.points):
+        _write_cloud(directory / "context_points.ply", (result.surroundings, CONTEXT_COLOUR))
+        names.append("context_points.ply")
     arrays: dict[str, Any] = {name: _float32(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
     _write_json(directory / "trace.json", trace_document(result.trace))
     np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
     preview(result).save(directory / "preview.png")
     _write_json(directory / "result.json", result_document(result, truth, symmetries, scene.points.device))
-    return [
-        "scene_points.ply",
-        "object_points.ply",
-        "aligned.ply",
-        "residuals.npz",
-        "trace.json",
-        "transform.npy",
-        "preview.png",
-        "result.json",
-    ]
+    return names
 
 
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:

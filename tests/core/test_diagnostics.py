@@ -28,6 +28,7 @@ NAMES = [
     "transform.npy",
     "preview.png",
     "result.json",
+    "context_points.ply",
 ]
 
 

@@ -72,15 +72,20 @@ def test_field_evaluations_are_counted() -> None:
     T = chair_pose()
     scene, obj = room(T), chair()
     recorded = Recording(scene.formula, scene.bounds.tolist()), Recording(obj.formula, obj.bounds.tolist())
-    result = register(*recorded, chair_box(T), BRIEF)
-    assert result.metrics["field_evaluations"] == sum(counts)
+    until: dict[Phase, int] = {}
+    result = register(
+        *recorded, chair_box(T), BRIEF, progress=lambda phase, done: until.setdefault(phase, sum(counts)) and None
+    )
+    assert result.metrics["field_evaluations"] == until["exporting"] > until["verifying"] > 0
+    assert result.metrics["field_evaluations_clouds"] == sum(counts) - until["exporting"] > 0
 
 
 def test_progress_names_the_phases_in_order_and_never_falls() -> None:
     T = chair_pose()
     seen: list[tuple[Phase, float]] = []
     register(room(T), chair(), chair_box(T), BRIEF, progress=lambda phase, done: seen.append((phase, done)))
-    assert list(dict.fromkeys(phase for phase, _ in seen)) == ["sampling", "initialising", "optimising", "verifying"]
+    phases = ["sampling", "initialising", "optimising", "verifying", "exporting"]
+    assert list(dict.fromkeys(phase for phase, _ in seen)) == phases
     shares = [done for _, done in seen]
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)

@@ -3,7 +3,8 @@
     python -m tests.ui.fixture_server        then open the printed addresses
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
-(live without an event stream), locked (wants a token), bare (a result with little in it) or broken (damaged clouds).
+(live without an event stream), locked (wants a token), bare (a result with little in it), roomy (with the scene round
+the detection) or broken (damaged clouds).
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ STORIES = (
     "polled",
     "locked",
     "bare",
+    "roomy",
     "broken",
 )
 STEPS: tuple[dict[str, Any], ...] = (
@@ -104,6 +106,8 @@ class Stage:
     def result(self, story: str) -> dict[str, Any]:
         if story == "bare":
             return {k: self.data.result[k] for k in ("verdict", "verdict_reason", "T_object_scene", "metrics")}
+        if story == "roomy":
+            return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
         if story != "ambiguous":
             return self.data.result
         half_turn = similarity(1.0, rotation([0, 0, 1], 3.0), [0, 0, 0]) @ self.data.T_object_scene

@@ -50,6 +50,16 @@ def test_every_layer_can_be_hidden_and_shown_again(visit: Visit, layer: str, lea
     assert changed_share(shown, canvas_pixels(page)) < 0.001
 
 
+def test_surroundings_are_a_layer_of_their_own_where_the_result_has_them(visit: Visit) -> None:
+    page = visit.open("roomy")
+    hide(visit, "scene")
+    shown = canvas_pixels(page)
+    hide(visit, "context")
+    assert changed_share(shown, canvas_pixels(page)) > 0.02
+    visit.open("done")
+    expect(page.locator("#context-chip")).to_be_hidden()
+
+
 def test_slider_moves_the_object_from_the_start_into_place(visit: Visit) -> None:
     page = visit.open("done")
     page.locator("#frame-all").click()
@@ -190,7 +200,9 @@ def test_alternatives_can_be_looked_at(visit: Visit) -> None:
 def test_every_artifact_can_be_downloaded(visit: Visit, tmp_path: Path) -> None:
     page = visit.open("done")
     artifacts = visit.server.stage.data.artifacts
-    assert page.locator("#files a").all_inner_texts() == list(artifacts)
+    assert page.locator("#files a").all_inner_texts() == [
+        one["name"] for one in visit.server.stage.data.result["artifacts"]
+    ]
     with page.expect_download() as download:
         page.locator("#files a", has_text="trace.json").click()
     download.value.save_as(tmp_path / "trace.json")

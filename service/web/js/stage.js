@@ -31,6 +31,7 @@ export class Stage {
     this.poses = frames.map((frame) => inverse(frame.pose));
     this.addCloud('scene', this.plain.scene, 'cloud-scene');
     this.addCloud('after', this.plain.after, 'cloud-after');
+    await this.addContext();
     this.addBefore(frames.length > 1);
     this.addBox(detectionOf(job, result));
     this.moveTo(frames.length - 1);
@@ -61,6 +62,15 @@ export class Stage {
     this.addCloud('before', before, 'cloud-before');
   }
 
+  /** The scene round the detection; older results have none, and the view does without it. */
+  async addContext() {
+    const known = this.names.includes('context_points.ply');
+    show(byId('context-chip'), known);
+    if (!known) return;
+    const geometry = geometryFromPly(await this.api.artifact('context_points.ply'));
+    this.addCloud('context', new Cloud(geometry, { seeThrough: true, discs: 0.35 }), 'cloud-context');
+  }
+
   addBox(box) {
     show(byId('box-chip'), Boolean(box));
     if (box) this.viewer.setLayer('box', { object: wireBox(box), tint: 'cloud-box' });
@@ -80,7 +90,7 @@ export class Stage {
     };
     byId('size').oninput = (event) => this.viewer.setPointFactor(Number(event.target.value));
     byId('frame-object').onclick = () => this.viewer.look(FOCUS);
-    byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'before', 'scene']);
+    byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'before', 'scene', 'context']);
     byId('colour').onchange = (event) => this.colourBy(event.target.value);
     this.offer('residual', this.names.includes('residuals.npz'));
     this.offer('file', Object.values(this.plain).some((cloud) => isColourful(cloud.geometry)));

@@ -102,7 +102,7 @@ export class Viewer {
   }
 
   settleFloor() {
-    const box = this.boundsOf([...this.layers.keys()].filter((name) => name !== 'before'));
+    const box = this.boundsOf([...this.layers.keys()].filter((name) => name !== 'before' && name !== 'context'));
     if (box.isEmpty()) return;
     const sphere = box.getBoundingSphere(new Sphere());
     this.floor.place(box, sphere.radius * 2.2);
