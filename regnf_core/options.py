@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.errors import InvalidOptionsError
 
-Preset = Literal["paper"]
+Preset = Literal["paper", "robust"]
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
 _Ratio = Annotated[float, Gt(0), Le(1)]
 
@@ -100,8 +100,46 @@ class ResamplingOptions:
 
 
 @dataclass(frozen=True)
+class RobustOptions:
+    """The preset `robust`: a search over all of Sim(3), refinement on the fields, and a verdict.
+
+    Lengths are in object diameters, shares within 0 and 1: nothing depends on the fields' units.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    up_axis: Literal["x", "y", "z"] | None = None
+    """The vertical axis of scene and object alike: only turns about it are tried. None: every orientation."""
+    rotations: Annotated[int, Ge(24), Le(20_000)] = 600
+    """Rotations that the search starts from, evenly spread over all; with an up axis a tenth of them, about it."""
+    scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
+    """Most samples of the scene's surface in the detection box."""
+    object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
+    """Most samples of the object's surface."""
+    held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
+    """Share of the samples kept from the refinement, for the verdict."""
+    inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
+    """Largest |residual| of a sample on which both fields agree."""
+    min_inlier_share: _Ratio = 0.6
+    """Least share of agreeing samples, in each direction; under it: LOW_OVERLAP. More is asked of accurate fields."""
+    min_explained_share: _Ratio = 0.4
+    """Least share of all that stands in the box that the object explains; under it: SCENE_UNEXPLAINED."""
+    max_free_space_violations: _Ratio = 0.2
+    """Largest share of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED.
+    Less is allowed of accurate fields."""
+    max_hidden_share: _Ratio = 0.75
+    """Largest share of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE."""
+    rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
+    """Poses whose score (0..1) is within this of the best one's, plus 0.15 times that one, explain the data as well:
+    all of them are listed."""
+
+
+@dataclass(frozen=True)
 class RegistrationOptions:
-    """All options of one registration, grouped by stage. The defaults are the published values."""
+    """All options of one registration, grouped by stage.
+
+    ``robust`` steers the preset `robust`; the other groups steer the preset `paper`, with the published values.
+    """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
@@ -110,6 +148,7 @@ class RegistrationOptions:
     initialisation: InitialisationOptions = field(default_factory=InitialisationOptions)
     optimisation: OptimisationOptions = field(default_factory=OptimisationOptions)
     resampling: ResamplingOptions = field(default_factory=ResamplingOptions)
+    robust: RobustOptions = field(default_factory=RobustOptions)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> RegistrationOptions:

@@ -1,10 +1,6 @@
-"""Registration of two fields, top to bottom: sample, initialise, refine, verify."""
+"""Registration of two fields. The preset `paper`, top to bottom: sample, initialise, refine, verify."""
 
 from __future__ import annotations
-
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 
@@ -16,19 +12,14 @@ from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.initialisation import initial_transform
 from regnf_core.optimisation import refine
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import IterationRecord, Phase, ProgressCallback, RegistrationResult
+from regnf_core.result import IterationRecord, ProgressCallback, RegistrationResult
+from regnf_core.robust.register import register_robust
+from regnf_core.run import STARTS, Run
 from regnf_core.sampling import sample_object, sample_scene, thin_out
 from regnf_core.shape import diameter
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import verify
 
-_STARTS: dict[Phase, float] = {
-    "sampling": 0.0,
-    "initialising": 0.15,
-    "optimising": 0.2,
-    "verifying": 0.95,
-    "exporting": 0.98,
-}
 _SCORING_SAMPLES = 400
 _SCORING_CAP = 0.1  # object diameters; a residual beyond it says no more than "wrong"
 
@@ -40,15 +31,21 @@ def register(
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
+    T_object_scene_start: Sim3 | None = None,
 ) -> RegistrationResult:
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
-    raise CancelledError. Deterministic for a seed, on one machine and with the same number of threads.
+    raise CancelledError. Deterministic for a seed, on one machine and with the same number of
+    threads. What follows is the preset `paper`; the preset `robust` has an engine of its own, regnf_core.robust.
+    ``T_object_scene_start``, for the preset `robust` alone, is where to look first; everything else is searched only if
+    that fails.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()
-    run = _Run(progress)
+    if options.preset == "robust":
+        return register_robust(scene, obj, detection, options, seed, progress, T_object_scene_start)
+    run = Run(progress)
     scene, obj = CountingField(scene), CountingField(obj)
     generator = torch.Generator().manual_seed(seed)
 
@@ -72,9 +69,9 @@ def register(
     with run.phase("optimising"):
 
         def on_iteration(record: IterationRecord) -> None:
-            span = _STARTS["verifying"] - _STARTS["optimising"]
+            span = STARTS["verifying"] - STARTS["optimising"]
             done = (record.iteration + 1) / options.optimisation.iterations
-            run.report("optimising", _STARTS["optimising"] + span * done)
+            run.report("optimising", STARTS["optimising"] + span * done)
 
         refined = refine(scene, obj, A, B, T_initial, options, generator, on_iteration)
 
@@ -108,22 +105,3 @@ def register(
         seed=seed,
         options=options.to_dict(),
     )
-
-
-class _Run:
-    """Progress reports and the seconds of each phase."""
-
-    def __init__(self, progress: ProgressCallback | None) -> None:
-        self.seconds: dict[str, float] = {}
-        self._progress = progress
-
-    def report(self, phase: Phase, done: float) -> None:
-        if self._progress is not None:
-            self._progress(phase, min(done, 1.0))
-
-    @contextmanager
-    def phase(self, name: Phase) -> Iterator[None]:
-        self.report(name, _STARTS[name])
-        start = time.perf_counter()
-        yield
-        self.seconds[f"seconds_{name}"] = time.perf_counter() - start

@@ -72,6 +72,9 @@ class RegistrationResult:
     seed: int
     options: dict[str, Any]
     alternatives: list[Alternative] = field(default_factory=list)
+    """The preset `robust` lists every distinct pose that explains the data as well; empty unless ``ambiguous``."""
     covariance: Tensor | None = None
+    """(7, 7) float64 of (omega_x, omega_y, omega_z, dt_x, dt_y, dt_z, d log s): a left perturbation of T_object_scene,
+    s e^(d log s), exp(omega) R, t + dt; radians and object units. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
     """The scene's surface round the detection, for viewers."""

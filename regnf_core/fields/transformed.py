@@ -1,0 +1,50 @@
+"""A field seen in another frame: the same surface after a similarity, distances in the other frame's units."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.fields.base import SdfField
+from regnf_core.sim3 import Sim3
+
+
+class TransformedField:
+    """S_frame(x) = S_field(T x) / s for T = ``T_field_frame``, which carries the new frame's points to the field's own.
+
+    The bounds are the axis-aligned box round the field's own bounds, in the new frame.
+    """
+
+    def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:
+        self.field = field
+        self.T_field_frame = T_field_frame
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU, new frame."""
+        low, high = self.field.bounds
+        corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))  # (8, 3)
+        moved = self.T_field_frame.inverse().apply(corners)
+        return torch.stack([moved.amin(0), moved.amax(0)])
+
+    @property
+    def device(self) -> torch.device:
+        """That of the field."""
+        return self.field.device
+
+    def to(self, device: torch.device | str) -> TransformedField:
+        """The same field with its parameters on another device."""
+        return TransformedField(self.field.to(device), self.T_field_frame)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3) of the new frame, its units."""
+        distance = self.field.signed_distance(self._moved(points))
+        return distance / float(self.T_field_frame.scale)
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) at points (N, 3) of the new frame."""
+        distance, gradient = self.field.signed_distance_and_gradient(self._moved(points))
+        return distance / float(self.T_field_frame.scale), gradient @ self.T_field_frame.rotation.to(gradient)
+
+    def _moved(self, points: Tensor) -> Tensor:
+        return self.T_field_frame.apply(points.double()).to(torch.float32)

@@ -1,0 +1,99 @@
+"""The two residuals of a pose and their derivatives with respect to a left perturbation (omega, dt, log-scale step).
+
+With y = T x for scene points x, w = T^-1 z for object points z, g the fields' gradients:
+
+    r1 = S_b(y) - s S_a(x)    dr1 = [ (y-t) x g_b,      g_b,    g_b . (y-t) - s S_a(x)         ]
+    r2 = s S_a(w) - S_b(z)    dr2 = [ -(z-t) x (R g_a), -R g_a, s S_a(w) - (R g_a) . (z-t)     ]
+
+Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from regnf_core.sim3 import Sim3
+
+
+class DistanceModel(Protocol):
+    """Anything that tells a signed distance (M,) and its gradient (M, 3) at points (M, 3)."""
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU."""
+
+    points: Tensor
+    values: Tensor
+    normals: Tensor
+
+    def __len__(self) -> int:
+        return int(self.points.shape[0])
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        return Samples(self.points[index], self.values[index], self.normals[index])
+
+    def on_surface(self) -> Tensor:
+        """The points (N, 3) carried onto the surface along their normals."""
+        return self.points - self.values.unsqueeze(-1) * self.normals
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals (H, N + M) of H poses, scene samples first; Jacobian (H, N + M, 7); agreement of the normals.
+
+    ``cosines`` (H, N + M): cosine between a sample's normal and the other field's gradient where the pose carries it.
+    """
+
+    values: Tensor
+    jacobian: Tensor
+    cosines: Tensor
+    scene_count: int
+
+
+def residuals(scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3) -> Residuals:
+    """Both residuals of the batch of poses T (H,) at scene samples A (N) and object samples B (M), object units."""
+    T = T.to(A.points)
+    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
+    forth, J_forth, cos_forth = _scene_to_object(obj, A, s, R, t)
+    back, J_back, cos_back = _object_to_scene(scene, B, s, R, t)
+    return Residuals(
+        torch.cat([forth, back], 1), torch.cat([J_forth, J_back], 1), torch.cat([cos_forth, cos_back], 1), len(A)
+    )
+
+
+def _scene_to_object(obj: DistanceModel, A: Samples, s: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    arm = s[..., None] * (A.points @ R.mT)  # y - t, (H, N, 3)
+    value, g = _ask(obj, arm + t)
+    own = s * A.values
+    lever = (g * arm).sum(-1) - own
+    J = torch.cat([torch.linalg.cross(arm, g), g, lever[..., None]], dim=-1)
+    return value - own, J, _cosine(g, A.normals @ R.mT)
+
+
+def _object_to_scene(
+    scene: DistanceModel, B: Samples, s: Tensor, R: Tensor, t: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    arm = B.points - t  # z - t, (H, M, 3)
+    value, g = _ask(scene, (arm @ R) / s[..., None])
+    turned = g @ R.mT  # R g_a
+    seen = s * value
+    lever = seen - (turned * arm).sum(-1)
+    J = torch.cat([-torch.linalg.cross(arm, turned), -turned, lever[..., None]], dim=-1)
+    return seen - B.values, J, _cosine(turned, B.normals.expand_as(turned))
+
+
+def _ask(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
+    value, gradient = model.value_and_gradient(points.reshape(-1, 3))
+    return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
+
+
+def _cosine(gradient: Tensor, normals: Tensor) -> Tensor:
+    cosine: Tensor = (gradient * normals).sum(-1) / gradient.norm(dim=-1).clamp_min(1e-6)
+    return cosine

@@ -1,0 +1,128 @@
+"""Samples of both surfaces, evenly spread over what lies in the region, with normals and exact field values.
+
+No length is absolute: everything follows from the detection box and from the object's own extent. A sample is a point
+close to the surface together with the field's value there, which the residuals take into account; so two gradient
+evaluations a point are enough.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.box import OrientedBox
+from regnf_core.errors import NoSurfaceError
+from regnf_core.fields.base import SdfField
+from regnf_core.robust.cells import Cells, surface_cells, tighten
+from regnf_core.robust.frame import WorkingField, WorkingFrame
+from regnf_core.robust.residuals import Samples
+from regnf_core.sampling import MIN_POINTS, check_box_meets_scene
+from regnf_core.shape import diameter
+
+REGION_GROWTH = 1.2
+"""The scene is sampled in the box grown by this: boxes are often too small or off centre."""
+_OBJECT_BASE, _SCENE_BASE, _LEVELS = 8, 9, 2
+_THICKNESS = 0.6  # edges: leaf cells beyond it duplicate what their neighbours find
+_CLOSE = 0.35  # edges: a sample farther from the surface after its step is dropped
+_LEAST_SLOPE = 0.2  # a gradient shorter than this leads nowhere
+
+
+@dataclass(frozen=True, eq=False)
+class SampledField:
+    """A field, the frame it is worked on in, and its samples there. spacing: working units between samples."""
+
+    field: WorkingField
+    frame: WorkingFrame
+    samples: Samples
+    spacing: float
+
+
+def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
+    """At most ``limit`` samples of the object; the working frame has the surface's centroid at 0 and diameter 1.
+
+    Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
+    """
+    low, high = obj.bounds
+    rough = _box_frame(low, high)
+    field = WorkingField(obj, rough)
+    low, high = rough.into(low).double(), rough.into(high).double()
+    inner = tighten(field.value, low, high, _OBJECT_BASE)
+    cells, space = surface_cells(field.value, *inner, _OBJECT_BASE, _LEVELS)
+    found = _settle(field, cells, limit, generator)
+    found = found[space.sees(found.points, found.normals)]
+    inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
+    found = found[inside]
+    if len(found) < MIN_POINTS:
+        raise NoSurfaceError(f"only {len(found)} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
+    surface = found.on_surface()
+    size = diameter(surface)
+    centre = surface.double().mean(0)
+    frame = WorkingFrame(rough.out_of(centre[None])[0], rough.length * size)
+    samples = Samples((found.points - centre.float()) / size, found.values / size, found.normals)
+    return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size)
+
+
+def sample_scene_surface(
+    scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator
+) -> SampledField:
+    """At most ``limit`` samples of the scene within the grown box; working frame: the box's centre, its diagonal 1.
+
+    Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
+    InvalidInputError (FIELD_NOT_FINITE).
+    """
+    check_box_meets_scene(scene, detection)
+    frame = WorkingFrame(detection.centre.double(), detection.diagonal)
+    field = WorkingField(scene, frame)
+    half = detection.size.double() / detection.diagonal * (REGION_GROWTH / 2)
+    rotation = detection.rotation.double()
+
+    def value(local: Tensor) -> Tensor:
+        return field.value(local.to(rotation) @ rotation.T)
+
+    cells, space = surface_cells(value, -half, half, _SCENE_BASE, _LEVELS)
+    cells = Cells(cells.centres @ rotation.T, cells.values, cells.edge)
+    found = _settle(field, cells, limit, generator)
+    axes = rotation.to(found.points)
+    found = found[space.sees(found.points @ axes, found.normals @ axes)]
+    bounds = frame.into(scene.bounds)
+    found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
+    if len(found) < MIN_POINTS:
+        raise NoSurfaceError(f"only {len(found)} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION")
+    return SampledField(field, frame, found, cells.edge)
+
+
+def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
+    """Two disjoint random parts: the second, a share ``held_out``, for the judgement alone."""
+    order = torch.randperm(len(samples), generator=generator)
+    cut = len(samples) - int(held_out * len(samples))
+    return samples[order[:cut]], samples[order[cut:]]
+
+
+def some(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
+    """At most ``limit`` of the samples, at random."""
+    if len(samples) <= limit:
+        return samples
+    return samples[torch.randperm(len(samples), generator=generator)[:limit]]
+
+
+def _box_frame(low: Tensor, high: Tensor) -> WorkingFrame:
+    return WorkingFrame(((low + high) / 2).double(), float((high - low).norm()))
+
+
+def _settle(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
+    """One Newton step from the leaf cells' centres towards the surface; value and normal where it ends."""
+    close = (cells.values.abs() <= _THICKNESS * cells.edge).nonzero().squeeze(-1)
+    if close.numel() > limit:
+        close = close[torch.randperm(close.numel(), generator=generator)[:limit]]
+    start = cells.centres[close].float()
+    if start.shape[0] == 0:
+        return Samples(start, start[:, 0], start)
+    value, gradient = field.value_and_gradient(start)
+    slope = gradient.square().sum(-1).clamp_min(_LEAST_SLOPE**2)
+    points = start - (value / slope).unsqueeze(-1) * gradient
+    value, gradient = field.value_and_gradient(points)
+    length = gradient.norm(dim=-1)
+    kept = (value.abs() <= _CLOSE * cells.edge) & (length >= _LEAST_SLOPE)
+    return Samples(points[kept], value[kept], gradient[kept] / length[kept, None])

@@ -1,0 +1,86 @@
+"""An object's own symmetries, found by registering it with itself on its samples: no field evaluations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.robust.levenberg import minimise
+from regnf_core.robust.poses import distinct, join, select
+from regnf_core.robust.residuals import DistanceModel, Samples, residuals
+from regnf_core.robust.rotations import turns_about
+from regnf_core.robust.samples import some
+from regnf_core.robust.search import disagreement
+from regnf_core.sim3 import Sim3
+
+_POINTS = 200
+_WIDTH = 0.02  # object diameters
+_ALIKE = 0.35
+"""Largest score, above that of the identity, of a turn that may be a symmetry: the fields decide afterwards."""
+_MOST = 12
+_APART = 0.08  # object diameters between two different symmetries
+_AXIS_TURNS = 36
+
+
+@dataclass(frozen=True, eq=False)
+class SelfSymmetry:
+    """Rigid transforms (K,) of the object onto itself, identity left out; axis (3,) when every turn about it is one."""
+
+    T: Sim3
+    axis: Tensor | None
+
+
+def self_symmetry(
+    obj: DistanceModel, B: Samples, extremes: Tensor, rotations: Tensor, generator: torch.Generator
+) -> SelfSymmetry:
+    """Likely symmetries of the object whose samples (working frame, centroid at 0) and distance model these are.
+
+    rotations: (K, 3, 3) to try. What is found is a set of proposals.
+    """
+    few = some(B, _POINTS, generator)
+    start = _rigid(rotations)
+    coarse = disagreement(residuals(obj, obj, some(few, 48, generator), some(few, 48, generator), start), 0.1)
+    T = select(start, coarse.argsort()[:80])
+    refined = minimise(obj, obj, few, few, T, [0.1, 0.07, 0.05, 0.03, 0.02, 0.02], fix_scale=True)
+    scores = disagreement(refined.residuals, _WIDTH)
+    itself = float(disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None].double())), _WIDTH))
+    alike = (scores <= itself + _ALIKE).nonzero().squeeze(-1)
+    T, scores = select(refined.T, alike), scores[alike]
+    moved = T.apply(extremes.double()) - extremes.double()
+    different = moved.norm(dim=-1).amax(-1) > _APART
+    T, scores = select(T, different), scores[different]
+    if scores.numel() == 0:
+        return SelfSymmetry(T, None)
+    T = select(T, distinct(T, scores, extremes, _APART, _MOST))
+    axis = _continuous_axis(obj, few, T, itself)
+    if axis is None:
+        return SelfSymmetry(T, None)
+    across = select(T, ~_about(T, axis))
+    return SelfSymmetry(join([across, _rigid(turns_about(axis, 8)[1:])]), axis)
+
+
+def _rigid(rotations: Tensor) -> Sim3:
+    count = rotations.shape[0]
+    return Sim3(torch.ones(count).double(), rotations.double(), torch.zeros(count, 3).double())
+
+
+def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> Tensor | None:
+    """An axis (3,) about which every turn is a symmetry, if one of the symmetries' axes is such."""
+    for omega in T.log()[:, 3:6]:
+        angle = float(omega.norm())
+        if angle < 0.1 or angle > 3.0:  # half turns say little: what is round has others too
+            continue
+        axis: Tensor = omega / omega.norm()
+        scores = disagreement(residuals(obj, obj, B, B, _rigid(turns_about(axis, _AXIS_TURNS))), _WIDTH)
+        if bool((scores <= itself + _ALIKE).all()):
+            return axis
+    return None
+
+
+def _about(T: Sim3, axis: Tensor) -> Tensor:
+    """(K,) bool: which of the transforms turn about the axis."""
+    omega = T.log()[:, 3:6]
+    about: Tensor = (omega @ axis).abs() >= 0.97 * omega.norm(dim=-1)
+    return about

@@ -1,0 +1,118 @@
+"""The preset as a whole, on exact fields: any scale, any orientation, and an honest verdict."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from regnf_core.box import OrientedBox
+from regnf_core.options import RegistrationOptions
+from regnf_core.registration import register
+from regnf_core.robust.poses import perturb
+from regnf_core.sim3 import Sim3
+from tests.core.analytic import chair, chair_pose, room, table
+from tests.core.robust.shapes import (
+    ROBUST,
+    can,
+    can_room,
+    detection,
+    placement_error,
+    pose_distance,
+    random_pose,
+    reframed,
+    run,
+    slab_table,
+    table_room,
+)
+
+
+@pytest.mark.parametrize("ratio", [0.1, 10.0])
+def test_any_scale_and_orientation(ratio: float) -> None:
+    scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, ratio / float(chair_pose().scale)))
+    result = run(scene, obj, box)
+    assert float(truth.scale) == pytest.approx(ratio)
+    assert result.verdict == "registered"
+    assert placement_error(result, truth) < 0.005
+    assert result.metrics["field_evaluations"] <= 150_000
+
+
+def test_upside_down() -> None:
+    over = Sim3.from_quaternion(1.0, [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    scene, obj, box, truth = reframed(over, Sim3.identity())
+    result = run(scene, obj, box)
+    assert result.verdict == "registered"
+    assert placement_error(result, truth) < 0.005
+
+
+def test_a_table_has_two_poses_and_both_are_told() -> None:
+    foot = torch.tensor([[0.0, 0.0, -0.3]], dtype=torch.float64)
+    turned = Sim3.from_quaternion(1.4, [0.0, 0.0, math.sin(0.4), math.cos(0.4)], [0.0, 0.0, 0.0])
+    truth = Sim3(turned.scale, turned.rotation, foot[0] - turned.apply(torch.tensor([[0.1, 0.0, 0.0]]).double())[0])
+    corners = torch.cartesian_prod(*[torch.tensor(v).double() for v in ([-0.45, 0.45], [-0.3, 0.3], [-0.3, 0.16])])
+    seen = truth.inverse().apply(corners)
+    box = OrientedBox.from_corners(seen.amin(0).tolist(), seen.amax(0).tolist())
+    result = run(table_room(truth), slab_table(), box)
+    twin = Sim3.from_quaternion(1.0, [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0]) @ truth
+    poses = [result.T_object_scene, *(a.T_object_scene for a in result.alternatives)]
+    assert result.verdict == "ambiguous"
+    assert result.verdict_reason == "SEVERAL_POSES_AGREE"
+    assert min(pose_distance(T, truth, result) for T in poses) < 0.01
+    assert min(pose_distance(T, twin, result) for T in poses) < 0.01
+    assert "180 degrees about z" in [a.relation for a in result.alternatives]
+
+
+def test_a_wrong_object_is_rejected() -> None:
+    result = run(room(chair_pose()), table(), detection())
+    assert result.verdict == "rejected"
+    assert result.verdict_reason in {"FREE_SPACE_VIOLATED", "LOW_OVERLAP", "SCENE_UNEXPLAINED", "TOO_LITTLE_SURFACE"}
+    assert result.alternatives == []
+
+
+def test_the_same_seed_gives_the_same_numbers_and_the_report_is_whole() -> None:
+    scene, obj = room(chair_pose()), chair()
+    reports: list[tuple[str, float]] = []
+    first = register(
+        scene, obj, detection(), ROBUST, seed=4, progress=lambda phase, done: reports.append((phase, done))
+    )
+    second = run(scene, obj, detection(), seed=4)
+    torch.testing.assert_close(first.T_object_scene.matrix(), second.T_object_scene.matrix(), rtol=0, atol=0)
+    assert placement_error(first, chair_pose()) < 0.005
+    assert [done for _, done in reports] == sorted(done for _, done in reports)
+    assert len(first.trace) == first.metrics["iterations"] > 5
+    torch.testing.assert_close(
+        first.trace[-1].T_object_scene.matrix(), first.T_object_scene.matrix(), rtol=0, atol=1e-12
+    )
+    assert first.covariance is not None
+    assert first.covariance.shape == (7, 7)
+    assert (torch.linalg.eigvalsh(first.covariance) > 0).all()
+
+
+def test_a_can_has_a_free_axis_and_it_is_told() -> None:
+    result = run(can_room(), can(), OrientedBox.from_corners([-0.2, -0.2, 0.0], [0.2, 0.2, 0.5]))
+    assert result.verdict == "ambiguous"
+    free = [a.relation for a in result.alternatives if "as any turn about this axis" in a.relation]
+    assert len(free) >= 4
+    assert all("about z" in relation for relation in free)
+
+
+def test_a_warm_start_is_refined_and_a_wrong_one_does_no_harm() -> None:
+    near = perturbed(chair_pose(), torch.tensor([0.1, -0.1, 0.15, 0.02, 0.02, -0.02, 0.05]))
+    far = perturbed(chair_pose(), torch.tensor([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
+    for start in (near, far):
+        result = register(room(chair_pose()), chair(), detection(), ROBUST, T_object_scene_start=start)
+        assert result.verdict == "registered"
+        assert placement_error(result, chair_pose()) < 0.005
+
+
+def test_with_an_up_axis_only_turns_about_it_are_searched() -> None:
+    up = RegistrationOptions.from_dict({"preset": "robust", "robust": {"up_axis": "z", "rotations": 240}})
+    result = run(room(chair_pose()), chair(), detection(), up)
+    assert result.verdict == "registered"
+    assert placement_error(result, chair_pose()) < 0.005
+
+
+def perturbed(T: Sim3, step: torch.Tensor) -> Sim3:
+    moved = perturb(Sim3(T.scale[None], T.rotation[None], T.translation[None]), step[None].double())
+    return Sim3(moved.scale[0], moved.rotation[0], moved.translation[0])
