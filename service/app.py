@@ -76,7 +76,10 @@ def create_app(
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
         lifespan=_lifespan_of(services, redis),
-        middleware=[Middleware(RequestContext), Middleware(TokenGate, tokens=settings.api_tokens)],
+        middleware=[
+            Middleware(RequestContext),
+            Middleware(TokenGate, tokens=settings.api_tokens, allow_unauthenticated=settings.allow_unauthenticated),
+        ],
     )
     app.state.services = services
     _include_routers(app)

@@ -51,3 +51,28 @@ def test_the_probe_and_the_page_are_open_and_tell_nothing(guarded: World) -> Non
     page = guarded.client.get(f"/jobs/{NOBODY}/view")
     assert (page.status_code, page.headers["content-type"]) == (200, "text/html; charset=utf-8")
     assert guarded.client.get("/static/js/app.js").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("address", "settings", "status"),
+    [
+        ("10.0.0.5", {}, 401),
+        ("2001:db8::1", {}, 401),
+        ("::ffff:10.0.0.5", {}, 401),
+        ("127.0.0.1", {}, 200),
+        ("::1", {}, 200),
+        ("::ffff:127.0.0.1", {}, 200),
+        ("10.0.0.5", {"allow_unauthenticated": True}, 200),
+    ],
+)
+def test_without_tokens_only_loopback_is_served(
+    tmp_path: Path, address: str, settings: dict[str, bool], status: int
+) -> None:
+    host = f"[{address}]" if ":" in address else address
+    made = make_world(tmp_path, **settings)
+    with made.client as client:
+        answer = client.get(f"http://{host}/jobs")
+        if status == 401:
+            assert_refused(answer, 401, "UNAUTHENTICATED")
+        assert answer.status_code == status
+        assert client.get(f"http://{host}/healthz").status_code == 200
