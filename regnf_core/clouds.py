@@ -2,53 +2,52 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from regnf_core.agreement import object_residuals, scene_residuals
 from regnf_core.box import OrientedBox
 from regnf_core.context import surroundings
 from regnf_core.densify import densify
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.options import SamplingOptions
-from regnf_core.result import SurfaceSamples
+from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sampling import in_detection
-from regnf_core.sim3 import Sim3
 
 _DENSE = 10_000
 _COARSE = 30_000
+_MARGIN = 0.02  # of the object's extent: how far beyond the samples new ones may lie
 
 
-@dataclass(frozen=True)
-class Clouds:
-    """Scene within the detection and object, both dense, with their residuals; and the scene round the detection."""
-
-    scene: SurfaceSamples
-    object: SurfaceSamples
-    surroundings: SurfaceSamples
-    residuals: dict[str, Tensor]
-
-
-def clouds_to_show(
-    fields: tuple[SdfField, SdfField],
-    samples: tuple[SurfaceSamples, SurfaceSamples],
+def with_clouds(
+    result: RegistrationResult,
+    scene_field: SdfField,
+    object_field: SdfField,
     detection: OrientedBox,
-    object_extent: OrientedBox,
-    T_object_scene: Sim3,
     options: SamplingOptions,
-    seed: int,
-) -> Clouds:
-    """Clouds for (scene, object) fields from the samples that were registered. Deterministic for a seed."""
-    (scene, obj), (A, B) = fields, samples
-    generator = torch.Generator().manual_seed(seed)
-    dense_A = densify(scene, A, _DENSE, generator, lambda points: in_detection(points, detection, options))
-    dense_B = densify(obj, B, _DENSE, generator, object_extent.contains)
+) -> RegistrationResult:
+    """The result with both clouds densified, their residuals, and the scene round the detection.
+
+    The evaluations it took stand apart from the registration's own, as ``field_evaluations_clouds``.
+    """
+    scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
+    generator = torch.Generator().manual_seed(result.seed)
+    extent = _extent(result.object_samples)
+    A = densify(scene, result.scene_samples, _DENSE, generator, lambda points: in_detection(points, detection, options))
+    B = densify(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
     residuals = {
-        "scene_points": dense_A.points,
-        "scene_residuals": scene_residuals(scene, obj, dense_A.points, T_object_scene),
-        "object_points": dense_B.points,
-        "object_residuals": object_residuals(scene, obj, dense_B.points, T_object_scene),
+        "scene_points": A.points,
+        "scene_residuals": scene_residuals(scene, obj, A.points, T),
+        "object_points": B.points,
+        "object_residuals": object_residuals(scene, obj, B.points, T),
     }
-    return Clouds(dense_A, dense_B, surroundings(scene, detection, _COARSE, generator), residuals)
+    around = surroundings(scene, detection, _COARSE, generator)
+    metrics = {**result.metrics, "field_evaluations_clouds": float(scene.evaluations + obj.evaluations)}
+    return replace(result, scene_samples=A, object_samples=B, residuals=residuals, surroundings=around, metrics=metrics)
+
+
+def _extent(samples: SurfaceSamples) -> OrientedBox:
+    """The samples' axis-aligned box."""
+    low, high = samples.points.amin(0).tolist(), samples.points.amax(0).tolist()
+    return OrientedBox.from_corners(low, [max(b, a + 1e-9) for a, b in zip(low, high, strict=True)])

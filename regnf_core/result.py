@@ -68,7 +68,7 @@ class RegistrationResult:
     field_evaluations, and seconds by phase as seconds_<phase>."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
-    """Per sample: scene_points, scene_residuals, object_points, object_residuals; residuals in object units."""
+    """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""
     seed: int
     options: dict[str, Any]
     alternatives: list[Alternative] = field(default_factory=list)

@@ -13,7 +13,7 @@ from torch import Tensor
 from regnf_core.box import OrientedBox
 from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import Alternative, IterationRecord, ProgressCallback, RegistrationResult, SurfaceSamples
+from regnf_core.result import Alternative, IterationRecord, RegistrationResult, SurfaceSamples
 from regnf_core.robust.covariance import covariance, in_object_units
 from regnf_core.robust.engine import ITERATIONS, Outcome, Problem, find_candidates, prepare, refine_candidates
 from regnf_core.robust.finalists import LAST, Trail
@@ -35,8 +35,8 @@ def register_robust(
     object_field: SdfField,
     detection: OrientedBox,
     options: RegistrationOptions,
-    seed: int = 0,
-    progress: ProgressCallback | None = None,
+    seed: int,
+    run: Run,
     T_object_scene_start: Sim3 | None = None,
 ) -> RegistrationResult:
     """T_object_scene from nothing but two fields and a box, with a verdict, all equal poses and a covariance.
@@ -45,7 +45,6 @@ def register_robust(
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
     """
-    run = Run(progress)
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
     with run.phase("sampling"):
@@ -54,8 +53,6 @@ def register_robust(
     outcome, ending = _attempt(problem, detection, options, generator, run, T_start)
     if T_start is not None and ending.verdict == "rejected":
         outcome, ending = _attempt(problem, detection, options, generator, run, None)
-    run.report("verifying", 1.0)
-    ending.metrics.update(run.seconds)
     ending.metrics["field_evaluations"] = float(scene.evaluations + obj.evaluations)
     return RegistrationResult(
         verdict=ending.verdict,
@@ -66,7 +63,7 @@ def register_robust(
         object_samples=_surface(problem.obj.samples, problem.obj.frame.out_of),
         metrics=ending.metrics,
         trace=_trace(problem, outcome.finalists.trail, ending.winner),
-        residuals=ending.residuals,
+        residuals={},
         seed=seed,
         options=options.to_dict(),
         alternatives=ending.alternatives,
@@ -106,11 +103,10 @@ class _Ending:
     metrics: dict[str, float]
     alternatives: list[Alternative]
     covariance: Tensor
-    residuals: dict[str, Tensor]
 
 
 def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -> _Ending:
-    """The winner by the held-out samples, its rivals, verdict, covariance and residuals."""
+    """The winner by the held-out samples, its rivals, verdict and covariance."""
     evidence, poses = outcome.evidence, outcome.finalists.T
     winner = int(evidence.scores.argmin())
     ranked = distinct(poses, evidence.scores, problem.extremes, _RIVALS_APART, poses.scale.numel())
@@ -131,9 +127,7 @@ def _conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) 
         "iterations": float(len(outcome.finalists.trail.steps)),
         "finalists": float(evidence.scores.numel()),
     }
-    return _Ending(
-        decision, reason, winner, T, metrics, alternatives, _covariance(problem, T_work), _residuals(problem, T_work)
-    )
+    return _Ending(decision, reason, winner, T, metrics, alternatives, _covariance(problem, T_work))
 
 
 def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
@@ -142,19 +136,6 @@ def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
     r = residuals(problem.scene.field, problem.obj.field, A, B, batch)
     cov = covariance(r, fitting_width(r, LAST.widths[-1]))
     return in_object_units(cov, T_work, problem.scene.frame, problem.obj.frame)
-
-
-def _residuals(problem: Problem, T_work: Sim3) -> dict[str, Tensor]:
-    """Of every sample, as results carry them: points in their own frames, residuals in object units."""
-    A, B, size = problem.foreground, problem.obj.samples, problem.obj.frame.length
-    batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
-    r = residuals(problem.scene.field, problem.obj.field, A, B, batch)
-    return {
-        "scene_points": problem.scene.frame.out_of(A.on_surface()).float(),
-        "scene_residuals": r.values[0, : r.scene_count] * size,
-        "object_points": problem.obj.frame.out_of(B.on_surface()).float(),
-        "object_residuals": r.values[0, r.scene_count :] * size,
-    }
 
 
 def _in_field_frames(problem: Problem, T_work: Sim3) -> Sim3:
