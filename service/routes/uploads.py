@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Path
@@ -94,7 +96,7 @@ async def post_field(
     digest = announced_digest(content_digest)
     async with services.open_upload() as upload:
         if body.media_type(request) == "multipart/form-data":
-            received, description = await _receive_parts(request, services, upload)
+            received, description = await _receive_parts(request, services, upload, digest)
         else:
             received, description = await _receive_raw(request, services, upload), None
             if digest not in (None, received.sha256):
@@ -112,18 +114,30 @@ async def _receive_raw(request: Request, services: Services, upload: Upload) -> 
 
 
 async def _receive_parts(
-    request: Request, services: Services, upload: Upload
+    request: Request, services: Services, upload: Upload, digest: str | None
 ) -> tuple[Received, UploadDescription | None]:
     body.refuse_encoding(request)
     settings = services.settings
     limit = settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit, settings.upload_stall_s)
+    if digest is not None:
+        data = _compared(data, digest)
     parts = await read_parts(data, boundary_of(request), {"file": upload}, {"description": DESCRIPTION_BYTES})
     if "file" not in parts:
         raise Problem("MISSING_PART", "The part `file` is missing.")
     text = parts.get("description")
     description = None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
     return await upload.finish(), description
+
+
+async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises Problem DIGEST_MISMATCH at its end: the digest is of the parts and all between."""
+    found = hashlib.sha256()
+    async for piece in data:
+        found.update(piece)
+        yield piece
+    if found.hexdigest() != digest:
+        raise Problem("DIGEST_MISMATCH")
 
 
 def _answer(taken: Intake, prefix: str) -> JSONResponse:

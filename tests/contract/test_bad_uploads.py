@@ -32,7 +32,7 @@ def _nothing_stays_and_the_next_works(world: World) -> Iterator[None]:
     assert world.client.put(PUT_GOOD, content=GOOD).status_code == 201
 
 
-def wrong_digest(data: bytes) -> str:
+def announced(data: bytes) -> str:
     return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256(data))).decode()}:"
 
 
@@ -43,7 +43,7 @@ def wrong_digest(data: bytes) -> str:
         ("PUT", f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNISED"),
         ("PUT", f"/fields/{sha256(TOO_LARGE)}", TOO_LARGE, {}, 413, "UPLOAD_TOO_LARGE"),
         ("PUT", PUT_GOOD, field_bytes("another"), {}, 400, "DIGEST_MISMATCH"),
-        ("PUT", PUT_GOOD, GOOD, {"Content-Digest": wrong_digest(b"x")}, 400, "DIGEST_MISMATCH"),
+        ("PUT", PUT_GOOD, GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH"),
         ("PUT", PUT_GOOD, GOOD, {"Content-Digest": "sha-256=:AAAA:"}, 400, "INVALID_DIGEST"),
         ("PUT", PUT_GOOD, GOOD, {"Content-Digest": "sha-256=0000"}, 400, "INVALID_DIGEST"),
         ("PUT", PUT_GOOD, GOOD, {"Content-Encoding": "gzip"}, 415, "UNSUPPORTED_MEDIA_TYPE"),
@@ -60,7 +60,7 @@ def wrong_digest(data: bytes) -> str:
         ("POST", "/fields", PNG, {}, 415, "FIELD_NOT_RECOGNISED"),
         ("POST", "/fields", LEGACY_PICKLE, {}, 415, "FIELD_NOT_RECOGNISED"),
         ("POST", "/fields", PLAIN_ZIP, {}, 415, "FIELD_NOT_RECOGNISED"),
-        ("POST", "/fields", GOOD, {"Content-Digest": wrong_digest(b"x")}, 400, "DIGEST_MISMATCH"),
+        ("POST", "/fields", GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH"),
         ("POST", "/fields", GOOD, {"Content-Type": "multipart/form-data"}, 400, "MALFORMED_MULTIPART"),
         ("POST", "/fields", GOOD, {"Content-Type": "multipart/form-data; boundary=x"}, 400, "MALFORMED_MULTIPART"),
     ],
@@ -125,6 +125,17 @@ FILE = part("file", GOOD, file=True)
 def test_multipart_refused(world: World, body: bytes, status: int, reason: str) -> None:
     headers = {"Content-Type": "multipart/form-data; boundary=x"}
     assert_refused(world.client.post("/fields", content=body + b"--x--\r\n", headers=headers), status, reason)
+
+
+def test_a_digest_of_a_multipart_body_is_compared_with_all_of_it(world: World) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x", "Content-Digest": announced(GOOD)}
+    whole = FILE + b"--x--\r\n"
+    assert_refused(world.client.post("/fields", content=whole, headers=headers), 400, "DIGEST_MISMATCH")
+    assert list(world.blobs.list("")) == []
+    headers["Content-Digest"] = announced(whole)
+    taken = world.client.post("/fields", content=whole, headers=headers)
+    assert taken.status_code == 201
+    assert world.client.delete(taken.json()["links"]["self"]).status_code == 204
 
 
 @pytest.mark.parametrize("reason", ["UNKNOWN_PART", "DUPLICATE_PART"])
