@@ -52,7 +52,7 @@ REASONS: dict[str, Reason] = {
     "UPLOAD_STALLED": Reason(408, "Upload stalled", "The body sent nothing for too long. Nothing was kept."),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
     "FIELD_NOT_RECOGNISED": Reason(
-        415, "Not a field file", "The first bytes are neither a PyTorch zip archive's nor a safetensors file's."
+        415, "Not a field file", "By its first bytes, or inside, the file is none of the fields that the service knows."
     ),
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
@@ -79,7 +79,7 @@ REASONS: dict[str, Reason] = {
     "INVALID_TRANSFORM": Reason(
         422,
         "Invalid transform",
-        "The matrix is no similarity transform: s R | t with s > 0, R a rotation, last row 0 0 0 1.",
+        "The matrix is no similarity transform: (s R, t) with s > 0, R a rotation, last row 0 0 0 1.",
     ),
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."

@@ -14,6 +14,10 @@ from worker.imports import claim_import, reject
 from worker.problems import problem
 
 logger = logging.getLogger(__name__)
+_DETAILS = {
+    "WORKER_LOST": "The process that did the work was killed. Send the request again.",
+    "INTERNAL": "A fault of ours: the process that did the work ended without a word. The log has more under its id.",
+}
 
 
 @dataclass(frozen=True)
@@ -95,5 +99,4 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
 
 def _problem(end: HorseEnd) -> dict[str, Any]:
     reason = end.reason()
-    killed = "The process that ran the job was killed. Post the job again."
-    return problem(reason, killed if reason == "WORKER_LOST" else None)
+    return problem(reason, _DETAILS.get(reason))

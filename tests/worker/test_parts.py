@@ -204,6 +204,7 @@ def test_a_process_that_ends_without_a_word_twice_is_a_fault_of_ours(context: Co
     error = job(context).error
     assert error is not None
     assert error["reason"] == "INTERNAL"
+    assert "request" not in error["detail"]  # no request failed here, so no request id leads anywhere
 
 
 def test_somebody_elses_job_is_left_alone(context: Context) -> None:
