@@ -66,9 +66,9 @@ def scene_from_room() -> NDArray[np.float64]:
     return scale_and_shift(SCENE_UNITS_PER_METRE, -SCENE_UNITS_PER_METRE * SCENE_ORIGIN_M)
 
 
-def object_from_mesh(mesh: MeshField) -> NDArray[np.float64]:
+def object_from_mesh(mesh: MeshField, units_per_metre: float = OBJECT_UNITS_PER_METRE) -> NDArray[np.float64]:
     """(4, 4): metres in the mesh's frame to object units, the bounding box's centre moved to the origin."""
-    return scale_and_shift(OBJECT_UNITS_PER_METRE, -OBJECT_UNITS_PER_METRE * mesh.bounds.mean(dim=0).numpy())
+    return scale_and_shift(units_per_metre, -units_per_metre * mesh.bounds.mean(dim=0).numpy())
 
 
 def load_instance(meshes: Path, instance: dict[str, Any]) -> MeshField:
@@ -108,14 +108,14 @@ def detection(instance: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def truth(instance: dict[str, Any], mesh: MeshField) -> dict[str, Any]:
+def truth(instance: dict[str, Any], mesh: MeshField, units_per_metre: float = OBJECT_UNITS_PER_METRE) -> dict[str, Any]:
     """The true transform from scene to object, and the object's diameter (largest distance of two vertices)."""
     T_room_mesh = np.array(instance["T_room_from_object"])
-    matrix = object_from_mesh(mesh) @ np.linalg.inv(scene_from_room() @ T_room_mesh)
-    scale = OBJECT_UNITS_PER_METRE / SCENE_UNITS_PER_METRE
+    matrix = object_from_mesh(mesh, units_per_metre) @ np.linalg.inv(scene_from_room() @ T_room_mesh)
+    scale = units_per_metre / SCENE_UNITS_PER_METRE
     rotation = Rotation.from_matrix(matrix[:3, :3] / scale)
     matrix[:3, :3] = scale * rotation.as_matrix()
-    vertices = mesh.vertices * OBJECT_UNITS_PER_METRE
+    vertices = mesh.vertices * units_per_metre
     diameter = max(float(np.linalg.norm(vertices - vertex, axis=1).max()) for vertex in vertices)
     return {
         "T_object_scene": {
