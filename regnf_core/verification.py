@@ -7,6 +7,7 @@ small against the object's diameter, in both directions, and their size overall 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -14,9 +15,10 @@ from torch import Tensor
 
 from regnf_core.agreement import object_residuals, scene_residuals
 from regnf_core.box import OrientedBox
+from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.options import SamplingOptions
-from regnf_core.result import Verdict
+from regnf_core.result import SurfaceSamples, Verdict
 from regnf_core.sampling import sample_object, sample_scene
 from regnf_core.sim3 import Sim3
 
@@ -50,12 +52,26 @@ def verify(
 ) -> Verification:
     """Judge the transform on fresh samples of both surfaces, seen by cameras half way between the first ones."""
     turn = math.pi / options.views
-    coarser = replace(options, pixel_stride=min(options.pixel_stride * _STRIDE_FACTOR, options.image_size))
-    scene_points = sample_scene(scene, detection, coarser, turn).points
-    object_points = sample_object(obj, coarser, turn, object_extent).points
+    scene_points = _fresh_points(lambda chosen: sample_scene(scene, detection, chosen, turn), options)
+    object_points = _fresh_points(lambda chosen: sample_object(obj, chosen, turn, object_extent), options)
     forth = scene_residuals(scene, obj, scene_points, T_object_scene) / object_diameter
     back = object_residuals(scene, obj, object_points, T_object_scene) / object_diameter
     return judge(forth, back)
+
+
+def _fresh_points(sample: Callable[[SamplingOptions], SurfaceSamples], options: SamplingOptions) -> Tensor:
+    """(N, 3) what ``sample`` finds with rays farther apart than ``options`` has them, or closer where that is too few.
+
+    Raises NoSurfaceError when even four times the rays of the first sampling find too few.
+    """
+    stride = min(options.pixel_stride * _STRIDE_FACTOR, options.image_size)
+    while True:
+        try:
+            return sample(replace(options, pixel_stride=stride)).points
+        except NoSurfaceError:
+            if stride == 1 or stride * _STRIDE_FACTOR <= options.pixel_stride:
+                raise
+        stride = max(1, stride // _STRIDE_FACTOR)
 
 
 def judge(forth: Tensor, back: Tensor) -> Verification:

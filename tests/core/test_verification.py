@@ -8,8 +8,11 @@ import pytest
 import torch
 
 from regnf_core.agreement import object_residuals, scene_residuals
+from regnf_core.box import OrientedBox
+from regnf_core.errors import NoSurfaceError
 from regnf_core.extent import surface_extent
 from regnf_core.options import SamplingOptions
+from regnf_core.sampling import sample_scene
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import INLIER_DISTANCE, Verification, judge, verify
 from tests.core.analytic import chair, chair_box, chair_pose, room, sphere, table
@@ -62,6 +65,24 @@ def test_the_numbers_of_a_judgement() -> None:
     assert metrics["residual_rms"] == pytest.approx(math.sqrt(3 * 0.01 / 20))
     assert metrics["free_space_violations"] == 0.0  # the scene has more matter there, not less
     assert judge(residuals(9, 1, 0.1), residuals(8, 2, 0.1)).metrics["free_space_violations"] == pytest.approx(0.2)
+
+
+def test_views_that_see_too_little_are_looked_at_more_closely() -> None:
+    # 100 points or so at first: a quarter of the rays would find fewer than the fifty that are asked for.
+    truth, obj = chair_pose(), chair()
+    options = SamplingOptions(pixel_stride=40)
+    first = sample_scene(room(truth), chair_box(truth), options)
+    assert 50 <= len(first.points) < 150
+    judged = verify(room(truth), obj, chair_box(truth), surface_extent(obj), truth, options, 1.1)
+    assert judged.verdict == "registered"
+
+
+def test_no_surface_for_the_verdict_is_said_in_the_end() -> None:
+    truth, obj = chair_pose(), chair()
+    far = OrientedBox.from_corners([-0.9, -0.9, 0.7], [-0.7, -0.7, 0.9])
+    with pytest.raises(NoSurfaceError) as caught:
+        verify(room(truth), obj, far, surface_extent(obj), truth, SamplingOptions(pixel_stride=40), 1.1)
+    assert caught.value.reason == "NO_SURFACE_IN_DETECTION"
 
 
 def verdict_of(T: Sim3, obj_name: str = "chair") -> Verification:
