@@ -27,7 +27,7 @@ class OrientedBox:
 
     def __post_init__(self) -> None:
         for name, shape in (("centre", (3,)), ("size", (3,)), ("rotation", (3, 3))):
-            value = torch.as_tensor(getattr(self, name), dtype=torch.float64)
+            value = torch.as_tensor(getattr(self, name), dtype=torch.float64, device="cpu")
             if tuple(value.shape) != shape:
                 raise InvalidDetectionError(f"box {name} has shape {tuple(value.shape)}, expected {shape}")
             if not torch.isfinite(value).all():
@@ -48,6 +48,8 @@ class OrientedBox:
         """An axis-aligned box from its lowest and highest corner, (3,) each, scene frame."""
         low = torch.as_tensor(lower, dtype=torch.float64)
         high = torch.as_tensor(upper, dtype=torch.float64)
+        if low.shape != (3,) or high.shape != (3,):  # a single number would spread over all axes
+            raise InvalidDetectionError("a box's corners have three coordinates each")
         return cls((low + high) / 2, high - low, torch.eye(3, dtype=torch.float64), label, score)
 
     @classmethod

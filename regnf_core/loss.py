@@ -68,7 +68,8 @@ def residuals(samples: SampleSet, other: SdfField, T_other_own: Sim3) -> Tensor:
 def regulariser(moved: Tensor, target: SampleSet) -> Tensor:
     """L_r: mean squared distance () from the points (N, 3) to their nearest sample of ``target``, in its frame."""
     _, nearest = target.neighbours.query(moved)
-    return (moved - target.neighbours.points[nearest]).square().sum(-1).mean()
+    points = target.neighbours.points
+    return (moved - points[nearest.to(points.device)].to(moved)).square().sum(-1).mean()
 
 
 def bidirectional_loss(

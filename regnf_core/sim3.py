@@ -19,6 +19,14 @@ def _invalid(message: str) -> InvalidInputError:
     return InvalidInputError(message, reason="INVALID_TRANSFORM")
 
 
+def _numbers(values: Any) -> Tensor:
+    """Values as float64, where they are numbers in a regular array."""
+    try:
+        return torch.as_tensor(values, dtype=torch.float64)
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise _invalid("a transform is made of numbers, in rows of equal length") from error
+
+
 @dataclass(frozen=True, eq=False)
 class Sim3:
     """A similarity transform, or a batch of them: x -> scale * rotation @ x + translation.
@@ -49,7 +57,7 @@ class Sim3:
         Raises InvalidInputError (INVALID_TRANSFORM) unless each is a similarity: finite, last row (0, 0, 0, 1),
         equal singular values, no reflection.
         """
-        M = torch.as_tensor(matrix, dtype=torch.float64)
+        M = _numbers(matrix)
         if M.shape[-2:] != (4, 4):
             raise _invalid(f"a transform is a 4x4 matrix, not {tuple(M.shape)}")
         if not torch.isfinite(M).all():
@@ -75,9 +83,7 @@ class Sim3:
         translation: Tensor | Sequence[float],
     ) -> Sim3:
         """From scale (...), quaternion (..., 4) as (x, y, z, w), normalised here, and translation (..., 3)."""
-        s = torch.as_tensor(scale, dtype=torch.float64)
-        q = torch.as_tensor(rotation_quaternion_xyzw, dtype=torch.float64)
-        t = torch.as_tensor(translation, dtype=torch.float64)
+        s, q, t = _numbers(scale), _numbers(rotation_quaternion_xyzw), _numbers(translation)
         if q.shape[-1:] != (4,) or t.shape[-1:] != (3,):
             raise _invalid("a quaternion has four numbers and a translation three")
         if not all(torch.isfinite(part).all() for part in (s, q, t)):

@@ -57,7 +57,7 @@ class BoxField:
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) float32 at points (N, 3) and its gradient (N, 3)."""
         lower, upper = self.bounds
-        offset = points.double() - (lower + upper) / 2.0
+        offset = points.cpu().double() - (lower + upper) / 2.0
         beyond = offset.abs() - (upper - lower) / 2.0  # (N, 3)
         outward = beyond.clamp_min(0.0)
         outside = outward.norm(dim=-1)
@@ -125,6 +125,7 @@ class UnionField:
 
         A part is asked only where its bounding box is nearer than what has been found.
         """
+        points = points.to(device=self.device, dtype=torch.float32)
         distance = points.new_full((points.shape[0],), torch.inf)
         gradient = torch.zeros_like(points)
         for part in self.parts:

@@ -170,6 +170,12 @@ def test_a_box_that_misses_the_scene_is_refused() -> None:
     assert reason_of(caught) == "DETECTION_OUTSIDE_SCENE"
 
 
+def test_corners_need_three_coordinates_each() -> None:
+    with pytest.raises(InvalidDetectionError) as caught:
+        OrientedBox.from_corners([0], [1, 1, 1])
+    assert reason_of(caught) == "INVALID_DETECTION"
+
+
 def test_a_box_round_nothing_is_refused() -> None:
     with pytest.raises(NoSurfaceError) as caught:
         sample_scene(sphere(0.2), OrientedBox.from_corners([0.5, 0.5, 0.5], [0.9, 0.9, 0.9]), OPTIONS)

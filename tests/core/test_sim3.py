@@ -130,10 +130,18 @@ def test_what_is_no_similarity_is_refused(spoil, what) -> None:  # type: ignore[
     assert caught.value.reason == "INVALID_TRANSFORM", what
 
 
+@pytest.mark.parametrize("matrix", ["abc", [[1, 2], [3]], [["a"] * 4] * 4, {"x": 1}, None, [[10**400] * 4] * 4])
+def test_what_is_no_matrix_of_numbers_is_refused(matrix) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InvalidInputError) as caught:
+        Sim3.from_dict({"matrix": matrix})
+    assert caught.value.reason == "INVALID_TRANSFORM"
+
+
 @pytest.mark.parametrize(
     "values",
     [
         {"scale": 1.0, "translation": [0, 0, 0]},
+        {"scale": "large", "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]},
         {"scale": 0.0, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]},
         {"scale": 1.0, "rotation_quaternion_xyzw": [0, 0, 0, 0], "translation": [0, 0, 0]},
         {"scale": 1.0, "rotation_quaternion_xyzw": [0, 0, 1], "translation": [0, 0, 0]},
