@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from typing import Any
 
 import igl
@@ -16,6 +17,20 @@ from regnf_core.errors import FieldFormatError
 
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9
+_FAULTS_OF_CONTENT = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    NameError,
+    NotImplementedError,
+    OSError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+"""What trimesh's readers are known to raise on malformed files; OSError is a part that the file names and lacks."""
 
 
 class MeshField:
@@ -43,12 +58,13 @@ class MeshField:
 
         Raises FieldFormatError (MESH_INVALID) when the file is malformed or holds no triangles, and OSError.
         """
-        os.stat(path)  # trimesh takes a name without a file for the mesh itself
+        with open(path, "rb"):  # what cannot be read is no matter of its content
+            pass
         try:
             scene = trimesh.load_scene(os.fspath(path), process=False)
-        except (LookupError, NotImplementedError, TypeError, ValueError) as error:
+            meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+        except _FAULTS_OF_CONTENT as error:
             raise FieldFormatError(f"{os.path.basename(path)}: {error}", reason="MESH_INVALID") from error
-        meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
         if not meshes:
             raise FieldFormatError(f"{os.path.basename(path)} holds no triangle mesh", reason="MESH_INVALID")
         counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])

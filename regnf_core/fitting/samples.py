@@ -66,6 +66,8 @@ def _measure(target: SdfField, points: NDArray[np.float64]) -> ExactSamples:
 def _surface_points(target: SdfField, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Surface points (M, 3): the target's own, or else points of its bounds carried down its gradient."""
     if isinstance(target, SurfaceSource):
+        if not target.area > 0.0:
+            raise InvalidInputError("the target's surface has no area", reason="NO_SURFACE_IN_TARGET")
         return target.sample_surface(count, rng)
     points = volume_samples(target, count, 0.05, rng).points
     for _ in range(_PROJECTION_STEPS):

@@ -118,6 +118,26 @@ def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
         MeshField.load(tmp_path / "absent.glb")
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("parts.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "absent.bin", "byteLength": 3}]}'),
+        ("short.obj", "v 0 0\nv 1 0 0\nv 0 1\nf 1 2 3\n"),
+        ("far.obj", "v 0 0 0\nv 1 0 0\nf 1 2 9\n"),
+    ],
+)
+def test_malformed_meshes_are_refused(name: str, content: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(FieldFormatError) as caught:
+        MeshField.load(tmp_path / name)
+    assert caught.value.reason == "MESH_INVALID"
+
+
+def test_a_folder_is_no_mesh_file(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError):
+        MeshField.load(tmp_path)
+
+
 def test_surface_samples_lie_on_the_surface() -> None:
     rng = np.random.default_rng(0)
     for field in (BOX, box_mesh(BOX), UnionField([BOX, BoxField((1, 1, 1), (2, 2, 2))])):
@@ -138,6 +158,15 @@ def test_union_takes_the_nearest() -> None:
         other.signed_distance_and_gradient(points)[1],
     )
     torch.testing.assert_close(gradient, nearest)
+
+
+def test_union_takes_double_precision_and_no_points_at_all() -> None:
+    union = UnionField([BOX, BoxField((1, 1, 1), (2, 2, 2))])
+    points = some_points(100, reach=1.5)
+    distance, gradient = union.signed_distance_and_gradient(points.double())
+    assert distance.dtype == gradient.dtype == torch.float32
+    torch.testing.assert_close(distance, union.signed_distance(points))
+    assert union.signed_distance(points[:0]).shape == (0,)
 
 
 def test_union_shares_samples_by_weight() -> None:

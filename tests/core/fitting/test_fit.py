@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from regnf_core.errors import CancelledError, InvalidInputError
+from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField
 from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.safe_format import open_field, read_description
 from regnf_core.fitting.fit import fit_field
 from regnf_core.fitting.network import TrainableField
@@ -83,9 +86,10 @@ def test_progress_may_stop_the_fit(tmp_path: Path) -> None:
     [
         (sphere(3.0, bounds=[[-3.0] * 3, [3.0] * 3]), "TARGET_OUTSIDE_GRID"),
         (AnalyticField(lambda points: 1.0 + 0.0 * points.sum(-1), [[-0.5] * 3, [0.5] * 3]), "NO_SURFACE_IN_TARGET"),
+        (MeshField(np.zeros((3, 3)), [[0, 1, 2]]), "NO_SURFACE_IN_TARGET"),
     ],
 )
-def test_targets_that_cannot_be_fitted(target: AnalyticField, reason: str, tmp_path: Path) -> None:
+def test_targets_that_cannot_be_fitted(target: SdfField, reason: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError) as caught:
         fit_field(target, tmp_path / "field", OPTIONS)
     assert caught.value.reason == reason
