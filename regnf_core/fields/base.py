@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -38,13 +37,6 @@ class SdfField(Protocol):
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) and its gradient (N, 3) with respect to the points (N, 3)."""
         ...
-
-
-def evaluate_in_chunks(evaluate: Callable[[Tensor], Tensor], points: Tensor, chunk: int) -> Tensor:
-    """Apply ``evaluate`` to slices of at most ``chunk`` points and join the results along the first axis."""
-    if points.shape[0] <= chunk:
-        return evaluate(points)
-    return torch.cat([evaluate(part) for part in torch.split(points, chunk)])
 
 
 class _SignedDistance(torch.autograd.Function):

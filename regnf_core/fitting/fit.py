@@ -13,7 +13,6 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.safe_format import open_field, write_safe_field
 from regnf_core.fitting.network import DEGREE, TrainableField
 from regnf_core.fitting.options import FitOptions, FitProgress, FitReport
@@ -28,11 +27,6 @@ from regnf_core.fitting.samples import (
 _CHECK_POINTS = 20_000
 _REPORT_EVERY = 50
 _GRID_RADIUS = 2.0
-
-
-def fit_mesh(mesh_path: str | os.PathLike[str], path: str | os.PathLike[str], **arguments: Any) -> FitReport:
-    """Fit a field to the mesh in ``mesh_path`` and write it to ``path``; the rest as for :func:`fit_field`."""
-    return fit_field(MeshField.load(mesh_path), path, **arguments)
 
 
 def fit_field(
