@@ -23,7 +23,7 @@ err = Console(stderr=True, highlight=False)
 def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT) -> int:
     """Say on stderr what went wrong; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
-    err.print(message, markup=False)
+    err.print(message, markup=False, soft_wrap=True)
     return code
 
 
@@ -38,7 +38,7 @@ def read_json(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidInputError(f"{what} {path}: {error}", reason="MALFORMED_JSON") from error
     if not isinstance(value, dict):
         raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON")

@@ -12,8 +12,10 @@ from regnf_cli.console import out, read_json
 
 
 def inspect(
-    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", exists=True)],
-    description: Annotated[Path | None, typer.Option(help="JSON: what the checkpoint does not carry.")] = None,
+    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", exists=True, dir_okay=False)],
+    description: Annotated[
+        Path | None, typer.Option(help="JSON: what the checkpoint does not carry.", exists=True, dir_okay=False)
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: family, why, bounds, parameters, plausibility.

@@ -5,6 +5,7 @@ Exit codes: 0 registered (or done) · 1 ambiguous or rejected · 2 bad input · 
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from typing import Annotated
@@ -53,6 +54,10 @@ def main() -> None:
         sys.exit(fail(error.reason, str(error), code))
     except FileNotFoundError as error:
         sys.exit(fail("FILE_NOT_FOUND", f"no such file: {error.filename}"))
+    except OSError as error:
+        if error.filename is None and error.errno != errno.ENOSPC:
+            raise
+        sys.exit(fail("FILE_UNUSABLE", str(error)))
 
 
 if __name__ == "__main__":

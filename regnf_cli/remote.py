@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 
 from regnf_cli.console import EXIT_UNAVAILABLE, err, fail, phase_progress
-from regnf_core.errors import RegnfError
+from regnf_core.errors import InvalidInputError, RegnfError
 
 _BLOCK = 1 << 20
 _FINISHED = ("successful", "failed", "dismissed")
@@ -32,6 +32,12 @@ class RemoteService:
 
     def __init__(self, address: str, token: str | None = None) -> None:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
+        try:
+            url = httpx.URL(address)
+        except httpx.InvalidURL as error:
+            raise InvalidInputError(f"{address}: {error}", reason="INVALID_ADDRESS") from error
+        if url.scheme not in ("http", "https") or not url.host:
+            raise InvalidInputError(f"{address!r} is no http:// or https:// address", reason="INVALID_ADDRESS")
         self._http = httpx.Client(base_url=address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
 
     def __enter__(self) -> RemoteService:
@@ -50,7 +56,7 @@ class RemoteService:
         """Send a field unless the service holds it; returns its SHA-256 while its import may still run."""
         sha256 = _sha256(path)
         known = self._http.get(f"/fields/{sha256}")
-        if known.status_code != 200 or known.json()["state"] == "rejected":
+        if known.status_code != 200 or _check(known).get("state") == "rejected":
             size = max(path.stat().st_size, 1)
 
             def body() -> Iterator[bytes]:
@@ -96,7 +102,7 @@ class RemoteService:
         with self._http.stream("GET", f"/jobs/{job_id}/artifacts/{name}") as response:
             if response.status_code != 200:
                 response.read()
-                raise _problem(response.json())
+                _check(response)
             with target.open("wb") as file:
                 for block in response.iter_bytes(_BLOCK):
                     file.write(block)
@@ -123,9 +129,10 @@ def register_remotely(
             if output is not None:
                 output.mkdir(parents=True, exist_ok=True)
                 for artifact in document["artifacts"]:
-                    service.fetch_artifact(job["id"], artifact["name"], output / artifact["name"])
+                    name = artifact["name"]
+                    service.fetch_artifact(job["id"], name, output / Path(name).name)  # never outside the folder
             return document
-    except httpx.TransportError as error:
+    except httpx.RequestError as error:
         err.print()
         raise SystemExit(
             fail("SERVICE_UNAVAILABLE", f"{address} does not answer: {error}", EXIT_UNAVAILABLE)
@@ -138,14 +145,14 @@ def _sha256(path: Path) -> str:
 
 
 def _check(response: httpx.Response) -> dict[str, Any]:
-    if response.is_success:
-        document: dict[str, Any] = response.json()
-        return document
+    """The JSON object of a good answer; raises ServiceError for a refusal, and for what is no regnf service."""
     try:
-        problem = response.json()
+        document = response.json()
     except ValueError:
-        problem = {"detail": f"HTTP status {response.status_code}"}
-    error = _problem(problem)
+        document = None
+    if response.is_success and isinstance(document, dict):
+        return document
+    error = _problem(document if isinstance(document, dict) else {"detail": f"HTTP status {response.status_code}"})
     error.unavailable = response.status_code in (502, 503, 504)
     raise error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -22,12 +22,11 @@ def serve(
 
     Example: **regnf serve --port 8080**
     """
+    from regnf_cli.settings import read_settings
     from regnf_cli.supervisor import Supervisor
     from service.logs import configure_logging
-    from service.settings import Settings
 
-    given: dict[str, Any] = {"host": host, "port": port, "state_dir": state_dir, "workers": workers}
-    settings = Settings(**{name: value for name, value in given.items() if value is not None})
+    settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
     configure_logging(settings.log_format)
     Supervisor(settings).run(ready=lambda address: typer.echo(f"regnf serves {address} (Ctrl+C stops it)"))
 

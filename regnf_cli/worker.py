@@ -20,14 +20,18 @@ def worker(
     """
     import os
 
+    from redis.exceptions import ConnectionError as RedisConnectionError
+
     from regnf_cli.service_errors import ServiceError
-    from service.settings import Settings
+    from regnf_cli.settings import read_settings
     from worker.context import NoRedisError
     from worker.main import run_worker
 
     if redis_url is not None:
         os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too
     try:
-        run_worker(Settings())
+        run_worker(read_settings())
     except NoRedisError as error:
         raise ServiceError(str(error), reason=error.reason) from error
+    except RedisConnectionError as error:
+        raise ServiceError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE") from error

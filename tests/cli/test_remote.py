@@ -1,0 +1,123 @@
+"""`regnf register --server`: what is said of services that are absent, unable, or no regnf service at all."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.conftest import Run
+
+Answer = tuple[int, str]
+Answers = Callable[[str, str], Answer]
+Serve = Callable[[Answers], str]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """``serve(answers)``: a server's address; ``answers(method, path)`` gives status and body."""
+    servers: list[ThreadingHTTPServer] = []
+
+    def start(answers: Answers) -> str:
+        class Handler(BaseHTTPRequestHandler):
+            def answer(self) -> None:
+                self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                status, body = answers(self.command, self.path.partition("?")[0])
+                self.send_response(status)
+                self.send_header("Content-Length", str(len(body.encode())))
+                self.end_headers()
+                self.wfile.write(body.encode())
+
+            do_GET = do_PUT = do_POST = answer  # noqa: N815 (the names that http.server calls)
+
+            def log_message(self, *_: Any) -> None:
+                """Say nothing."""
+
+        servers.append(ThreadingHTTPServer(("127.0.0.1", 0), Handler))
+        threading.Thread(target=servers[-1].serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        return f"http://127.0.0.1:{servers[-1].server_address[1]}"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def service(verdict: str, artifact: str = "result.json") -> Answers:
+    """A service that has every field and whose one job is done."""
+    transform = {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "scale": 1.0}
+    result = {
+        "verdict": verdict,
+        "verdict_reason": "BECAUSE",
+        "T_object_scene": transform,
+        "metrics": {"residual_rms": 0.5},
+        "artifacts": [{"name": artifact}],
+    }
+
+    def answers(method: str, path: str) -> Answer:
+        if path.startswith("/fields/"):
+            return 200, json.dumps({"state": "ready"})
+        if path == "/register":
+            return 202, json.dumps({"id": "j"})
+        if path == "/jobs/j":
+            return 200, json.dumps({"id": "j", "status": "successful"})
+        return 200, json.dumps(result) if path == "/jobs/j/result" else "content"
+
+    return answers
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("registered", 0), ("ambiguous", 1), ("rejected", 1)])
+def test_the_verdict_decides(verdict: str, code: int, run: Run, demo: list[object], serve: Serve) -> None:
+    outcome = run(*demo, "--server", serve(service(verdict)))
+    assert outcome.code == code, outcome.stderr
+    assert outcome.stdout.startswith(f"verdict      {verdict}  (BECAUSE)")
+
+
+def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    outcome = run(*demo, "--output", folder, "--server", serve(service("registered", "../outside.txt")))
+    assert outcome.code == 0, outcome.stderr
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["outside.txt"]
+    assert (folder / "outside.txt").read_text() == "content"
+
+
+def test_a_dead_port_is_unavailable(run: Run, demo: list[object]) -> None:
+    with socket.socket() as bound:  # bound, but nobody listens
+        bound.bind(("127.0.0.1", 0))
+        outcome = run(*demo, "--server", f"http://127.0.0.1:{bound.getsockname()[1]}")
+    assert outcome.code == 3
+    assert "SERVICE_UNAVAILABLE " in outcome.stderr
+
+
+def test_a_service_that_cannot_now_is_unavailable(run: Run, demo: list[object], serve: Serve) -> None:
+    problem = json.dumps({"reason": "QUEUE_UNAVAILABLE", "detail": "Redis does not answer"})
+    outcome = run(*demo, "--server", serve(lambda method, path: (503, problem)))
+    assert outcome.code == 3
+    assert "QUEUE_UNAVAILABLE Redis does not answer" in outcome.stderr
+
+
+def test_a_refusal_is_bad_input_with_the_services_reason(run: Run, demo: list[object], serve: Serve) -> None:
+    problem = json.dumps({"reason": "UNAUTHENTICATED", "title": "Who are you?"})
+    outcome = run(*demo, "--server", serve(lambda method, path: (401, problem)))
+    assert outcome.code == 2
+    assert "UNAUTHENTICATED Who are you?" in outcome.stderr
+
+
+@pytest.mark.parametrize("answer", [(200, "<html>hello</html>"), (200, "[]"), (404, "<html>"), (418, "[1]")])
+def test_what_is_no_regnf_service(answer: Answer, run: Run, demo: list[object], serve: Serve) -> None:
+    outcome = run(*demo, "--server", serve(lambda method, path: answer))
+    assert outcome.code == 2
+    assert f"SERVICE_ERROR HTTP status {answer[0]}" in outcome.stderr
+
+
+@pytest.mark.parametrize("address", ["", "here", "127.0.0.1:8080", "http://", "http://[::1", "ftp://127.0.0.1"])
+def test_what_is_no_address(address: str, run: Run, demo: list[object]) -> None:
+    outcome = run(*demo, "--server", address)
+    assert outcome.code == 2
+    assert "INVALID_ADDRESS " in outcome.stderr
