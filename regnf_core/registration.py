@@ -8,6 +8,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.options import RegistrationOptions
 from regnf_core.paper import register_paper
 from regnf_core.result import ProgressCallback, RegistrationResult
+from regnf_core.robust.object_model import ObjectModel
 from regnf_core.robust.register import register_robust
 from regnf_core.run import Run
 from regnf_core.sim3 import Sim3
@@ -21,18 +22,20 @@ def register(
     seed: int = 0,
     progress: ProgressCallback | None = None,
     T_object_scene_start: Sim3 | None = None,
+    object_model: ObjectModel | None = None,
 ) -> RegistrationResult:
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
-    raise CancelledError. ``T_object_scene_start``, for the preset `robust` alone, is where to look first; everything
-    else is searched only if that fails. Deterministic for a seed, on one machine and with the same number of threads.
+    raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, everything else
+    is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.object_model.model_object` made of
+    ``obj`` earlier. Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()
     run = Run(progress)
     if options.preset == "robust":
-        result = register_robust(scene, obj, detection, options, seed, run, T_object_scene_start)
+        result = register_robust(scene, obj, detection, options, seed, run, T_object_scene_start, object_model)
     else:
         result = register_paper(scene, obj, detection, options, seed, run)
     with run.phase("exporting"):

@@ -53,6 +53,19 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class ObjectSymmetry:
+    """The turns that carry the object onto itself: how many there are, the identity included.
+
+    axis: unit vector, object frame, that all of them turn about, if there is one; None for a box's three half turns.
+    With ``continuous`` every turn about the axis is one, and ``order`` counts the ends that look alike: 1 or 2.
+    """
+
+    order: int
+    axis: tuple[float, float, float] | None
+    continuous: bool
+
+
+@dataclass(frozen=True)
 class RegistrationResult:
     """The outcome of one registration. Transforms carry scene coordinates to object coordinates."""
 
@@ -76,5 +89,7 @@ class RegistrationResult:
     covariance: Tensor | None = None
     """(7, 7) float64 of (omega_x, omega_y, omega_z, dt_x, dt_y, dt_z, d log s): a left perturbation of T_object_scene,
     s e^(d log s), exp(omega) R, t + dt; radians and object units. None from the preset `paper`."""
+    symmetry: ObjectSymmetry | None = None
+    """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
     """The scene's surface round the detection, for viewers."""

@@ -10,7 +10,10 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from regnf_core.robust.residuals import Samples
+
 _CELLS = 40
+_REACH = 0.2  # working units round the samples that a proxy covers
 _PLANE_SPACINGS = 2.0  # nearer than this the tangent plane is the better distance
 
 
@@ -45,6 +48,11 @@ class ProxyField:
         value = entry[:, 0] + (gradient * offset).sum(-1) + outside
         away = beyond / outside.clamp_min(1e-9)[:, None]
         return value, torch.where((outside > 0)[:, None], away, gradient)
+
+
+def proxy_of(samples: Samples, spacing: float) -> ProxyField:
+    """The proxy of a surface's samples, ``spacing`` apart, in their working frame."""
+    return ProxyField(samples.on_surface(), samples.normals, spacing, _REACH)
 
 
 def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, queries: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""An object's own symmetries, found by registering it with itself on its samples: no field evaluations."""
+"""An object's own symmetries, found by registering it with itself: proposed by its samples, confirmed by its field."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.result import ObjectSymmetry
 from regnf_core.robust.levenberg import minimise
 from regnf_core.robust.poses import distinct, join, select
 from regnf_core.robust.residuals import DistanceModel, Samples, residuals
@@ -22,14 +23,35 @@ _ALIKE = 0.35
 _MOST = 12
 _APART = 0.08  # object diameters between two different symmetries
 _AXIS_TURNS = 36
+_CONFIRMING_POINTS = 300
+_CONFIRMING_WIDTHS = [0.02, 0.015, 0.01, 0.01]
+_EXACT = 0.1
+"""Largest score, above that of the identity, of a turn that the field itself calls a symmetry."""
+_PARALLEL = 0.99  # least cosine between the axes of turns about one axis
 
 
 @dataclass(frozen=True, eq=False)
 class SelfSymmetry:
-    """Rigid transforms (K,) of the object onto itself, identity left out; axis (3,) when every turn about it is one."""
+    """Rigid transforms (K,) that carry the object, or most of it, onto itself; the identity is left out.
+
+    axis: (3,) when every turn about it is one · excess: (K,) how much worse than the identity's the score (0..1) of
+    each is: near 0 for a symmetry, more for what merely resembles one.
+    """
 
     T: Sim3
     axis: Tensor | None
+    excess: Tensor
+
+    def group(self) -> ObjectSymmetry:
+        """What the object's field calls its symmetries: exact turns alone."""
+        exact = select(self.T, self.excess <= _EXACT)
+        omega = exact.log()[:, 3:6]
+        if self.axis is not None:
+            across = int((~_about(exact, self.axis)).sum())
+            return ObjectSymmetry(1 + min(across, 1), _tuple(self.axis), True)
+        axes = omega / omega.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        one_axis = len(axes) > 0 and bool(((axes @ axes[0]).abs() >= _PARALLEL).all())
+        return ObjectSymmetry(1 + len(axes), _tuple(axes[0]) if one_axis else None, False)
 
 
 def self_symmetry(
@@ -52,13 +74,31 @@ def self_symmetry(
     different = moved.norm(dim=-1).amax(-1) > _APART
     T, scores = select(T, different), scores[different]
     if scores.numel() == 0:
-        return SelfSymmetry(T, None)
-    T = select(T, distinct(T, scores, extremes, _APART, _MOST))
+        return SelfSymmetry(T, None, scores)
+    kept = distinct(T, scores, extremes, _APART, _MOST)
+    T, excess = select(T, kept), scores[kept] - itself
     axis = _continuous_axis(obj, few, T, itself)
     if axis is None:
-        return SelfSymmetry(T, None)
-    across = select(T, ~_about(T, axis))
-    return SelfSymmetry(join([across, _rigid(turns_about(axis, 8)[1:])]), axis)
+        return SelfSymmetry(T, None, excess)
+    across = ~_about(T, axis)
+    turns = _rigid(turns_about(axis, 8)[1:])
+    return SelfSymmetry(
+        join([select(T, across), turns]), axis, torch.cat([excess[across], torch.zeros(turns.scale.numel())])
+    )
+
+
+def confirmed(proposed: SelfSymmetry, obj: DistanceModel, B: Samples, generator: torch.Generator) -> SelfSymmetry:
+    """The proposals refined on the object's own field, each with its excess there.
+
+    Costs nothing for an object without proposals, and some 3,000 field evaluations for each.
+    """
+    count = proposed.T.scale.numel()
+    if count == 0:
+        return proposed
+    few = some(B, _CONFIRMING_POINTS, generator)
+    itself = disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None])), _WIDTH)
+    refined = minimise(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
+    return SelfSymmetry(refined.T, proposed.axis, (disagreement(refined.residuals, _WIDTH) - itself).clamp_min(0.0))
 
 
 def _rigid(rotations: Tensor) -> Sim3:
@@ -77,6 +117,12 @@ def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> 
         if bool((scores <= itself + _ALIKE).all()):
             return axis
     return None
+
+
+def _tuple(axis: Tensor) -> tuple[float, float, float]:
+    """A unit vector, its largest entry positive: an axis has no sense."""
+    x, y, z = (axis * axis[axis.abs().argmax()].sign()).tolist()
+    return x, y, z
 
 
 def _about(T: Sim3, axis: Tensor) -> Tensor:
