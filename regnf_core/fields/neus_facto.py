@@ -5,19 +5,18 @@ The function is that of sdfstudio's and nerfstudio's neus-facto, of NeuS (no gri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from regnf_core.fields.contraction import contract_linf, pull_back_linf
-from regnf_core.fields.description import SKIP_LAYER, Contraction
+from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
+from regnf_core.fields.kinds.neus_facto import SKIP_LAYER, Contraction, NeusFactoDescription
 from regnf_core.fields.positional_encoding import PositionalEncoding
-
-_CHUNK = 1 << 12
-_CHUNK_ACCELERATOR = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,19 @@ class NeusFactoFunction:
     """``linf``: z is the contracted point; ``linf_grid``: only the hash grid sees the contracted point (nerfstudio)."""
     grid_radius: float = 2.0
     """r: the hash grid covers [-r, r]^3."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters live."""
+        return self.mlp.weights[0].device
+
+    def to(self, device: torch.device | str) -> NeusFactoFunction:
+        """The same function with its parameters on another device."""
+        weights, biases = ([t.to(device) for t in tensors] for tensors in (self.mlp.weights, self.mlp.biases))
+        grid = self.hash_encoding
+        if grid is not None:
+            grid = HashEncoding(grid.config, grid.table.to(device), grid.active_levels)
+        return replace(self, mlp=GeometryMlp(weights, biases, self.mlp.skip_at or SKIP_LAYER), hash_encoding=grid)
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (N,) at points (N, 3)."""
@@ -79,50 +91,49 @@ class NeusFactoFunction:
         return (grid_points + self.grid_radius) / (2.0 * self.grid_radius)
 
 
-class NeusFactoField:
-    """A :class:`NeusFactoFunction` as an SdfField: no autograd graph, in chunks, on the device of its parameters.
+class NeusFactoField(FunctionField[NeusFactoFunction]):
+    """A :class:`NeusFactoFunction` as an SdfField."""
 
-    bounds: (2, 3), lowest and highest corner of the region where the field has meaning, own frame.
-    chunk: points evaluated at once; None picks what suits the device (CPU: what fits its cache).
+
+def build_neus_facto(description: NeusFactoDescription, tensors: Mapping[str, Tensor]) -> NeusFactoField:
+    """The field of ``description`` with its parameters in ``tensors`` (names as in the safe format), in float32.
+
+    Tensors keep their device. Columns that only ever saw zeros (an unused encoding, masked levels) are left out.
+    The tensors must have passed :meth:`NeusFactoDescription.check_tensors`.
     """
+    layers = sum(name.endswith(".weight") for name in tensors)
+    weights = [tensors[f"layers.{i}.weight"].float() for i in range(layers)]
+    biases = [tensors[f"layers.{i}.bias"].float() for i in range(layers)]
+    encoding = description.positional_encoding
+    positional = None
+    if encoding is not None and encoding.used and encoding.degree > 0:
+        positional = PositionalEncoding.with_two_pi(encoding.degree, encoding.two_pi)
+    grid = None
+    if description.hash is not None and description.use_grid:
+        grid = HashEncoding(description.hash, tensors["hash_table"].float(), description.level_mask)
+    live = torch.tensor(_live_columns(description, positional, grid), device=weights[0].device)
+    if len(live) < description.input_width:
+        weights[0] = weights[0][:, live]
+        if layers > SKIP_LAYER:
+            hidden = weights[SKIP_LAYER - 1].shape[0]
+            kept = torch.cat((torch.arange(hidden, device=live.device), live + hidden))
+            weights[SKIP_LAYER] = weights[SKIP_LAYER][:, kept]
+    function = NeusFactoFunction(
+        GeometryMlp(weights, biases, SKIP_LAYER), positional, grid, description.contraction, description.grid_radius
+    )
+    return NeusFactoField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
 
-    def __init__(self, function: NeusFactoFunction, bounds: Tensor, chunk: int | None = None) -> None:
-        self.function = function
-        self.chunk = chunk
-        self._bounds = torch.as_tensor(bounds, dtype=torch.float64, device="cpu")
 
-    @property
-    def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU, own frame."""
-        return self._bounds
-
-    @property
-    def device(self) -> torch.device:
-        """Where the parameters live."""
-        return self.function.mlp.weights[0].device
-
-    def to(self, device: torch.device | str) -> NeusFactoField:
-        """The same field with its parameters on another device."""
-        old = self.function
-        weights, biases = ([t.to(device) for t in tensors] for tensors in (old.mlp.weights, old.mlp.biases))
-        mlp = GeometryMlp(weights, biases, old.mlp.skip_at or SKIP_LAYER)
-        grid = old.hash_encoding
-        if grid is not None:
-            grid = HashEncoding(grid.config, grid.table.to(device), grid.active_levels)
-        function = NeusFactoFunction(mlp, old.positional_encoding, grid, old.contraction, old.grid_radius)
-        return NeusFactoField(function, self._bounds, self.chunk)
-
-    @torch.no_grad()
-    def signed_distance(self, points: Tensor) -> Tensor:
-        """Signed distance (N,) float32 at points (N, 3)."""
-        return torch.cat([self.function.value(part) for part in self._chunks(points)])
-
-    @torch.no_grad()
-    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
-        parts = [self.function.value_and_gradient(part) for part in self._chunks(points)]
-        return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
-
-    def _chunks(self, points: Tensor) -> tuple[Tensor, ...]:
-        size = self.chunk or (_CHUNK if self.device.type == "cpu" else _CHUNK_ACCELERATOR)
-        return torch.split(points.to(device=self.device, dtype=torch.float32), size)
+def _live_columns(
+    description: NeusFactoDescription, positional: PositionalEncoding | None, grid: HashEncoding | None
+) -> list[int]:
+    """The columns of the network's input that are ever fed something other than zero."""
+    columns = [0, 1, 2]
+    start = 3
+    if positional is not None:
+        columns += range(start, start + positional.width)
+    if description.positional_encoding is not None:
+        start += description.positional_encoding.width
+    if grid is not None:
+        columns += range(start, start + grid.width)
+    return columns

@@ -16,18 +16,15 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.description import (
-    NeusFactoDescription,
-    TensorSpec,
-    description_to_dict,
-    parse_description,
-)
+from regnf_core.fields.description import description_to_dict, parse_description
+from regnf_core.fields.kinds.kind import FieldDescription
+from regnf_core.fields.kinds.tensor_check import TensorSpec
 
 if TYPE_CHECKING:
     import torch
     from numpy.typing import NDArray
 
-    from regnf_core.fields.neus_facto import NeusFactoField
+    from regnf_core.fields.base import SdfField
 
 FORMAT_VERSION = "1"
 _TYPE_NAMES = {"float32": "F32", "float16": "F16"}
@@ -76,19 +73,19 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
     return description_to_dict(_read_header(path)[0])
 
 
-def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> NeusFactoField:
+def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:
     """The field in ``path``, its parameters on ``device``. On a CPU float32 tensors are mapped, not read.
 
     Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
     """
-    from regnf_core.fields.build import build_neus_facto
+    from regnf_core.fields.build import build_field
 
     description, names = _read_header(path)
     with safe_open(os.fspath(path), framework="pt", device=str(device)) as file:
-        return build_neus_facto(description, {name: file.get_tensor(name) for name in names})
+        return build_field(description, {name: file.get_tensor(name) for name in names})
 
 
-def _read_header(path: str | os.PathLike[str]) -> tuple[NeusFactoDescription, list[str]]:
+def _read_header(path: str | os.PathLike[str]) -> tuple[FieldDescription, list[str]]:
     """The checked description, and the tensors' names."""
     try:
         with safe_open(os.fspath(path), framework="numpy") as file:
@@ -102,7 +99,7 @@ def _read_header(path: str | os.PathLike[str]) -> tuple[NeusFactoDescription, li
     return description, sorted(specs)
 
 
-def _parse_metadata(metadata: Mapping[str, str]) -> NeusFactoDescription:
+def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
     version, text = metadata.get("regnf"), metadata.get("field")
     if version is None or text is None:
         raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")

@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Ge, Gt, Le, MaxLen
-from pydantic import TypeAdapter, ValidationError
+from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
+from pydantic import AfterValidator, FiniteFloat, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.fields.kinds.kind import Axis
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
+_Corner = Annotated[list[FiniteFloat], Len(3, 3)]
+
+
+def _sound_box(box: list[list[float]]) -> list[list[float]]:
+    if not all(low < high for low, high in zip(*box, strict=True)):
+        raise ValueError("the lowest corner is not below the highest along every axis")
+    return box
+
+
+def _whole_sign(sign: int) -> int:
+    if sign not in (1, -1):
+        raise ValueError("should be 1 or -1")
+    return sign
+
+
+_Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 
 @dataclass(frozen=True)
@@ -37,8 +54,26 @@ class UploadDescription:
     """How far space is squeezed before the field sees it; see the field families' documentation."""
     level_mask: Annotated[int, Gt(0), Le(32)] | None = None
     """Only this many of the coarsest grid levels are evaluated, for checkpoints of coarse-to-fine training."""
+    latent_index: Annotated[int, Ge(0), Lt(1 << 24)] | None = None
+    """Which shape of a family of shapes, counted from 0 in the order of the checkpoint's latent codes."""
+    latent: Annotated[list[FiniteFloat], Len(1, 512)] | None = None
+    """The shape's latent code itself, where the checkpoint has none."""
+    bounds: _Box | None = None
+    """Lowest and highest corner of the region where the field has meaning, in its own frame, after ``world_scale``."""
+    world_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
+    """Length, in the unit wanted, of one unit of the checkpoint's coordinates; distances scale with it."""
+    sign: Annotated[int, AfterValidator(_whole_sign)] | None = None
+    """1: the checkpoint's values are positive in free space; -1: they are negative there."""
+    up_axis: Axis | None = None
+    """Which axis of the field points up. Kept with the field, changes nothing about it."""
     label: Annotated[str, MaxLen(200)] | None = None
     hash: GridDescription = field(default_factory=GridDescription)
+
+    def said(self) -> dict[str, Any]:
+        """The entries that say something, as plain (JSON) values."""
+        values = asdict(self)
+        values["hash"] = {name: value for name, value in values["hash"].items() if value is not None}
+        return {name: value for name, value in values.items() if value not in (None, {})}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any] | None) -> UploadDescription:

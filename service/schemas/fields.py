@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any, Literal
 
 from pydantic import Field
@@ -14,9 +13,7 @@ from service.schemas.common import Links, Outgoing, ProblemDocument, Sha256, out
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
     """What the import needs of a description: everything that was said but the label."""
-    said = asdict(description)
-    said["hash"] = {name: value for name, value in said["hash"].items() if value is not None}
-    return {name: value for name, value in said.items() if name != "label" and value not in (None, {})}
+    return {name: value for name, value in description.said().items() if name != "label"}
 
 
 class FieldDocument(Outgoing):

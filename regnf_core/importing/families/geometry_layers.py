@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.description import MAX_LAYERS, SKIP_LAYER
+from regnf_core.fields.kinds.neus_facto import MAX_LAYERS, SKIP_LAYER
 from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,12 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.safe_format import read_description
 from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.shared import refuse_other_entries, require_family
 from regnf_core.importing.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.tensors import Float32Array
 from regnf_core.importing.upload_description import UploadDescription
 
+_OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2")}
 
 
@@ -27,16 +28,22 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: 
     header = read_header(data)
     if sum(tensor.size for tensor in header.values()) > tensor_bytes:
         raise FieldFormatError("the tensors exceed the limit", reason="TENSOR_TOO_LARGE")
-    description = read_description(path)
-    named = {"contraction": wanted.contraction, "level_mask": wanted.level_mask, "label": wanted.label}
-    description |= {key: value for key, value in named.items() if value is not None}
-    if any(value is not None for value in dataclasses.asdict(wanted.hash).values()):
-        raise FieldFormatError("a field file describes its own hash grid", reason="INVALID_DESCRIPTION")
-    if wanted.family not in (None, description["family"]):
-        raise FieldFormatError(f"the file holds a {description['family']} field", reason="FAMILY_NOT_SUPPORTED")
+    description = _overruled(read_description(path), wanted)
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
     why = ("a regnf field file",)
     return ConvertedField(str(description["family"]), why, description, tensors)
+
+
+def _overruled(description: dict[str, Any], wanted: UploadDescription) -> dict[str, Any]:
+    """``description`` with what was said instead; a new scale takes the bounds along, unless they were said too."""
+    family = str(description["family"])
+    require_family(wanted, family)
+    refuse_other_entries(wanted, f"a field file of the kind {family}", sorted(_OVERRULED & description.keys()))
+    changed = description | wanted.said()
+    if wanted.bounds is None:
+        ratio = changed["world_scale"] / description["world_scale"]
+        changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]
+    return changed
 
 
 def _array(name: str, tensor: StoredTensor, data: memoryview) -> Float32Array:

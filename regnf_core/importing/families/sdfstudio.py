@@ -7,15 +7,17 @@ uploader may overrule. Training state, colour, background, proposal networks and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.description import SKIP_LAYER
 from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.fields.kinds.neus_facto import SKIP_LAYER
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.geometry_layers import GeometryLayers, count_layers, read_layers
 from regnf_core.importing.families.grid_search import GridHabits, find_grid
+from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.tensors import TensorSource, as_tensor, lookup, require_shape
 from regnf_core.importing.upload_description import UploadDescription
@@ -63,6 +65,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     if prefix is None:
         return None
     state = {key.removeprefix(prefix): value for key, value in pipeline.items() if _has_prefix(key, prefix)}
+    refuse_other_entries(wanted, "a checkpoint of sdfstudio or nerfstudio", ("contraction", "level_mask", "hash"))
     count = count_layers(state)
     variant, why = _tell_variant(state, count, wanted)
     evidence = (f"keys {prefix}glin*, {count} layers", why)
@@ -111,13 +114,12 @@ def _assemble(
     uses_sines = layers.uses_columns(3, _PLAIN_WIDTH)
     description = {
         "family": "neus_facto",
-        "bounds": _bounds(state, source, warnings),
+        **shared_entries(wanted, _bounds(state, source, wanted, warnings)),
         "hash": _as_dict(grid),
         "positional_encoding": {"degree": _DEGREE, "two_pi": variant.two_pi, "used": uses_sines},
         "use_grid": uses_grid,
         "contraction": wanted.contraction or variant.contraction,
         "level_mask": wanted.level_mask,
-        "label": wanted.label,
         "source": {"family": variant.name},
     }
     return ConvertedField(variant.name, why, description, tensors, tuple(warnings))
@@ -149,10 +151,13 @@ def _as_dict(grid: HashGridConfig) -> dict[str, Any]:
     }
 
 
-def _bounds(state: dict[str, Any], source: TensorSource, warnings: list[str]) -> list[list[float]]:
+def _bounds(
+    state: dict[str, Any], source: TensorSource, wanted: UploadDescription, warnings: list[str]
+) -> Sequence[Sequence[float]]:
     if "aabb" not in state:
-        warnings.append("BOUNDS_ASSUMED: the checkpoint has no aabb; [-1, 1] is assumed along every axis")
-        return [[-1.0] * 3, [1.0] * 3]
+        if wanted.bounds is None:
+            warnings.append("BOUNDS_ASSUMED: the checkpoint has no aabb; [-1, 1] is assumed along every axis")
+        return UNIT_CUBE
     box = source.array("aabb", state["aabb"])
     require_shape("aabb", box, (2, 3))
     if not (box[0] < box[1]).all():

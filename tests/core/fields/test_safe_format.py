@@ -15,7 +15,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import build_neus_facto
+from regnf_core.fields.build import build_field
 from regnf_core.fields.description import parse_description
 from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
 from tests.core.fields.small_field import GRID, description, tensors
@@ -39,7 +39,7 @@ def test_round_trip(tmp_path: Path) -> None:
     }
     assert read["hash"]["levels"] == GRID.levels
     parameters = {name: torch.from_numpy(array) for name, array in tensors(6).items()}
-    expected = build_neus_facto(parse_description(values), parameters)
+    expected = build_field(parse_description(values), parameters)
     points = torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(open_field(path).signed_distance(points), expected.signed_distance(points))
     assert torch.equal(open_field(path).bounds, torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64))

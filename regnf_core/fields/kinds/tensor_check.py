@@ -1,0 +1,45 @@
+"""Checks of stored tensors against what a description asks for, by names, types and shapes alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from dataclasses import dataclass
+
+from regnf_core.errors import FieldFormatError
+
+FLOAT_TYPES = ("F32", "F16")
+
+
+@dataclass(frozen=True)
+class TensorSpec:
+    """A stored tensor's shape and its safetensors type name."""
+
+    shape: tuple[int, ...]
+    dtype: str
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless ``condition`` holds."""
+    if not condition:
+        raise FieldFormatError(message, reason="FIELD_SHAPES_MISMATCH")
+
+
+def require_names(tensors: Mapping[str, TensorSpec], names: Set[str]) -> None:
+    """Exactly these tensors, all of them real numbers. Raises FieldFormatError (FIELD_SHAPES_MISMATCH)."""
+    require(set(tensors) == names, f"unexpected or missing tensors: {sorted(names ^ set(tensors))[:4]}")
+    for name, spec in sorted(tensors.items()):
+        require(spec.dtype in FLOAT_TYPES, f"{name} is {spec.dtype}, expected one of {FLOAT_TYPES}")
+
+
+def require_shape(tensors: Mapping[str, TensorSpec], name: str, expected: tuple[int, ...]) -> None:
+    """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the tensor ``name`` has this shape."""
+    shape = tensors[name].shape
+    require(shape == expected, f"{name} has shape {shape}, its description asks for {expected}")
+
+
+def count_rows(tensors: Mapping[str, TensorSpec], name: str) -> int:
+    """The first extent of the tensor ``name``. Raises FieldFormatError (FIELD_SHAPES_MISMATCH) where there is none."""
+    shape = tensors[name].shape
+    rows = shape[0] if shape else 0
+    require(rows >= 1, f"{name} has no rows")
+    return rows
