@@ -10,7 +10,6 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, FiniteFloat, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.kinds.kind import Axis
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
@@ -64,7 +63,7 @@ class UploadDescription:
     """Length, in the unit wanted, of one unit of the checkpoint's coordinates; distances scale with it."""
     sign: Annotated[int, AfterValidator(_whole_sign)] | None = None
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
-    up_axis: Axis | None = None
+    up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
     label: Annotated[str, MaxLen(200)] | None = None
     hash: GridDescription = field(default_factory=GridDescription)
