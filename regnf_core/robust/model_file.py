@@ -31,7 +31,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "symmetry.scale": ("K",),
     "symmetry.rotation": ("K", 3, 3),
     "symmetry.translation": ("K", 3),
-    "symmetry.excess": ("K",),
+    "symmetry.deviation": ("K",),
     "symmetry.axis": ("A", 3),
 }
 
@@ -49,7 +49,7 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
         "symmetry.scale": model.symmetry.T.scale,
         "symmetry.rotation": model.symmetry.T.rotation,
         "symmetry.translation": model.symmetry.T.translation,
-        "symmetry.excess": model.symmetry.excess,
+        "symmetry.deviation": model.symmetry.deviation,
         "symmetry.axis": axis[None] if axis is not None else torch.zeros(0, 3),
     }
     content = save(
@@ -86,7 +86,7 @@ def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:
         Samples(*(tensors[name].float() for name in ("points", "values", "normals"))),
         float(lengths[1]),
         tensors["extremes"].float(),
-        SelfSymmetry(T, axes[0].double() if len(axes) else None, tensors["symmetry.excess"].float()),
+        SelfSymmetry(T, axes[0].double() if len(axes) else None, tensors["symmetry.deviation"].float()),
     )
 
 

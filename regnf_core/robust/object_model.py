@@ -58,7 +58,7 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     extremes = extreme_points(sampled.samples.on_surface(), _EXTREMES)
     proxy = proxy_of(sampled.samples, sampled.spacing)
     proposed = self_symmetry(proxy, sampled.samples, extremes, super_fibonacci(_ROTATIONS), generator)
-    symmetry = confirmed(proposed, sampled.field, sampled.samples, generator)
+    symmetry = confirmed(proposed, sampled.field, sampled.samples, extremes, generator)
     model = ObjectModel(sampled.frame, sampled.samples, sampled.spacing, extremes, symmetry)
     model.__dict__["proxy"] = proxy
     return model

@@ -24,9 +24,11 @@ _MOST = 12
 _APART = 0.08  # object diameters between two different symmetries
 _AXIS_TURNS = 36
 _CONFIRMING_POINTS = 300
-_CONFIRMING_WIDTHS = [0.02, 0.015, 0.01, 0.01]
-_EXACT = 0.1
-"""Largest score, above that of the identity, of a turn that the field itself calls a symmetry."""
+_CONFIRMING_WIDTHS = [0.03, 0.02, 0.015, 0.01, 0.01, 0.01]
+_OFF = 0.01  # object diameters
+_EXACT = 0.03
+"""Largest share of samples off by more than ``_OFF`` of a turn that is called a symmetry. Normals do not count: on the
+rims of thin boards a fitted field has them anyhow."""
 _PARALLEL = 0.99  # least cosine between the axes of turns about one axis
 
 
@@ -34,17 +36,17 @@ _PARALLEL = 0.99  # least cosine between the axes of turns about one axis
 class SelfSymmetry:
     """Rigid transforms (K,) that carry the object, or most of it, onto itself; the identity is left out.
 
-    axis: (3,) when every turn about it is one · excess: (K,) how much worse than the identity's the score (0..1) of
-    each is: near 0 for a symmetry, more for what merely resembles one.
+    axis: (3,) when every turn about it is one · deviation: (K,) the share of the surface that each does not carry onto
+    the surface: near 0 for a symmetry, more for what merely resembles one.
     """
 
     T: Sim3
     axis: Tensor | None
-    excess: Tensor
+    deviation: Tensor
 
     def group(self) -> ObjectSymmetry:
         """What the object's field calls its symmetries: exact turns alone."""
-        exact = select(self.T, self.excess <= _EXACT)
+        exact = select(self.T, self.deviation <= _EXACT)
         omega = exact.log()[:, 3:6]
         if self.axis is not None:
             across = int((~_about(exact, self.axis)).sum())
@@ -70,35 +72,41 @@ def self_symmetry(
     itself = float(disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None].double())), _WIDTH))
     alike = (scores <= itself + _ALIKE).nonzero().squeeze(-1)
     T, scores = select(refined.T, alike), scores[alike]
-    moved = T.apply(extremes.double()) - extremes.double()
-    different = moved.norm(dim=-1).amax(-1) > _APART
-    T, scores = select(T, different), scores[different]
-    if scores.numel() == 0:
-        return SelfSymmetry(T, None, scores)
-    kept = distinct(T, scores, extremes, _APART, _MOST)
-    T, excess = select(T, kept), scores[kept] - itself
+    kept = _distinct_turns(T, scores, extremes)
+    T, scores = select(T, kept), scores[kept]
     axis = _continuous_axis(obj, few, T, itself)
-    if axis is None:
-        return SelfSymmetry(T, None, excess)
-    across = ~_about(T, axis)
-    turns = _rigid(turns_about(axis, 8)[1:])
-    return SelfSymmetry(
-        join([select(T, across), turns]), axis, torch.cat([excess[across], torch.zeros(turns.scale.numel())])
-    )
+    if axis is not None:
+        across = ~_about(T, axis)
+        turns = _rigid(turns_about(axis, 8)[1:])
+        T = join([select(T, across), turns])
+    return SelfSymmetry(T, axis, torch.zeros(T.scale.numel()))
 
 
-def confirmed(proposed: SelfSymmetry, obj: DistanceModel, B: Samples, generator: torch.Generator) -> SelfSymmetry:
-    """The proposals refined on the object's own field, each with its excess there.
+def confirmed(
+    proposed: SelfSymmetry, obj: DistanceModel, B: Samples, extremes: Tensor, generator: torch.Generator
+) -> SelfSymmetry:
+    """The proposals refined on the object's own field, each with its deviation there.
 
-    Costs nothing for an object without proposals, and some 3,000 field evaluations for each.
+    Costs nothing for an object without proposals, and some 4,000 field evaluations for each.
     """
-    count = proposed.T.scale.numel()
-    if count == 0:
+    if proposed.T.scale.numel() == 0:
         return proposed
     few = some(B, _CONFIRMING_POINTS, generator)
-    itself = disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None])), _WIDTH)
     refined = minimise(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
-    return SelfSymmetry(refined.T, proposed.axis, (disagreement(refined.residuals, _WIDTH) - itself).clamp_min(0.0))
+    deviation = (refined.residuals.values.abs() > _OFF).float().mean(1)
+    kept = _distinct_turns(refined.T, deviation, extremes)
+    T, deviation = select(refined.T, kept), deviation[kept]
+    axis = proposed.axis
+    if axis is not None and bool((deviation[_about(T, axis)] > _EXACT).any()):
+        axis = None
+    return SelfSymmetry(T, axis, deviation)
+
+
+def _distinct_turns(T: Sim3, scores: Tensor, extremes: Tensor) -> Tensor:
+    """Numbers of the best, no two of them alike, none like the identity."""
+    moved = (T.apply(extremes.double()) - extremes.double()).norm(dim=-1).amax(-1)
+    kept = distinct(T, scores, extremes, _APART, T.scale.numel() + 1)[: 2 * _MOST]
+    return kept[moved[kept] > _APART][:_MOST]
 
 
 def _rigid(rotations: Tensor) -> Sim3:
