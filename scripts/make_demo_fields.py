@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,39 @@ from regnf_core.fields.mesh import MeshField
 from regnf_core.fitting.fit import fit_field
 from regnf_core.fitting.options import FitOptions
 
-SCENE_UNITS_PER_METRE = 0.5
-SCENE_ORIGIN_M = np.array([0.0, 0.0, 1.0])
 OBJECT_UNITS_PER_METRE = 0.625
 """1.25 object units a scene unit: the scale that the registration has to find."""
 LIBRARY = {"armchair": ("fc", ""), "dining-chair": ("dc", "-dining-chair")}
 """Library objects: the room's instance that shows each, and how its detection and truth files end."""
 ATTRIBUTION = "Poly Haven, https://polyhaven.com, CC0 1.0"
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """A scene's frame: metres in the room's frame, less ``origin_m``, times ``units_per_metre``."""
+
+    units_per_metre: float = 0.5
+    origin_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    @classmethod
+    def of(cls, room: dict[str, Any]) -> SceneFrame:
+        """The frame that a layout asks for, or the usual one."""
+        usual = cls()
+        origin = room.get("scene_origin_m", usual.origin_m)
+        return cls(room.get("scene_units_per_metre", usual.units_per_metre), tuple(origin))
+
+    def from_room(self) -> NDArray[np.float64]:
+        """(4, 4): metres in the room's frame to scene units."""
+        return scale_and_shift(self.units_per_metre, -self.units_per_metre * np.array(self.origin_m))
+
+    def points(self, metres: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) of the room's frame in scene units."""
+        matrix = self.from_room()
+        moved: NDArray[np.float64] = metres @ matrix[:3, :3].T + matrix[:3, 3]
+        return moved
+
+
+SCENE_FRAME = SceneFrame()
 
 ROOM_OPTIONS = FitOptions(
     grid=HashGridConfig.from_top_resolution(512, levels=10, log2_table_size=17),
@@ -61,11 +87,6 @@ def scale_and_shift(scale: float, shift: NDArray[np.float64]) -> NDArray[np.floa
     return matrix
 
 
-def scene_from_room() -> NDArray[np.float64]:
-    """(4, 4): metres in the room's frame to scene units."""
-    return scale_and_shift(SCENE_UNITS_PER_METRE, -SCENE_UNITS_PER_METRE * SCENE_ORIGIN_M)
-
-
 def object_from_mesh(mesh: MeshField, units_per_metre: float = OBJECT_UNITS_PER_METRE) -> NDArray[np.float64]:
     """(4, 4): metres in the mesh's frame to object units, the bounding box's centre moved to the origin."""
     return scale_and_shift(units_per_metre, -units_per_metre * mesh.bounds.mean(dim=0).numpy())
@@ -78,27 +99,26 @@ def load_instance(meshes: Path, instance: dict[str, Any]) -> MeshField:
 
 def compose_room(meshes: Path, room: dict[str, Any]) -> UnionField:
     """The furnished room in scene units: exact boxes for floor and walls, every instance's mesh at its pose."""
-    to_scene = scene_from_room()
+    frame = SceneFrame.of(room)
     parts: list[SdfField] = []
     weights: list[float] = []
     floor_bottom = room["floor"]["box_min"][2]
     for box in [room["floor"], *room["walls"]]:
         # Walls reach down through the floor: two solids that only touched would have a false surface between them.
         lower = np.array([*box["box_min"][:2], floor_bottom])
-        corners = (np.stack((lower, box["box_max"])) - SCENE_ORIGIN_M) * SCENE_UNITS_PER_METRE
+        corners = frame.points(np.stack((lower, box["box_max"])))
         parts.append(BoxField(*(tuple(corner) for corner in corners.tolist())))
         weights.append(0.1)
     for instance in room["instances"]:
         mesh = load_instance(meshes, instance)
-        parts.append(mesh.transformed(to_scene @ np.array(instance["T_room_from_object"])))
+        parts.append(mesh.transformed(frame.from_room() @ np.array(instance["T_room_from_object"])))
         weights.append(0.25 if instance["class"] == "chair" else 0.1)
     return UnionField(parts, weights)
 
 
-def detection(instance: dict[str, Any]) -> dict[str, Any]:
+def detection(instance: dict[str, Any], frame: SceneFrame = SCENE_FRAME) -> dict[str, Any]:
     """The instance's axis-aligned box in scene units."""
-    corners = np.array([instance["aabb_min"], instance["aabb_max"]])
-    lower, upper = (corners - SCENE_ORIGIN_M) * SCENE_UNITS_PER_METRE
+    lower, upper = frame.points(np.array([instance["aabb_min"], instance["aabb_max"]]))
     return {
         "centre": ((lower + upper) / 2.0).tolist(),
         "size": (upper - lower).tolist(),
@@ -108,11 +128,16 @@ def detection(instance: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def truth(instance: dict[str, Any], mesh: MeshField, units_per_metre: float = OBJECT_UNITS_PER_METRE) -> dict[str, Any]:
+def truth(
+    instance: dict[str, Any],
+    mesh: MeshField,
+    units_per_metre: float = OBJECT_UNITS_PER_METRE,
+    frame: SceneFrame = SCENE_FRAME,
+) -> dict[str, Any]:
     """The true transform from scene to object, and the object's diameter (largest distance of two vertices)."""
     T_room_mesh = np.array(instance["T_room_from_object"])
-    matrix = object_from_mesh(mesh, units_per_metre) @ np.linalg.inv(scene_from_room() @ T_room_mesh)
-    scale = units_per_metre / SCENE_UNITS_PER_METRE
+    matrix = object_from_mesh(mesh, units_per_metre) @ np.linalg.inv(frame.from_room() @ T_room_mesh)
+    scale = units_per_metre / frame.units_per_metre
     rotation = Rotation.from_matrix(matrix[:3, :3] / scale)
     matrix[:3, :3] = scale * rotation.as_matrix()
     vertices = mesh.vertices * units_per_metre
@@ -128,13 +153,20 @@ def truth(instance: dict[str, Any], mesh: MeshField, units_per_metre: float = OB
     }
 
 
-def fit(target: SdfField, path: Path, options: FitOptions, label: str, made_from: list[str]) -> None:
+def fit(
+    target: SdfField,
+    path: Path,
+    options: FitOptions,
+    label: str,
+    made_from: list[str],
+    attribution: str = ATTRIBUTION,
+) -> None:
     """Fit one field, and keep what was measured beside the others' figures."""
 
     def show(iteration: int, loss: float, seconds_left: float) -> None:
         print(f"{path.name}: iteration {iteration}, loss {loss:.5f}, {seconds_left:.0f} s left", flush=True)
 
-    source = {"meshes": made_from, "attribution": ATTRIBUTION}
+    source = {"meshes": made_from, "attribution": attribution}
     report = fit_field(target, path, options, seed=0, progress=show, label=label, source=source)
     path.with_suffix(".fit.json").write_text(json.dumps(asdict(report), indent=1) + "\n")
     print(path.name, report, f"{path.stat().st_size / 1e6:.2f} MB")

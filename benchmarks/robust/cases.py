@@ -14,12 +14,8 @@ from regnf_core import open_field as open_safe_field
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.symmetry import Symmetries
 
-MAIN, HELD_OUT, FULL_SIZE, UNDER_TRAINED = (
-    "pairs.json",
-    "pairs-held-out.json",
-    "pairs-full-size.json",
-    "pairs-under-trained.json",
-)
+MAIN, HELD_OUT, FULL_SIZE = "pairs.json", "pairs-held-out.json", "pairs-full-size.json"
+UNDER_TRAINED = ("pairs-after-3-percent.json", "pairs-after-10-percent.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +52,15 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A detection in a room and the library's object that it shows. diameter: of the object, its units."""
+    """A detection in a scene and the library's object that it shows, fields by name.
+
+    instance: what the object is, whatever its field is called · diameter: of the object, its units.
+    """
 
     folder: Path
     room: str
     object: str
+    instance: str
     detection: OrientedBox
     truth: Sim3
     diameter: float
@@ -73,7 +73,7 @@ class Pair:
     def case(self) -> Case:
         """The right object in its detection."""
         scene, obj = open_field(self.folder, self.room), open_field(self.folder, self.object)
-        return Case(self.name, scene, obj, self.detection, self.truth, declared(self.object))
+        return Case(self.name, scene, obj, self.detection, self.truth, declared(self.instance))
 
     def with_other(self, other: str) -> Case:
         """Another object in this detection."""
@@ -98,4 +98,5 @@ def open_field(folder: Path, name: str) -> SdfField:
 def _pair(folder: Path, values: dict[str, Any]) -> Pair:
     box = OrientedBox.from_quaternion(values["detection"]["centre"], values["detection"]["size"])
     truth = Sim3.from_dict(values["truth"]["T_object_scene"])
-    return Pair(folder, values["room"], values["object"], box, truth, values["truth"]["object_diameter"])
+    names = (values["room"], values["object"], values["instance"])
+    return Pair(folder, *names, box, truth, values["truth"]["object_diameter"])

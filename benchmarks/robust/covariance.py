@@ -77,9 +77,13 @@ def _jobs(context: Context) -> Iterator[Job]:
             for number, pair in enumerate(main):
                 for draw in range(bends):
                     yield _bent_job(pair, amplitude, length, draw, 1000 * number + draw)
-    for pair in _pairs(context, UNDER_TRAINED):
-        for seed in range(context.seeds):
-            yield Job(pair.case, "under-trained", seed)
+    for file in UNDER_TRAINED:
+        group = (
+            file.removeprefix("pairs-").removesuffix(".json").replace("-", " ").replace("percent", "% of the training")
+        )
+        for pair in _pairs(context, file):
+            for seed in range(bends):
+                yield Job(pair.case, group, seed)
 
 
 def _bent_job(pair: Pair, amplitude: float, length: float, seed: int, bend: int) -> Job:
@@ -96,7 +100,7 @@ def bent(pair: Pair, amplitude: float, length: float, bend: int) -> Case:
 
 
 def _pairs(context: Context, file: str) -> Sequence[Pair]:
-    return [pair for pair in load_pairs(context.folder, file) if pair.object not in ANY_TURN]
+    return [pair for pair in load_pairs(context.folder, file) if pair.instance not in ANY_TURN]
 
 
 def _measure(case: Case, result: RegistrationResult) -> dict[str, Any]:
