@@ -1,0 +1,168 @@
+"""Fields that are a network of plain layers and nothing else: NeuS, DeepSDF at one latent code, SIREN."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from regnf_core.fields.activations import ACTIVATIONS
+from regnf_core.fields.function_field import FunctionField
+from regnf_core.fields.kinds.mlp import ActivationName, MlpDescription, count_layers
+from regnf_core.fields.positional_encoding import PositionalEncoding
+
+
+@dataclass(frozen=True)
+class LayerNorm:
+    """(a - mean) / sqrt(variance + 1e-5) * weight + bias, over the last axis. weight, bias: (width,)."""
+
+    weight: Tensor
+    bias: Tensor
+
+    def normalise(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The result (N, width), and what :meth:`pull_back` needs: a standardised, and 1 / its deviation (N, 1)."""
+        variance, mean = torch.var_mean(a, dim=-1, keepdim=True, correction=0)
+        scale = (variance + 1e-5).rsqrt()
+        standard = (a - mean) * scale
+        return standard * self.weight + self.bias, standard, scale
+
+    def pull_back(self, gradient: Tensor, standard: Tensor, scale: Tensor) -> Tensor:
+        """Gradient (N, width) by a, from that by the result."""
+        g = gradient * self.weight
+        along = (g * standard).mean(dim=-1, keepdim=True)
+        return scale * (g - g.mean(dim=-1, keepdim=True) - standard * along)
+
+    def to(self, device: torch.device | str) -> LayerNorm:
+        """The same on another device."""
+        return LayerNorm(self.weight.to(device), self.bias.to(device))
+
+
+@dataclass(frozen=True)
+class Layer:
+    """W [h, input] + b, then perhaps a layer normalisation. weight: (out, in), bias: (out,)."""
+
+    weight: Tensor
+    bias: Tensor
+    sees_input: bool = False
+    norm: LayerNorm | None = None
+
+    def to(self, device: torch.device | str) -> Layer:
+        """The same on another device."""
+        norm = None if self.norm is None else self.norm.to(device)
+        return Layer(self.weight.to(device), self.bias.to(device), self.sees_input, norm)
+
+
+@dataclass(frozen=True)
+class MlpFunction:
+    """x -> [x, sines and cosines of x] -> layers, activation between -> tanh, ``output_tanh`` times -> distance.
+
+    Of the last layer the first row is evaluated: the signed distance.
+    """
+
+    layers: tuple[Layer, ...]
+    activation: ActivationName
+    positional_encoding: PositionalEncoding | None = None
+    output_tanh: int = 0
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters live."""
+        return self.layers[0].weight.device
+
+    def to(self, device: torch.device | str) -> MlpFunction:
+        """The same function with its parameters on another device."""
+        return replace(self, layers=tuple(layer.to(device) for layer in self.layers))
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3)."""
+        inputs = self._inputs(points)
+        activate = ACTIVATIONS[self.activation].value
+        h = inputs
+        for layer in self.layers[:-1]:
+            a = _linear(layer, h, inputs)
+            h = activate(a if layer.norm is None else layer.norm.normalise(a)[0])
+        return self._squashed(_linear(self.layers[-1], h, inputs).squeeze(-1))[0]
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
+        inputs = self._inputs(points)
+        activation = ACTIVATIONS[self.activation]
+        h, slopes, standards = inputs, [], []
+        for layer in self.layers[:-1]:
+            a = _linear(layer, h, inputs)
+            if layer.norm is not None:
+                a, standard, scale = layer.norm.normalise(a)
+                standards.append((standard, scale))
+            slopes.append(activation.slope(a))
+            h = activation.value(a)
+        distance, slope = self._squashed(_linear(self.layers[-1], h, inputs).squeeze(-1))
+        gradient = slope.unsqueeze(-1) * self.layers[-1].weight  # (N, in)
+        by_input, gradient = _split(self.layers[-1], gradient, inputs)
+        for layer in reversed(self.layers[:-1]):
+            gradient = gradient * slopes.pop()
+            if layer.norm is not None:
+                gradient = layer.norm.pull_back(gradient, *standards.pop())
+            seen, gradient = _split(layer, gradient @ layer.weight, inputs)
+            by_input = by_input + seen
+        return distance, self._pull_back(inputs, gradient + by_input)
+
+    def _inputs(self, points: Tensor) -> Tensor:
+        if self.positional_encoding is None:
+            return points
+        return torch.cat((points, self.positional_encoding.encode(points)), dim=-1)
+
+    def _pull_back(self, inputs: Tensor, gradient: Tensor) -> Tensor:
+        if self.positional_encoding is None:
+            return gradient
+        return gradient[:, :3] + self.positional_encoding.pull_back(inputs[:, 3:], gradient[:, 3:])
+
+    def _squashed(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """tanh as often as asked for, and its derivative."""
+        slope = torch.ones_like(distance)
+        for _ in range(self.output_tanh):
+            distance = distance.tanh()
+            slope = slope * (1.0 - distance.square())
+        return distance, slope
+
+
+def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> FunctionField[MlpFunction]:
+    """The field of ``description`` with its parameters in ``tensors`` (names as in the safe format), in float32.
+
+    Tensors keep their device; they must have passed :meth:`MlpDescription.check_tensors`. Columns of sines and cosines
+    that were never used are left out.
+    """
+    encoding = description.positional_encoding
+    positional = None
+    if encoding is not None and encoding.used and encoding.degree > 0:
+        positional = PositionalEncoding.with_two_pi(encoding.degree, encoding.two_pi)
+    live = 3 + (positional.width if positional is not None else 0)
+    layers = []
+    count = count_layers(tensors)
+    for i in range(count):
+        rows = slice(0, 1) if i == count - 1 else slice(None)
+        weight, bias = (tensors[f"layers.{i}.{part}"][rows].float() for part in ("weight", "bias"))
+        sees_input = i in description.input_at
+        if i == 0 or sees_input:
+            weight = weight[:, : weight.shape[1] - description.input_width + live]
+        norm = None
+        if i in description.normalised:
+            norm = LayerNorm(tensors[f"norms.{i}.weight"].float(), tensors[f"norms.{i}.bias"].float())
+        layers.append(Layer(weight, bias, sees_input, norm))
+    function = MlpFunction(tuple(layers), description.activation, positional, description.output_tanh)
+    return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
+
+
+def _linear(layer: Layer, h: Tensor, inputs: Tensor) -> Tensor:
+    if layer.sees_input:
+        h = torch.cat((h, inputs), dim=-1)
+    return torch.addmm(layer.bias, h, layer.weight.T)
+
+
+def _split(layer: Layer, gradient: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    """What of the gradient by a layer's input belongs to the network's own input, and what to the layer before."""
+    if not layer.sees_input:
+        return torch.zeros_like(inputs), gradient
+    hidden = gradient.shape[1] - inputs.shape[1]
+    return gradient[:, hidden:], gradient[:, :hidden]

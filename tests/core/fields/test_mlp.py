@@ -1,0 +1,172 @@
+"""The kind ``mlp``: against a slow evaluation in float64, and the shapes that its descriptions ask for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.base import SdfField, differentiable_signed_distance
+from regnf_core.fields.build import build_field
+from regnf_core.fields.description import parse_description
+from regnf_core.fields.safe_format import open_field, write_safe_field
+from tests.core.fields.reference import central_differences
+
+Array = NDArray[Any]
+HIDDEN = (24, 20, 24, 24)
+PLAIN: dict[str, Any] = {"activation": "softplus"}
+CASES: dict[str, dict[str, Any]] = {
+    "softplus": PLAIN,
+    "relu": {"activation": "relu"},
+    "sine": {"activation": "sine"},
+    "skips": {"activation": "softplus", "input_at": [2, 4]},
+    "sines and cosines": {
+        "activation": "softplus",
+        "positional_encoding": {"degree": 4, "two_pi": False},
+        "input_at": [3],
+    },
+    "2 pi, unused": {
+        "activation": "softplus",
+        "positional_encoding": {"degree": 2, "two_pi": True, "used": False},
+        "input_at": [1],
+    },
+    "normalised": {"activation": "relu", "normalised": [0, 1, 3], "input_at": [2], "output_tanh": 1},
+    "tanh twice": {"activation": "sine", "output_tanh": 2},
+}
+
+
+def description(**changes: Any) -> dict[str, Any]:
+    return {"family": "mlp", "bounds": [[-1.0] * 3, [1.0] * 3]} | changes
+
+
+def encoding_width(values: dict[str, Any]) -> int:
+    return 6 * (values.get("positional_encoding") or {"degree": 0})["degree"]
+
+
+def tensors(values: dict[str, Any]) -> dict[str, Array]:
+    """Random layers that fit a description; the last has three rows."""
+    rng = np.random.default_rng(3)
+    inputs = 3 + encoding_width(values)
+    made, columns = {}, inputs
+    for i, rows in enumerate((*HIDDEN, 3)):
+        columns += inputs if i in values.get("input_at", ()) else 0
+        made[f"layers.{i}.weight"] = (1.5 * rng.normal(size=(rows, columns)) / math.sqrt(columns)).astype(np.float32)
+        made[f"layers.{i}.bias"] = (0.2 * rng.normal(size=rows)).astype(np.float32)
+        if i in values.get("normalised", ()):
+            made[f"norms.{i}.weight"] = rng.uniform(0.5, 1.5, rows).astype(np.float32)
+            made[f"norms.{i}.bias"] = (0.2 * rng.normal(size=rows)).astype(np.float32)
+        columns = rows
+    return made
+
+
+def slowly(values: dict[str, Any], stored: dict[str, Array], point: Array) -> float:
+    """The distance at one point (3,), layer by layer, in float64."""
+    encoding = values.get("positional_encoding")
+    waves: Array = np.zeros(encoding_width(values))
+    if encoding is not None and encoding.get("used", True):
+        factor = 2.0 * math.pi if encoding["two_pi"] else 1.0
+        angles = [factor * 2.0**k * point[axis] for axis in range(3) for k in range(encoding["degree"])]
+        waves = np.concatenate((np.sin(angles), np.cos(angles)))
+    inputs: Array = np.concatenate((point, waves))
+    h = inputs
+    activations: dict[str, Callable[[Array], Array]] = {
+        "relu": lambda a: np.maximum(a, 0.0),
+        "softplus": lambda a: np.logaddexp(100.0 * a, 0.0) / 100.0,
+        "sine": np.sin,
+    }
+    for i in range(5):
+        if i in values.get("input_at", ()):
+            h = np.concatenate((h, inputs))
+        h = stored[f"layers.{i}.weight"].astype(np.float64) @ h + stored[f"layers.{i}.bias"]
+        if i in values.get("normalised", ()):
+            h = (h - h.mean()) / np.sqrt(h.var() + 1e-5) * stored[f"norms.{i}.weight"] + stored[f"norms.{i}.bias"]
+        if i < 4:
+            h = activations[values["activation"]](h)
+    distance = h[0]
+    for _ in range(values.get("output_tanh", 0)):
+        distance = np.tanh(distance)
+    return float(distance)
+
+
+def built(values: dict[str, Any]) -> SdfField:
+    parsed = parse_description(description(**values))
+    return build_field(parsed, {name: torch.from_numpy(array) for name, array in tensors(values).items()})
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_agrees_with_a_slow_evaluation(case: str) -> None:
+    values = CASES[case]
+    stored = tensors(values)
+    points = np.random.default_rng(4).uniform(-1.2, 1.2, (40, 3))
+    field = built(values)
+    distance, gradient = field.signed_distance_and_gradient(torch.from_numpy(points))
+    exact = points.astype(np.float32).astype(np.float64)
+    np.testing.assert_allclose(distance.numpy(), [slowly(values, stored, p) for p in exact], atol=1e-5)
+    expected = np.stack([central_differences(lambda p: slowly(values, stored, p), p, 1e-7) for p in exact])
+    # A kink of ReLU within the differences' reach is possible, but not among these points.
+    np.testing.assert_allclose(gradient.numpy(), expected, atol=2e-5 * max(1.0, float(np.abs(expected).max())))
+    torch.testing.assert_close(field.signed_distance(torch.from_numpy(points)), distance, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_is_an_sdf_field_that_survives_its_file(case: str, tmp_path: Path) -> None:
+    values = CASES[case]
+    write_safe_field(tmp_path / "field", description(**values), tensors(values))
+    field = open_field(tmp_path / "field")
+    assert isinstance(field, SdfField)
+    points = torch.randn(10_000, 3, generator=torch.Generator().manual_seed(0))
+    expected = built(values).signed_distance(points)
+    assert torch.equal(field.to("cpu").signed_distance(points), expected)
+    seen = points[:5].clone().requires_grad_(True)
+    differentiable_signed_distance(field, seen).sum().backward()  # type: ignore[no-untyped-call]
+    assert seen.grad is not None
+    torch.testing.assert_close(seen.grad, field.signed_distance_and_gradient(points[:5])[1])
+
+
+def without(name: str) -> dict[str, Array]:
+    return {key: array for key, array in tensors(CASES["normalised"]).items() if key != name}
+
+
+def cut(name: str) -> dict[str, Array]:
+    return tensors(CASES["normalised"]) | {name: tensors(CASES["normalised"])[name][:-1]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "stored"),
+    [
+        ({}, without("norms.1.bias")),
+        ({}, without("layers.2.bias")),
+        ({}, without("layers.2.weight")),
+        ({}, cut("norms.1.bias")),
+        ({}, cut("layers.2.weight")),
+        ({}, cut("layers.3.bias")),
+        ({"input_at": []}, tensors(CASES["normalised"])),
+        ({"input_at": [0, 2]}, tensors(CASES["normalised"])),
+        ({"input_at": [2, 5]}, tensors(CASES["normalised"])),
+        ({"normalised": [0, 1, 4]}, tensors(CASES["normalised"])),
+        ({"normalised": [0, 1]}, tensors(CASES["normalised"])),
+        ({"positional_encoding": {"degree": 1}}, tensors(CASES["normalised"])),
+        ({}, {}),
+    ],
+)
+def test_tensors_that_do_not_fit(changes: dict[str, Any], stored: dict[str, Array], tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        write_safe_field(tmp_path / "f", description(**CASES["normalised"] | changes), stored)
+    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"activation": "gelu"}, {"output_tanh": 3}, {"input_at": [-1]}, {"input_at": list(range(40))}, {"hash": None}],
+)
+def test_descriptions_that_mean_nothing(changes: dict[str, Any]) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        parse_description(description(**PLAIN | changes))
+    assert caught.value.reason == "SAFE_FORMAT_INVALID"
