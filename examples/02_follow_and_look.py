@@ -1,4 +1,4 @@
-"""The same with options, progress, the errors against the truth, and pictures to look at.
+"""The same with the published method, progress, the errors against the truth, and pictures to look at.
 
 python examples/02_follow_and_look.py OUTPUT_FOLDER
 """
@@ -20,7 +20,7 @@ result = register(
     open_field(data / "mix-room.safetensors"),
     open_field(data / "armchair.safetensors"),
     OrientedBox.from_quaternion(box["centre"], box["size"], box["rotation_quaternion_xyzw"]),
-    RegistrationOptions.from_dict({"optimisation": {"iterations": 150}}),
+    RegistrationOptions.from_dict({"preset": "paper", "optimisation": {"iterations": 150}}),
     seed=3,
     progress=lambda phase, share: print(f"\r{phase:>14} {share:4.0%}", end="", file=sys.stderr),
 )

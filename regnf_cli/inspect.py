@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.console import out, read_json
+from regnf_cli.console import out
+from regnf_cli.request_files import read_object
 
 
 def inspect(
@@ -26,7 +27,7 @@ def inspect(
 
     from regnf_core.importing.gate import ImportLimits, import_field
 
-    given = read_json(description, "description") if description else None
+    given = read_object(description, "description") if description else None
     with tempfile.TemporaryDirectory() as folder:
         report = import_field(field, Path(folder), given, ImportLimits()).to_dict()
     if as_json:

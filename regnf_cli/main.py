@@ -1,6 +1,6 @@
 """The command ``regnf``: gathers the sub-commands and turns errors into exit codes.
 
-Exit codes: 0 registered (or done) · 1 ambiguous or rejected · 2 bad input · 3 service unavailable · 130 interrupted.
+Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable · 130 interrupted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from regnf_core.errors import RegnfError
 app = typer.Typer(
     name="regnf",
     help="Register neural signed distance fields: find the transform that lays a scene's object onto a library's.",
+    epilog="Exit codes: 0 registered or done, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.",
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.console import exit_code, out, phase_progress, read_json, show_result
-from regnf_core.errors import InvalidDetectionError, InvalidInputError
-from regnf_core.options import RegistrationOptions
-
-if TYPE_CHECKING:
-    from regnf_core.box import OrientedBox
+from regnf_cli.console import out, phase_progress
+from regnf_cli.report import exit_code, show_result
+from regnf_cli.request_files import parse_detection, read_object, read_options, read_transform
+from regnf_core.errors import InvalidInputError
+from regnf_core.options import Preset, RegistrationOptions
 
 _FILE: dict[str, Any] = {"exists": True, "dir_okay": False}
 
@@ -23,8 +22,15 @@ def register(
     scene: Annotated[Path, typer.Argument(help="The scene's field: safe field, checkpoint or mesh.", **_FILE)],
     object_: Annotated[Path, typer.Argument(metavar="OBJECT", help="The library object's field.", **_FILE)],
     detection: Annotated[Path, typer.Option(help="JSON: the box in the scene's frame.", **_FILE)],
+    preset: Annotated[
+        Preset | None, typer.Option(help="robust (the default) needs no starting guess; paper is the published method.")
+    ] = None,
     options: Annotated[
         Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **_FILE)
+    ] = None,
+    initial_transform: Annotated[
+        Path | None,
+        typer.Option(help="JSON: a T_object_scene to look at first, as a 4x4 or in a result document.", **_FILE),
     ] = None,
     truth: Annotated[
         Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **_FILE)
@@ -42,13 +48,20 @@ def register(
     """Find the similarity transform that lays the scene's object onto the library's.
 
     Example: **regnf register room.ckpt chair.ckpt --detection box.json --output out/**
+
+    Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
-    request = {
-        "detection": read_json(detection, "detection"),
-        "options": read_json(options, "options") if options else {},
+    request: dict[str, Any] = {
+        "detection": read_object(detection, "detection"),
+        "options": read_options(options, preset),
         "seed": seed,
-        "ground_truth": {"T_object_scene": _true_matrix(truth)} if truth else None,
+        "initial_transform": read_transform(initial_transform, "initial transform") if initial_transform else None,
+        "ground_truth": {"T_object_scene": read_transform(truth, "ground truth")} if truth else None,
     }
+    if request["initial_transform"] and RegistrationOptions.from_dict(request["options"]).preset != "robust":
+        raise InvalidInputError(
+            "only the preset robust starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED"
+        )
     if server is not None:
         from regnf_cli.remote import register_remotely
 
@@ -62,39 +75,6 @@ def register(
     raise typer.Exit(exit_code(document))
 
 
-def parse_detection(values: dict[str, Any]) -> OrientedBox:
-    """A detection's JSON as a box. Raises InvalidDetectionError for what is missing, unknown or malformed."""
-    from regnf_core.box import OrientedBox
-
-    known = {"min", "max", "centre", "size", "rotation_quaternion_xyzw", "label", "score"}
-    if unknown := sorted(set(values) - known):
-        raise InvalidDetectionError(f"detection holds unknown members: {', '.join(unknown)}")
-    shared = {name: values[name] for name in ("label", "score") if values.get(name) is not None}
-    try:
-        if values.keys() & {"min", "max"}:
-            if extra := sorted(values.keys() & {"centre", "size", "rotation_quaternion_xyzw"}):
-                raise InvalidDetectionError(f"detection holds corners and {', '.join(extra)}: either, not both")
-            return OrientedBox.from_corners(values["min"], values["max"], **shared)
-        quaternion = values.get("rotation_quaternion_xyzw") or (0.0, 0.0, 0.0, 1.0)
-        return OrientedBox.from_quaternion(values["centre"], values["size"], quaternion, **shared)
-    except KeyError as error:
-        raise InvalidDetectionError(f"detection lacks {error}") from error
-    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise InvalidDetectionError("detection must hold lists of three numbers") from error
-
-
-def _true_matrix(path: Path) -> Any:
-    """The 4x4 of a ground-truth file, given plainly or as the transform object that results carry.
-
-    Raises InvalidInputError (INVALID_TRANSFORM) when the file has neither.
-    """
-    transform = read_json(path, "ground truth").get("T_object_scene")
-    matrix = transform.get("matrix") if isinstance(transform, dict) else transform
-    if matrix is None:
-        raise InvalidInputError(f"ground truth {path}: no T_object_scene with a matrix", reason="INVALID_TRANSFORM")
-    return matrix
-
-
 def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: Path | None) -> dict[str, Any]:
     from regnf_core.diagnostics import result_document, write_artifacts
     from regnf_core.loading import load_field
@@ -103,8 +83,8 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
 
     options = RegistrationOptions.from_dict(request["options"])
     box = parse_detection(request["detection"])
-    matrix = request["ground_truth"]["T_object_scene"] if request["ground_truth"] else None
-    truth = Sim3.from_matrix(matrix) if matrix is not None else None
+    start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
+    truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)  # before the work, which would be lost
     with phase_progress() as bar:
@@ -116,6 +96,7 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
             options,
             request["seed"],
             lambda phase, share: bar.update(task, description=phase, completed=share),
+            start,
         )
         bar.update(task, description="exporting", completed=1.0)
     if output is not None:

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from regnf_core.errors import InvalidOptionsError
 
 Preset = Literal["paper", "robust"]
-_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
+_FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 _Ratio = Annotated[float, Gt(0), Le(1)]
 
 
@@ -143,7 +143,8 @@ class RegistrationOptions:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
-    preset: Preset = "paper"
+    preset: Preset = "robust"
+    """The engine: `robust` needs no starting guess, `paper` is the published method."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
     initialisation: InitialisationOptions = field(default_factory=InitialisationOptions)
     optimisation: OptimisationOptions = field(default_factory=OptimisationOptions)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import torch
+from torch import Tensor
 
 import regnf_core
+from regnf_core.diagnostics.uncertainty import COVARIANCE_ORDERING, uncertainty
 from regnf_core.metrics import errors_against_truth
 from regnf_core.result import Alternative, IterationRecord, RegistrationResult
 from regnf_core.sim3 import Sim3
 from regnf_core.symmetry import Symmetries
+from regnf_core.verdicts import VERDICT_REASONS
 
 
 def result_document(
@@ -30,11 +34,13 @@ def result_document(
     return {
         "verdict": result.verdict,
         "verdict_reason": result.verdict_reason,
+        "verdict_detail": VERDICT_REASONS.get(result.verdict_reason, ""),
         "T_object_scene": result.T_object_scene.to_dict(),
         "T_scene_object": result.T_object_scene.inverse().to_dict(),
         "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
         "alternatives": [_alternative(other) for other in result.alternatives],
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        **_covariance(result.covariance),
+        "symmetry": None if result.symmetry is None else asdict(result.symmetry),
         "metrics": {name: _json_number(value) for name, value in metrics.items()},
         "seed": result.seed,
         "options": result.options,
@@ -64,6 +70,17 @@ def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
         }
         for record in trace
     ]
+
+
+def _covariance(covariance: Tensor | None) -> dict[str, Any]:
+    if covariance is None:
+        return {"covariance": None, "covariance_ordering": None, "uncertainty": None}
+    rows = [[_json_number(value) for value in row] for row in covariance.tolist()]
+    return {
+        "covariance": rows,
+        "covariance_ordering": list(COVARIANCE_ORDERING),
+        "uncertainty": uncertainty(covariance),
+    }
 
 
 def _alternative(other: Alternative) -> dict[str, Any]:

@@ -28,12 +28,17 @@ REGISTER_EXAMPLES: dict[str, Any] = {
                 "label": "chair",
                 "score": 0.91,
             },
-            "options": {
-                "preset": "paper",
-                "sampling": {"views": 8, "up_axis": "z"},
-                "optimisation": {"iterations": 300},
-            },
+            "options": {"robust": {"up_axis": "z", "scene_samples": 6000}},
             "seed": 7,
+        },
+    },
+    "published": {
+        "summary": "The published method instead, with options of its own",
+        "value": {
+            "scene": SCENE,
+            "object": OBJECT,
+            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
+            "options": {"preset": "paper", "sampling": {"views": 8}, "optimisation": {"iterations": 300}},
         },
     },
     "measured": {

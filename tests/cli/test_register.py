@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from regnf_cli.register import parse_detection
-from regnf_core.errors import InvalidDetectionError
+from regnf_cli.report import symmetry_in_words
+from regnf_cli.request_files import parse_detection, read_options
+from regnf_core.errors import InvalidDetectionError, InvalidOptionsError
+from regnf_core.sim3 import Sim3
+from regnf_core.verdicts import VERDICT_REASONS
 from tests.cli.conftest import DATA, Run
 from tests.core.analytic import chair, chair_box, chair_pose, room
+from tests.core.robust.shapes import slab_table, table_room
 
 
 @pytest.fixture
@@ -27,6 +33,18 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     (tmp_path / "truth.json").write_text(json.dumps({"T_object_scene": truth.matrix().tolist()}))
     files = [tmp_path / name for name in ("room.safetensors", "chair.safetensors")]
     return ["register", *files, "--detection", tmp_path / "box.json", "--truth", tmp_path / "truth.json"]
+
+
+@pytest.fixture
+def twins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
+    """A registration of a table that half a turn carries onto itself."""
+    truth = Sim3.from_translation(torch.tensor([0.0, 0.0, -0.3], dtype=torch.float64))
+    fields = {"room.safetensors": table_room(truth), "table.safetensors": slab_table()}
+    for name in fields:
+        (tmp_path / name).touch()
+    monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
+    (tmp_path / "box.json").write_text('{"min": [-0.48, -0.33, -0.03], "max": [0.48, 0.33, 0.49]}')
+    return ["register", *(tmp_path / name for name in fields), "--detection", tmp_path / "box.json"]
 
 
 def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[object], tmp_path: Path) -> None:
@@ -45,10 +63,89 @@ def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_
     (tmp_path / "options.json").write_text('{"optimisation": {"iterations": 1}}')
     far = {"T_object_scene": {"matrix": np.eye(4).tolist()}}
     (tmp_path / "truth.json").write_text(json.dumps(far))  # as results spell it
-    outcome = run(*exact, "--options", tmp_path / "options.json")
+    outcome = run(*exact, "--preset", "paper", "--options", tmp_path / "options.json")
     assert outcome.code == 1, outcome.stderr
     assert outcome.stdout.startswith("verdict      rejected")
     assert "rotation_error_rad" in outcome.stdout
+
+
+def test_an_ambiguous_registration_ends_with_4_and_tells_the_twins(run: Run, twins: list[object]) -> None:
+    outcome = run(*twins)
+    assert outcome.code == 4, outcome.stderr
+    said = outcome.stdout
+    assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
+    assert VERDICT_REASONS["SEVERAL_POSES_AGREE"] in said
+    assert re.search(r"^ *1 +0\.\d{4} +180 degrees about z", said, flags=re.M)
+    assert re.search(r"^1 sigma +rotation( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
+    assert re.search(r"^ +translation( [\d.e-]+){3} object units$", said, flags=re.M)
+    assert re.search(r"^ +scale [\d.e-]+ %$", said, flags=re.M)
+    assert re.search(r"^symmetry +2 turns about \(0\.00, 0\.00, 1\.00\) of the object look alike", said, flags=re.M)
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "said"),
+    [
+        ({"order": 1, "axis": None, "continuous": False}, "none"),
+        ({"order": 4, "axis": None, "continuous": False}, "4 turns look alike, the identity included"),
+        ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any turn about (0.00, 0.00, 1.00) of the object"),
+        ({"order": 2, "axis": [1, 0, 0], "continuous": True}, "any turn about (1.00, 0.00, 0.00) of the object, and"),
+    ],
+)
+def test_symmetries_in_words(symmetry: dict[str, object], said: str) -> None:
+    assert symmetry_in_words(symmetry).startswith(said)
+
+
+def test_a_result_is_a_start_for_the_next(run: Run, exact: list[object], tmp_path: Path) -> None:
+    near = chair_pose().matrix()
+    near[0, 3] += 0.02
+    (tmp_path / "start.json").write_text(json.dumps({"T_object_scene": {"matrix": near.tolist()}}))
+    outcome = run(*exact, "--json", "--initial-transform", tmp_path / "start.json")
+    assert outcome.code == 0, outcome.stderr
+    assert json.loads(outcome.stdout)["metrics"]["rotation_error_rad"] < 0.01
+
+
+def test_the_published_method_starts_from_nothing_given(run: Run, exact: list[object], tmp_path: Path) -> None:
+    (tmp_path / "start.json").write_text(json.dumps(np.eye(4).tolist()))
+    outcome = run(*exact, "--preset", "paper", "--initial-transform", tmp_path / "start.json")
+    assert outcome.code == 2
+    assert outcome.stderr.startswith("INITIAL_TRANSFORM_UNSUPPORTED ")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{}",
+        '{"T_object_scene": {"scale": 2}}',
+        '{"T_object_scene": null}',
+        "[[1, 2], [3]]",
+        "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
+        "[[NaN, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+        '"abcd"',
+        "7",
+    ],
+)
+@pytest.mark.parametrize("option", ["--initial-transform", "--truth"])
+def test_a_file_without_a_transform_is_refused(
+    option: str, text: str, run: Run, exact: list[object], tmp_path: Path
+) -> None:
+    (tmp_path / "T.json").write_text(text)
+    outcome = run(*exact, option, tmp_path / "T.json")
+    assert outcome.code == 2
+    assert outcome.stderr.startswith("INVALID_TRANSFORM ")
+
+
+def test_the_file_names_the_preset_unless_two_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "options.json"
+    file.write_text('{"preset": "paper"}')
+    assert read_options(file, None) == read_options(file, "paper") == {"preset": "paper"}
+    assert read_options(None, "paper") == {"preset": "paper"}
+    assert read_options(None, None) == {}
+    with pytest.raises(InvalidOptionsError, match="says 'paper', --preset robust"):
+        read_options(file, "robust")
+
+
+def test_an_unknown_preset_is_refused(run: Run, demo: list[object]) -> None:
+    assert run(*demo, "--preset", "fastest").code == 2
 
 
 @pytest.mark.parametrize(
@@ -90,14 +187,6 @@ def test_detections_that_are_refused(detection: str, said: str, run: Run, exact:
 def test_boxes_that_are_refused(values: dict[str, object]) -> None:
     with pytest.raises(InvalidDetectionError):
         parse_detection(values)
-
-
-@pytest.mark.parametrize("truth", ["{}", '{"T_object_scene": {"scale": 2}}', '{"T_object_scene": [[1, 2], [3]]}'])
-def test_a_truth_without_a_transform_is_refused(truth: str, run: Run, exact: list[object], tmp_path: Path) -> None:
-    (tmp_path / "truth.json").write_text(truth)
-    outcome = run(*exact)
-    assert outcome.code == 2
-    assert outcome.stderr.startswith("INVALID_TRANSFORM ")
 
 
 def test_options_that_are_refused(run: Run, demo: list[object], tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def service(verdict: str, artifact: str = "result.json") -> Answers:
     return answers
 
 
-@pytest.mark.parametrize(("verdict", "code"), [("registered", 0), ("ambiguous", 1), ("rejected", 1)])
+@pytest.mark.parametrize(("verdict", "code"), [("registered", 0), ("ambiguous", 4), ("rejected", 1)])
 def test_the_verdict_decides(verdict: str, code: int, run: Run, demo: list[object], serve: Serve) -> None:
     outcome = run(*demo, "--server", serve(service(verdict)))
     assert outcome.code == code, outcome.stderr

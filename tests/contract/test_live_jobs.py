@@ -16,11 +16,12 @@ from tests.contract.world import assert_refused, field_bytes, sha256
 
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 QUICK = {
+    "preset": "paper",
     "sampling": {"views": 2, "image_size": 64, "pixel_stride": 2},
     "initialisation": {"ransac_iterations": 1000},
     "optimisation": {"iterations": 5},
 }
-ENDLESS = {"optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
+ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +16,9 @@ from PIL import Image
 from regnf_core.diagnostics import result_document, write_artifacts
 from regnf_core.diagnostics.preview import residual_colours
 from regnf_core.diagnostics.splats import Surfels, View, render
-from regnf_core.result import Alternative
+from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.sim3 import Sim3
+from regnf_core.verdicts import VERDICT_REASONS
 from tests.core.conftest import ChairRun
 
 NAMES = [
@@ -48,11 +50,15 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
     assert set(document) == {
         "verdict",
         "verdict_reason",
+        "verdict_detail",
         "T_object_scene",
         "T_scene_object",
         "T_object_scene_initial",
         "alternatives",
         "covariance",
+        "covariance_ordering",
+        "uncertainty",
+        "symmetry",
         "metrics",
         "seed",
         "options",
@@ -61,7 +67,8 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
     forth, back = (np.array(document[name]["matrix"]) for name in ("T_object_scene", "T_scene_object"))
     np.testing.assert_allclose(forth @ back, np.eye(4), atol=1e-9)
     assert document["metrics"]["rotation_error_rad"] < 0.02
-    assert document["covariance"] is None
+    assert document["verdict_detail"] == VERDICT_REASONS["SURFACES_AGREE"]
+    assert [document[name] for name in ("covariance", "covariance_ordering", "uncertainty", "symmetry")] == [None] * 4
     assert document["engine"]["name"] == "regnf"
     assert "rotation_error_rad" not in result_document(chair_run.result)["metrics"]
 
@@ -76,6 +83,31 @@ def test_numbers_that_json_lacks_become_null(chair_run: ChairRun) -> None:
     assert document["alternatives"][0]["relation"] == "180 degrees about z"
     assert len(document["covariance"]) == 7
     json.dumps(document, allow_nan=False)
+
+
+def test_uncertainty_is_the_covariance_in_units_of_people(chair_run: ChairRun) -> None:
+    degree, unit, percent = math.radians(1.0), 0.25, 0.01
+    variances = [degree**2, (2 * degree) ** 2, (3 * degree) ** 2, unit**2, 4 * unit**2, 0.0, percent**2]
+    document = result_document(replace(chair_run.result, covariance=torch.tensor(variances).double().diag()))
+    assert document["covariance_ordering"] == ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
+    assert document["uncertainty"]["rotation_deg"] == pytest.approx([1.0, 2.0, 3.0])
+    assert document["uncertainty"]["translation"] == pytest.approx([0.25, 0.5, 0.0])
+    assert document["uncertainty"]["scale_percent"] == pytest.approx(1.0)
+
+
+def test_what_is_no_variance_has_no_deviation(chair_run: ChairRun) -> None:
+    odd = torch.diag(torch.tensor([-1.0, math.nan, 1.0, math.inf, 1.0, 1.0, -1e-9]).double())
+    document = json.loads(json.dumps(result_document(replace(chair_run.result, covariance=odd)), allow_nan=False))
+    assert document["uncertainty"]["rotation_deg"][:2] == [None, None]
+    assert document["uncertainty"]["translation"] == [None, 1.0, 1.0]
+    assert document["uncertainty"]["scale_percent"] is None
+    assert document["covariance"][1][1] is None
+
+
+def test_the_objects_symmetry_is_told(chair_run: ChairRun) -> None:
+    round_one = replace(chair_run.result, symmetry=ObjectSymmetry(2, (0.0, 0.0, 1.0), True))
+    document = json.loads(json.dumps(result_document(round_one)))
+    assert document["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": True}
 
 
 def test_clouds_come_back_through_another_reader(chair_run: ChairRun, folder: Path) -> None:

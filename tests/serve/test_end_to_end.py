@@ -20,7 +20,7 @@ from tests.core.importing.checkpoints import write_small_checkpoint
 from tests.devdata import ROOT
 
 DATA = ROOT / "examples" / "data"
-QUICK = {"optimisation": {"iterations": 3}, "sampling": {"pixel_stride": 16}}
+ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
 DEADLINE_S = 120
 Client = httpx.Client
 
@@ -41,7 +41,6 @@ def demo(client: Client) -> dict[str, Any]:
         "scene": upload(client, (DATA / "mix-room.safetensors").read_bytes()),
         "object": upload(client, (DATA / "armchair.safetensors").read_bytes()),
         "detection": json.loads((DATA / "detection.json").read_text()),
-        "options": QUICK,
     }
 
 
@@ -168,7 +167,7 @@ def test_a_box_of_air_holds_no_surface(client: Client, demo: dict[str, Any]) -> 
 
 def running(client: Client, request: dict[str, Any]) -> str:
     """A long job that has begun to optimise."""
-    job_id = submit(client, {**request, "options": {"optimisation": {"iterations": 10_000, "stop_residual": 0.0}}})
+    job_id = submit(client, {**request, "options": ENDLESS})
     wait(lambda: client.get(f"/jobs/{job_id}", params={"wait": 1}).json(), lambda job: job["phase"] == "optimising")
     return job_id
 

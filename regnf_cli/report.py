@@ -1,0 +1,75 @@
+"""A result document for people: verdict, the 4x4, how sure it is, and the figures that matter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from regnf_cli.console import EXIT_AMBIGUOUS, EXIT_NOT_REGISTERED, EXIT_REGISTERED, out
+
+_EXIT_CODES = {"registered": EXIT_REGISTERED, "ambiguous": EXIT_AMBIGUOUS}
+_COLOURS = {"registered": "green", "ambiguous": "yellow"}
+
+
+def exit_code(document: dict[str, Any]) -> int:
+    """0 for a registered result, 4 for an ambiguous one, 1 for a rejected one."""
+    return _EXIT_CODES.get(document["verdict"], EXIT_NOT_REGISTERED)
+
+
+def show_result(document: dict[str, Any]) -> None:
+    """Print what a result document says. Documents of other versions may lack everything but verdict and transform."""
+    verdict = escape(document["verdict"])
+    out.print(
+        f"verdict      [bold {_COLOURS.get(verdict, 'red')}]{verdict}[/]  ({escape(document['verdict_reason'])})",
+        soft_wrap=True,
+    )
+    if detail := document.get("verdict_detail"):
+        _line("", detail)
+    transform = document["T_object_scene"]
+    out.print("T_object_scene (scene coordinates to object coordinates)")
+    for row in transform["matrix"]:
+        out.print("   " + " ".join(f"{value: .6f}" for value in row))
+    _line("scale", f"{transform['scale']:.6f}")
+    _show_uncertainty(document.get("uncertainty"))
+    if symmetry := document.get("symmetry"):
+        _line("symmetry", symmetry_in_words(symmetry))
+    _show_alternatives(document.get("alternatives") or [])
+    for name, value in document["metrics"].items():
+        _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+def symmetry_in_words(symmetry: dict[str, Any]) -> str:
+    """An object's symmetry as a result document has it: order, axis, continuous."""
+    order, axis = symmetry["order"], symmetry["axis"]
+    numbers = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in axis or ())  # adding zero makes -0.00 plain
+    about = "" if axis is None else f" about ({numbers}) of the object"
+    if symmetry["continuous"]:
+        return f"any turn{about}" + (", and either end up" if order > 1 else "")
+    return "none" if order == 1 else f"{order} turns{about} look alike, the identity included"
+
+
+def _show_uncertainty(sigmas: dict[str, Any] | None) -> None:
+    if sigmas is None:
+        return
+    _line("1 sigma", f"rotation {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
+    _line("", f"translation {_numbers(sigmas['translation'])} object units")
+    _line("", f"scale {_numbers([sigmas['scale_percent']])} %")
+
+
+def _show_alternatives(alternatives: list[dict[str, Any]]) -> None:
+    if not alternatives:
+        return
+    table = Table("", "score", "relation to the result", title="alternatives", title_justify="left", box=None)
+    for number, other in enumerate(alternatives, 1):
+        table.add_row(str(number), f"{other['score']:.4f}", escape(other["relation"]))
+    out.print(table)
+
+
+def _line(name: str, value: str) -> None:
+    out.print(f"{name:<12} {value}", markup=False, soft_wrap=True)
+
+
+def _numbers(values: list[float | None]) -> str:
+    return " ".join("-" if value is None else f"{value:.2g}" for value in values)
