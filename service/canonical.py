@@ -11,20 +11,22 @@ from typing import Any
 
 from regnf_core import __version__
 from service.schemas.registrations import Question
+from service.schemas.transforms import rows_of
 
 _ID_DIGITS = 32
 
 
 def canonical_request(question: Question, scene: str, object_: str) -> dict[str, Any]:
     """What a worker reads from the job record: every default filled in, every spelling of a value made one."""
-    truth = question.ground_truth
+    start, truth = question.initial_transform, question.ground_truth
     return {
         "scene": scene,
         "object": object_,
         "detection": question.detection.canonical(),
         "options": question.options.to_dict(),
         "seed": question.seed,
-        "ground_truth": None if truth is None else {"T_object_scene": truth.T_object_scene},
+        "initial_transform": None if start is None else rows_of(start),
+        "ground_truth": None if truth is None else {"T_object_scene": rows_of(truth.T_object_scene)},
     }
 
 

@@ -81,6 +81,11 @@ REASONS: dict[str, Reason] = {
         "Invalid transform",
         "The matrix is no similarity transform: (s R, t) with s > 0, R a rotation, last row 0 0 0 1.",
     ),
+    "INITIAL_TRANSFORM_UNSUPPORTED": Reason(
+        422,
+        "Initial transform unsupported",
+        "The preset `paper` makes its own first guess. Leave `initial_transform` out, or take the preset `robust`.",
+    ),
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
     ),

@@ -103,5 +103,6 @@ def _inputs(request: dict[str, Any]) -> dict[str, Any]:
         "object": request["object"],
         "detection": request["detection"],
         "seed": request["seed"],
+        "initial_transform": request["initial_transform"],
         "options_sha256": digest(request["options"]),
     }

@@ -45,15 +45,13 @@ class CoreEngine:
         return {"version": __version__, "device": self.device}
 
     def register(self, scene: Path, object_: Path, request: dict[str, Any], report: Report, folder: Path) -> list[str]:
-        import torch
-
         from regnf_core.box import OrientedBox
         from regnf_core.diagnostics import write_artifacts
         from regnf_core.fields.safe_format import open_field
         from regnf_core.registration import register
         from regnf_core.sim3 import Sim3
 
-        truth = request.get("ground_truth")
+        start, truth = request.get("initial_transform"), request.get("ground_truth")
         result = register(
             open_field(scene, self.device),
             open_field(object_, self.device),
@@ -61,10 +59,10 @@ class CoreEngine:
             RegistrationOptions.from_dict(request["options"]),
             request["seed"],
             report,
+            Sim3.from_matrix(start) if start else None,
         )
         report("exporting", 0.95)
-        matrix = truth["T_object_scene"] if truth else None
-        T_true = Sim3.from_matrix(torch.tensor(matrix, dtype=torch.float64)) if matrix is not None else None
+        T_true = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
         names: list[str] = write_artifacts(result, folder, truth=T_true)
         return names
 

@@ -41,6 +41,20 @@ REGISTER_EXAMPLES: dict[str, Any] = {
             "options": {"preset": "paper", "sampling": {"views": 8}, "optimisation": {"iterations": 300}},
         },
     },
+    "warm start": {
+        "summary": "Where to look first, from an earlier result or a robot's odometry",
+        "value": {
+            "scene": SCENE,
+            "object": OBJECT,
+            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
+            "initial_transform": [
+                [2.0, 0.0, 0.0, 0.3],
+                [0.0, 2.0, 0.0, 0.1],
+                [0.0, 0.0, 2.0, -0.4],
+                [0.0, 0.0, 0.0, 1.0],
+            ],
+        },
+    },
     "measured": {
         "summary": "With the known transform: the metrics then hold the errors",
         "value": {

@@ -73,6 +73,7 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INVALID_DETECTION",
             "INVALID_OPTIONS",
             "INVALID_TRANSFORM",
+            "INITIAL_TRANSFORM_UNSUPPORTED",
             "FIELD_REJECTED",
             "DETECTION_OUTSIDE_SCENE",
             "IDEMPOTENCY_KEY_REUSED",

@@ -30,7 +30,9 @@ class JobDocument(Outgoing):
     started_at: str | None = None
     finished_at: str | None = None
     expires_at: str | None = Field(None, description="When a finished job and its artifacts will be gone.")
-    inputs: dict[str, Any] = Field(description="scene, object, detection, seed, and the SHA-256 of the full options.")
+    inputs: dict[str, Any] = Field(
+        description="scene, object, detection, seed, initial_transform, and the SHA-256 of the full options."
+    )
     engine: dict[str, Any] = Field({}, description="Version and device.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     links: Links

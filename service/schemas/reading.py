@@ -7,14 +7,19 @@ from typing import TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from service.problems import Problem, json_pointer
-from service.schemas.detections import SPELLINGS
+from service.schemas.detections import SPELLINGS as BOX_SPELLINGS
+from service.schemas.registrations import START_UNSUPPORTED
+from service.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
 from service.strict_json import parse_json
 
 _REASONS = {
     "detection": "INVALID_DETECTION",
     "options": "INVALID_OPTIONS",
+    "initial_transform": "INVALID_TRANSFORM",
     "ground_truth": "INVALID_TRANSFORM",
 }
+_REASONS_OF_FAULTS = {START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED"}
+_SPELLINGS = BOX_SPELLINGS | TRANSFORM_SPELLINGS
 _Model = TypeVar("_Model")
 
 
@@ -35,9 +40,12 @@ def refusal(error: ValidationError, otherwise: str) -> Problem:
     if any(fault["type"] == "json_invalid" for fault in error.errors(include_url=False, include_input=False)):
         return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
     faults = error.errors(include_url=False, include_input=False, include_context=False)
-    places = [[part for part in fault["loc"] if part not in SPELLINGS] for fault in faults]
-    heads = [str(place[0]) if place else "" for place in places]
-    reason = next((_REASONS[head] for head in heads if head in _REASONS), otherwise)
+    places = [[part for part in fault["loc"] if part not in _SPELLINGS] for fault in faults]
+    reasons = [
+        _REASONS_OF_FAULTS.get(fault["type"]) or _REASONS.get(str(place[0]) if place else "")
+        for fault, place in zip(faults, places, strict=True)
+    ]
+    reason = next(filter(None, reasons), otherwise)
     entries = [
         {"pointer": json_pointer(place), "detail": fault["msg"].removeprefix("Value error, ")}
         for place, fault in zip(places, faults, strict=True)

@@ -129,6 +129,60 @@ def test_transforms(world: World, truth: Any) -> None:
     assert_refused(post(world, world.valid_request() | {"ground_truth": truth}), 422, "INVALID_TRANSFORM")
 
 
+def rows(*changes: tuple[int, int, Any]) -> Any:
+    return matrix(*changes)["T_object_scene"]
+
+
+@pytest.mark.parametrize(
+    ("start", "pointer"),
+    [
+        (rows((0, 3, float("nan"))), "/initial_transform/0/3"),
+        (rows((1, 1, float("inf"))), "/initial_transform/1/1"),
+        (rows((1, 1, 10**400)), "/initial_transform/1/1"),
+        (rows((1, 1, "1")), "/initial_transform/1/1"),
+        (rows((1, 1, True)), "/initial_transform/1/1"),
+        (rows((1, 1, None)), "/initial_transform/1/1"),
+        (rows((2, 2, -1)), "/initial_transform"),
+        (rows((0, 1, 2e-4)), "/initial_transform"),
+        (rows((0, 0, 1.001)), "/initial_transform"),
+        (rows((0, 0, 0), (1, 1, 0), (2, 2, 0)), "/initial_transform"),
+        (rows((3, 3, 2)), "/initial_transform"),
+        (rows((3, 0, 0.1)), "/initial_transform"),
+        (IDENTITY[:3], "/initial_transform"),
+        ([row[:3] for row in IDENTITY], "/initial_transform/0"),
+        ([], "/initial_transform"),
+        ([value for row in IDENTITY for value in row], "/initial_transform"),
+        ("identity", "/initial_transform"),
+        (7, "/initial_transform"),
+        ({}, "/initial_transform/matrix"),
+        ({"matrix": None}, "/initial_transform/matrix"),
+        ({"matrix": rows((2, 2, -1))}, "/initial_transform/matrix"),
+        ({"matrix": IDENTITY, "scale": 2}, "/initial_transform"),
+        ({"matrix": IDENTITY, "scale": 0}, "/initial_transform/scale"),
+        ({"matrix": IDENTITY, "translation": [0, 0, 1]}, "/initial_transform"),
+        ({"matrix": IDENTITY, "rotation_quaternion_xyzw": [0, 0, 1, 0]}, "/initial_transform"),
+        ({"matrix": IDENTITY, "rotation_quaternion_xyzw": [0, 0, 0, 0]}, "/initial_transform"),
+        ({"matrix": IDENTITY, "more": 1}, "/initial_transform/more"),
+        ({"T_object_scene": IDENTITY}, "/initial_transform/matrix"),
+    ],
+)
+def test_initial_transforms(world: World, start: Any, pointer: str) -> None:
+    body = world.valid_request() | {"initial_transform": start}
+    problem = assert_refused(post(world, body), 422, "INVALID_TRANSFORM")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+def test_the_published_method_takes_no_initial_transform(world: World) -> None:
+    body = world.valid_request() | {"initial_transform": IDENTITY, "options": {"preset": "paper"}}
+    problem = assert_refused(post(world, body), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
+    assert [entry["pointer"] for entry in problem["errors"]] == ["/initial_transform"]
+
+
+def test_of_an_unusable_preset_and_an_initial_transform_the_preset_is_refused(world: World) -> None:
+    body = world.valid_request() | {"initial_transform": IDENTITY, "options": {"preset": "fastest"}}
+    assert_refused(post(world, body), 422, "INVALID_OPTIONS")
+
+
 @pytest.mark.parametrize(
     ("change", "pointer"),
     [

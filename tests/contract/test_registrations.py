@@ -37,7 +37,15 @@ def test_the_record_holds_the_canonical_request(world: World) -> None:
     assert record.request["options"]["sampling"]["views"] == 9
     assert record.request["options"]["optimisation"]["iterations"] == 200
     assert (record.request["seed"], record.request["ground_truth"]) == (0, None)
-    assert set(record.request) == {"scene", "object", "detection", "options", "seed", "ground_truth"}
+    assert set(record.request) == {
+        "scene",
+        "object",
+        "detection",
+        "options",
+        "seed",
+        "initial_transform",
+        "ground_truth",
+    }
 
 
 def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
@@ -54,6 +62,38 @@ def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
     assert len(world.queue.registrations) == 1
 
 
+def test_two_spellings_of_one_start_are_one_job(world: World) -> None:
+    turned = [[0, -2, 0, 0.5], [2, 0, 0, 0], [0, 0, 2, -1], [0, 0, 0, 1]]
+    half = 0.5**0.5
+    spelled = {"matrix": turned, "scale": 2, "translation": [0.5, 0, -1]}
+    spellings: list[Any] = [
+        turned,
+        {"matrix": [[float(value) or -0.0 for value in row] for row in turned]},
+        spelled | {"rotation_quaternion_xyzw": [0, 0, half, half]},
+        spelled | {"rotation_quaternion_xyzw": [0, 0, -3, -3]},
+    ]
+    jobs = [post(world, initial_transform=start).json() for start in spellings]
+    assert len({job["id"] for job in jobs}) == 1
+    assert jobs[0]["inputs"]["initial_transform"] == turned
+    record = world.records.get_job(jobs[0]["id"])
+    assert record is not None
+    assert record.request["initial_transform"] == turned
+
+
+def test_a_results_own_transform_is_a_start_and_a_truth(world: World) -> None:
+    world.succeed(first := world.submit())
+    found = world.client.get(f"/jobs/{first}/result").json()["T_object_scene"]
+    answer = post(world, initial_transform=found, ground_truth={"T_object_scene": found})
+    assert answer.status_code == 202, answer.text
+    record = world.records.get_job(answer.json()["id"])
+    assert record is not None
+    assert record.request["initial_transform"] == found["matrix"] == record.request["ground_truth"]["T_object_scene"]
+
+
+def test_no_start_is_the_same_as_none(world: World) -> None:
+    assert post(world).json()["id"] == post(world, initial_transform=None).json()["id"]
+
+
 def test_what_differs_in_anything_is_another_job(world: World) -> None:
     truth = {"T_object_scene": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}
     changes: list[dict[str, Any]] = [
@@ -62,6 +102,7 @@ def test_what_differs_in_anything_is_another_job(world: World) -> None:
         {"options": {"sampling": {"views": 6}}},
         {"detection": BOX | {"label": "chair"}},
         {"ground_truth": truth},
+        {"initial_transform": truth["T_object_scene"]},
         {"scene": world.valid_request()["object"]},
     ]
     assert len({post(world, **change).json()["id"] for change in changes}) == len(changes)

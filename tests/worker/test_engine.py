@@ -1,0 +1,40 @@
+"""What the worker's engine hands to regnf_core, with a double in its place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from regnf_core.options import RegistrationOptions
+from worker.engine import CoreEngine
+
+START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
+REQUEST: dict[str, Any] = {
+    "detection": {"centre": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 1]},
+    "options": RegistrationOptions().to_dict(),
+    "seed": 3,
+}
+
+
+@pytest.mark.parametrize("start", [None, START])
+def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[Any] = []
+    monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
+    monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
+    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, truth: ["result.json"])
+    request = REQUEST | {"initial_transform": start, "ground_truth": None}
+    names = CoreEngine("cpu").register(Path("scene"), Path("object"), request, lambda phase, share: None, tmp_path)
+    ((scene, obj, box, options, seed, _, given),) = calls
+    assert (scene, obj, seed, names) == ("scene", "object", 3, ["result.json"])
+    assert options == RegistrationOptions()
+    assert box.size.tolist() == [1, 1, 1]
+    assert (None if given is None else given.matrix().tolist()) == start
+
+
+def test_requests_recorded_before_there_were_starts_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
+    monkeypatch.setattr("regnf_core.registration.register", lambda *given: None)
+    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, truth: [])
+    assert CoreEngine("cpu").register(Path("s"), Path("o"), REQUEST, lambda phase, share: None, tmp_path) == []
