@@ -36,6 +36,7 @@ def convert_file(
     from regnf_core.fields.safe_format import open_field, write_safe_field
 
     converted = _convert(upload, description, limits.tensor_bytes)
+    _require_text(converted.description)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
     parameters = sum(array.size for array in converted.tensors.values())
@@ -75,6 +76,14 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
         return convert_safe_field(upload, data, tensor_bytes, wanted)
     reason, detail = explain_refusal(head)
     raise FieldFormatError(detail, reason=reason)
+
+
+def _require_text(description: dict[str, Any]) -> None:
+    """JSON can spell lone surrogates, which no file can hold. Raises FieldFormatError (SAFE_FORMAT_INVALID)."""
+    try:
+        json.dumps(description, ensure_ascii=False).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
 def _mapped(upload: Path) -> memoryview:

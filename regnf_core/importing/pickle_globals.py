@@ -18,6 +18,7 @@ Handler = Callable[[GlobalRef, tuple[Any, ...]], Any]
 _MAX_DIMENSIONS = 16
 _MAX_EXTENT = 1 << 48
 _MAX_SCALAR_TEXT = 64
+_TUPLE_KEY_WORK = 100
 _STORAGE_KEY = re.compile(r"[0-9]{1,20}")
 _NUMPY_SCALARS = {"f8": "<d", "f4": "<f", "f2": "<e", "i8": "<q", "i4": "<i", "i2": "<h", "i1": "<b"}
 _NUMPY_SCALARS |= {"u8": "<Q", "u4": "<I", "u2": "<H", "u1": "<B", "b1": "<?"}
@@ -131,7 +132,7 @@ def _reconstructed(function: GlobalRef, args: tuple[Any, ...]) -> Placeholder:
     return Placeholder(named.full_name)
 
 
-def dict_key(value: Any, depth: int = 4) -> Any:
+def dict_key(value: Any, depth: int = 2) -> Any:
     """``value`` if it may be a dictionary's key: a short scalar, an inert object, or a shallow tuple of such."""
     if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 64:
         raise pickle_error("a dictionary's key is a giant integer", "PICKLE_INTEGER_TOO_LARGE")
@@ -140,6 +141,21 @@ def dict_key(value: Any, depth: int = 4) -> Any:
     if isinstance(value, tuple) and depth > 0 and len(value) <= _MAX_DIMENSIONS:
         return tuple(dict_key(part, depth - 1) for part in value)
     raise pickle_error("a dictionary's key is no plain value")
+
+
+def key_work(key: object) -> int:
+    """What a dictionary's key costs of the opcode budget.
+
+    Tuples cost more: their hash follows from their numbers alone, so a file can hold any number of them with one hash,
+    and each insertion then compares with all before it.
+    """
+    return _TUPLE_KEY_WORK if isinstance(key, tuple) else 1
+
+
+def call_work(args: tuple[Any, ...]) -> int:
+    """What a call may cost of the opcode budget: it may look at every argument, and make a dictionary of the lists."""
+    pairs = (item for arg in args[:2] if isinstance(arg, list) for item in arg)
+    return len(args) + sum(key_work(pair[0]) if isinstance(pair, (list, tuple)) and pair else 1 for pair in pairs)
 
 
 _BUILTINS = ("builtins", "__builtin__")

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing import pickle_globals
-from regnf_core.importing.pickle_globals import dict_key
+from regnf_core.importing.pickle_globals import dict_key, key_work
 from regnf_core.importing.pickle_stream import PickleStream, pickle_error
 from regnf_core.importing.pickle_values import GlobalRef, NumpyType, Placeholder
 
@@ -153,7 +153,9 @@ class _Machine:
         if len(items) % 2:
             raise pickle_error("a key without a value")
         if isinstance(target, dict):
-            target.update((dict_key(key), value) for key, value in zip(items[::2], items[1::2], strict=True))
+            for key, value in zip(items[::2], items[1::2], strict=True):
+                self.charge(key_work(key))
+                target[dict_key(key)] = value
         elif not isinstance(target, Placeholder):
             raise pickle_error("keys for something that is no dictionary")
 
@@ -169,7 +171,7 @@ class _Machine:
 
     def name_global(self, module: Any, name: Any) -> None:
         for part in (module, name):
-            if not isinstance(part, str) or not part.isprintable() or not 0 < len(part) <= _MAX_GLOBAL_NAME:
+            if not isinstance(part, str) or not 0 < len(part) <= _MAX_GLOBAL_NAME or not part.isprintable():
                 raise pickle_error("a global's name is no plain text")
         self.push(GlobalRef(module, name))
 
@@ -179,8 +181,8 @@ class _Machine:
 
     def reduce(self) -> None:
         args, function = self.pop(), self.pop()
-        if isinstance(args, tuple) and args and isinstance(args[0], list):
-            self.charge(len(args[0]))  # the call may copy it
+        if isinstance(args, tuple):
+            self.charge(pickle_globals.call_work(args))
         self.push(pickle_globals.call(function, args))
 
     def new_object_with_keywords(self) -> None:

@@ -24,6 +24,8 @@ _STORED: dict[str, np.dtype[Any]] = {
 }
 _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
 _FINITE_CHUNK = 1 << 20
+_MAX_ELEMENTS = 1 << 60
+"""What numpy can address at eight bytes each. It counts empty axes as ones: even an array of nothing has a limit."""
 
 
 def tensor_error(message: str, reason: str) -> FieldFormatError:
@@ -44,9 +46,9 @@ class TensorSource:
     def array(self, name: str, value: object) -> Float32Array:
         """The tensor called ``name`` as a contiguous float32 array of its own shape.
 
-        Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, TENSOR_EXPECTED, TENSOR_NOT_DENSE, TENSOR_DTYPE,
-        TENSOR_DEVICE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH, TENSOR_TOO_LARGE, TENSOR_NOT_FINITE or
-        ARCHIVE_CRC_MISMATCH.
+        Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, TENSOR_EXPECTED, TENSOR_NOT_DENSE, TENSOR_SHAPE,
+        TENSOR_DTYPE, TENSOR_DEVICE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH, TENSOR_TOO_LARGE,
+        TENSOR_NOT_FINITE or ARCHIVE_CRC_MISMATCH.
         """
         ref = as_tensor(name, value)
         stored = _stored_type(name, ref)
@@ -115,6 +117,8 @@ def _stored_type(name: str, ref: TensorRef) -> np.dtype[Any]:
 
 def _check_dense(name: str, ref: TensorRef, count: int) -> None:
     """Every element of the storage occurs exactly once: strides are those of some order of the axes, offset is 0."""
+    if math.prod(max(extent, 1) for extent in ref.shape) > _MAX_ELEMENTS:
+        raise tensor_error(f"{name} has a shape that no array has: {ref.shape}", "TENSOR_SHAPE")
     expected = 1
     for stride, extent in sorted((s, n) for s, n in zip(ref.strides, ref.shape, strict=True) if n != 1):
         if stride != expected and count:

@@ -58,8 +58,9 @@ def storage(key: str, count: int, kind: str = "FloatStorage", device: str = "cpu
 
 
 def integer(value: int) -> bytes:
-    """The opcode that pushes an integer of up to 64 bits."""
-    return b"\x8a\x09" + value.to_bytes(9, "little", signed=True)
+    """The opcode that pushes an integer of up to 255 bytes."""
+    width = max(9, value.bit_length() // 8 + 1)
+    return b"\x8a" + bytes([width]) + value.to_bytes(width, "little", signed=True)
 
 
 def numbers(values: tuple[int, ...]) -> bytes:

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from regnf_core.importing.container import read_archive
-from regnf_core.importing.pickle_reader import PickleLimits, read_pickle
+from regnf_core.importing.pickle_reader import read_pickle
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder, TensorRef
 from tests.core.importing.archives import assert_refused, integer, storage, tensor, text
 
@@ -281,13 +281,3 @@ def test_giant_integers_as_keys_are_refused() -> None:
 
 def test_a_string_that_claims_gigabytes_is_refused() -> None:
     refused(PROTO + b"X" + struct.pack("<I", 1 << 31) + b".", "PICKLE_STRING_TOO_LARGE")
-
-
-def test_work_is_limited() -> None:
-    limits = PickleLimits(opcodes=100, memo=10)
-    assert_refused(lambda: read_pickle(memoryview(PROTO + b"N0" * 60 + b"N."), limits), "PICKLE_TOO_COMPLEX")
-    many = b"N" + b"".join(b"q" + bytes([i]) for i in range(20)) + b"."
-    assert_refused(lambda: read_pickle(memoryview(PROTO + many), limits), "PICKLE_TOO_COMPLEX")
-    pairs = b"(" + b"NN\x86" * 30 + b"lq\x00"
-    copies = (b"ccollections\nOrderedDict\nh\x00\x85R0") * 5
-    assert_refused(lambda: read_pickle(memoryview(PROTO + pairs + copies + b"."), limits), "PICKLE_TOO_COMPLEX")

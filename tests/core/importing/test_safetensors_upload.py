@@ -115,6 +115,17 @@ def test_weights_that_are_not_finite_are_refused(field_file: Path, tmp_path: Pat
     assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "FIELD_NOT_FINITE")
 
 
+def test_a_label_that_is_no_unicode_text_is_refused(field_file: Path, tmp_path: Path) -> None:
+    """JSON can spell half a surrogate pair; UTF-8 cannot."""
+    data = field_file.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    description = json.loads(header["__metadata__"]["field"]) | {"label": "\ud800"}
+    header["__metadata__"]["field"] = json.dumps(description)
+    path = saved(tmp_path, layout(header, data[8 + length :]))
+    assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
+
+
 def test_the_budget_holds(field_file: Path, tmp_path: Path) -> None:
     limits = ImportLimits(tensor_bytes=1000)
     assert_refused(lambda: convert_file(field_file, tmp_path, None, limits), "TENSOR_TOO_LARGE")

@@ -96,6 +96,12 @@ def test_tensors_that_lie_are_refused(body: bytes, reason: str) -> None:
     assert_refused(lambda: materialise(made_by_hand(body, s0=SIX)), reason)
 
 
+@pytest.mark.parametrize("shape", [(0, 1 << 47, 1 << 47), (1 << 47, 0, 1 << 47), (0, *[1 << 47] * 15)])
+def test_an_empty_tensor_too_wide_for_any_array_is_refused(shape: tuple[int, ...]) -> None:
+    for strides in (shape, (1,) * len(shape)):
+        assert_refused(partial(materialise, made_by_hand(tensor("0", shape, strides), s0=b"")), "TENSOR_SHAPE")
+
+
 def test_real_odd_tensors_are_refused() -> None:
     sparse = torch.eye(3).to_sparse()
     assert_refused(lambda: materialise(saved(sparse)), "UNSAFE_GLOBAL_IN_WEIGHTS")
