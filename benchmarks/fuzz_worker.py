@@ -1,0 +1,146 @@
+"""The process that runs a fuzzer's cases: little memory, a time limit each, every import and file noticed.
+
+    python -m benchmarks.fuzz_worker SEEDS FOLDER SEED
+
+Reads lines "FIRST COUNT" and answers each with one line of JSON. The case under way lies in FOLDER/case, for whoever
+has to find out why this process ended. Needs no torch.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import resource
+import signal
+import sys
+import time
+from collections import Counter
+from contextlib import nullcontext
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from benchmarks.line_coverage import Coverage
+from tests.core.importing.fuzzing.cases import STAGES, make_case
+from tests.core.importing.fuzzing.seeds import load_seeds
+from tests.core.importing.fuzzing.stages import Watch, run_stage
+
+MEMORY_BYTES = 2 << 30
+CASE_S = 5.0
+_MOST_FINDS = 400
+_TRACED_SHARE = 0.5
+
+
+class TimeLimitError(BaseException):
+    """A case took too long. No stage may catch it."""
+
+
+def _late(*_: object) -> None:
+    raise TimeLimitError
+
+
+class Fuzzer:
+    """Makes cases and runs them. A case's index and the seed decide it, together with what was found before."""
+
+    def __init__(self, seeds: Path, folder: Path, seed: str) -> None:
+        self.seeds = load_seeds(seeds)
+        self.folder, self.seed = folder, seed
+        self.scratch = folder / "scratch"
+        self.scratch.mkdir(exist_ok=True)
+        self.case = (folder / "case").open("w+b", buffering=0)
+        self.coverage, self.watch = Coverage(), Watch()
+        self.finds: dict[str, list[bytes]] = {stage: [] for stage in STAGES}
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Have every module loaded that sound files need."""
+        for data in (self.seeds.archive, self.seeds.field_file, b""):
+            for stage in STAGES:
+                run_stage(stage, data, self.scratch)
+        run_stage("pickle", self.seeds.pickles[1], self.scratch)
+
+    def run_chunk(self, first: int, count: int) -> dict[str, Any]:
+        outcomes: Counter[str] = Counter()
+        failures: list[dict[str, Any]] = []
+        samples: dict[str, tuple[str, bytes]] = {}
+        slowest, slowest_at = 0.0, ""
+        for index in range(first, first + count):
+            stage = STAGES[index % len(STAGES)]
+            data = make_case(Random(f"{self.seed} {index}"), stage, self.seeds, self.finds[stage])
+            begun = time.perf_counter()
+            outcome, fault = self.run_case(stage, data, Random(index).random() < _TRACED_SHARE)
+            seconds = time.perf_counter() - begun
+            if seconds > slowest:
+                slowest, slowest_at = seconds, f"{stage} {index}"
+            outcomes[f"{stage} {outcome}"] += 1
+            if fault:
+                failures.append({"at": f"{stage} {index}", "fault": fault, "case": base64.b64encode(data).decode()})
+            if stage != "pickle":
+                samples["taken" if outcome == "taken" else "refused"] = (stage, data)
+        return {
+            "outcomes": outcomes,
+            "failures": failures,
+            "slowest": [slowest, slowest_at],
+            "lines": self.coverage.lines(),
+            "finds": sum(map(len, self.finds.values())),
+            "samples": [[stage, base64.b64encode(data).decode()] for stage, data in samples.values()],
+            "peak_bytes": _peak_bytes(),
+        }
+
+    def run_case(self, stage: str, data: bytes, traced: bool) -> tuple[str, str]:
+        """The outcome, and what was wrong about it ("" for nothing)."""
+        self._write_down(stage, data)
+        known, before = len(sys.modules), len(self.coverage.steps)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, CASE_S)
+            with self.watch.over(stage), self.coverage.over() if traced else nullcontext():
+                outcome = run_stage(stage, data, self.scratch)
+            fault = ""
+        except (TimeLimitError, Exception) as error:  # noqa: BLE001 (whatever it is, it is the find)
+            outcome, fault = type(error).__name__, f"{error!r:.300}"
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        if len(self.coverage.steps) > before and len(self.finds[stage]) < _MOST_FINDS:
+            self.finds[stage].append(data)
+        return outcome, fault or self._traces(known)
+
+    def _write_down(self, stage: str, data: bytes) -> None:
+        text = stage.encode() + b"\n" + data
+        self.case.truncate(len(text))
+        os.pwrite(self.case.fileno(), text, 0)
+
+    def _traces(self, known: int) -> str:
+        """What a case must not leave or do."""
+        events, self.watch.events = self.watch.events, []
+        left = [path.name for path in self.scratch.iterdir()]
+        for name in left:
+            (self.scratch / name).unlink()
+        if events:
+            return f"audit events: {events[:3]}"
+        if left:
+            return f"files left: {left[:3]}"
+        return "" if len(sys.modules) == known else "a module was imported"
+
+
+def _peak_bytes() -> int:
+    """Largest resident size. getrusage would count what the parent held when it forked."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))
+
+
+def main(arguments: list[str]) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    signal.signal(signal.SIGALRM, _late)
+    fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2])
+    if "torch" in sys.modules:
+        raise RuntimeError("the stages loaded torch")
+    for line in sys.stdin:
+        first, count = map(int, line.split())
+        sys.stdout.write(json.dumps(fuzzer.run_chunk(first, count)) + "\n")
+        sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

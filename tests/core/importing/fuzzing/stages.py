@@ -1,0 +1,104 @@
+"""The gate's stages, run in this process on one case, and watched: what they import, open or start is an event."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.safe_format import write_safe_field
+from regnf_core.importing import convert
+from regnf_core.importing.container import read_archive
+from regnf_core.importing.families import convert_checkpoint
+from regnf_core.importing.pickle_reader import read_pickle
+from regnf_core.importing.safetensors_header import read_header
+from regnf_core.importing.tensors import TensorSource
+from regnf_core.importing.upload_description import UploadDescription
+
+BUDGET = 1 << 24
+"""Bytes of tensors that one case may have."""
+_TAKEN = "taken"
+_QUIET = ("object.", "sys._getframe", "code.__new__", "builtins.id", "gc.", "tempfile.", "time.", "sys.", "mmap.")
+"""Beginnings of the audit events that mean nothing here."""
+
+
+class Watch:
+    """Collects the audit events of a case: an import, a program, a socket ... that a file has brought about."""
+
+    def __init__(self) -> None:
+        self._armed = False
+        self._files = False
+        self.events: list[str] = []
+        sys.addaudithook(self._hear)
+
+    def _hear(self, event: str, args: tuple[Any, ...]) -> None:
+        if not self._armed or event.startswith(_QUIET) or (self._files and event in ("open", "os.remove", "os.rename")):
+            return
+        self.events.append(f"{event} {args!r:.200}")
+
+    @contextmanager
+    def over(self, stage: str) -> Iterator[None]:
+        """Watch one case."""
+        self._armed, self._files = True, stage == "file"
+        try:
+            yield
+        finally:
+            self._armed = False
+
+
+def run_stage(stage: str, data: bytes, folder: Path) -> str:
+    """The reason of the refusal, or "taken". Any other exception passes through. ``folder`` is for the stage "file"."""
+    try:
+        match stage:
+            case "container":
+                _container(data)
+            case "pickle":
+                read_pickle(memoryview(data))
+            case "tensors":
+                _tensors(data)
+            case "header":
+                read_header(memoryview(data))
+            case "file":
+                _file(data, folder)
+    except FieldFormatError as error:
+        return error.reason
+    return _TAKEN
+
+
+def _container(data: bytes) -> None:
+    archive = read_archive(memoryview(data))
+    for name in archive.entries:
+        archive.read(name)
+
+
+def _tensors(data: bytes) -> None:
+    archive = read_archive(memoryview(data))
+    value = read_pickle(archive.read("data.pkl"))
+    refusals = []
+    for name, found in _values(value):
+        try:
+            TensorSource(archive, BUDGET).array(name, found)
+        except FieldFormatError as error:
+            refusals.append(error)
+    convert_checkpoint(value, TensorSource(archive, BUDGET), UploadDescription())
+
+
+def _values(value: Any) -> list[tuple[str, Any]]:
+    """The values of the checkpoint's state, whatever they are."""
+    state = value.get("pipeline", value) if isinstance(value, dict) else {"value": value}
+    members = state.items() if isinstance(state, dict) else [("state", state)]
+    return [(key if isinstance(key, str) else "odd", found) for key, found in members][:100]
+
+
+def _file(data: bytes, folder: Path) -> None:
+    upload, out = folder / "upload", folder / "out"
+    upload.write_bytes(data)
+    try:
+        converted = convert._convert(upload, None, BUDGET)
+        write_safe_field(out, converted.description, converted.tensors)
+    finally:
+        upload.unlink()
+        out.unlink(missing_ok=True)
