@@ -27,7 +27,7 @@ def register(
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
-    raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, everything else
+    raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, anything else
     is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.object_model.model_object` made of
     ``obj`` earlier. Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).

@@ -38,11 +38,20 @@ class Problem:
 
     view: SceneView
     model: ObjectModel
+    scene_field: WorkingField
     object_field: WorkingField
     A: Samples
     B: Samples
     A_held: Samples
     B_held: Samples
+
+    def in_field_frames(self, T_work: Sim3) -> Sim3:
+        """A single pose between the working frames as T_object_scene."""
+        return self.model.frame.to_field() @ T_work @ self.view.frame.to_field().inverse()
+
+    def in_working_frames(self, T_object_scene: Sim3) -> Sim3:
+        """A single T_object_scene as a pose between the working frames."""
+        return self.model.frame.to_field().inverse() @ T_object_scene @ self.view.frame.to_field()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +64,17 @@ class Outcome:
 
 
 def pose_problem(
-    view: SceneView, model: ObjectModel, obj: SdfField, options: RobustOptions, generator: torch.Generator
+    view: SceneView,
+    model: ObjectModel,
+    scene: SdfField,
+    obj: SdfField,
+    options: RobustOptions,
+    generator: torch.Generator,
 ) -> Problem:
     """Split the samples of both surfaces into those to refine on and those to judge on."""
     A, A_held = split(view.foreground, options.held_out_share, generator)
     B, B_held = split(model.samples, options.held_out_share, generator)
-    return Problem(view, model, model.field(obj), A, B, A_held, B_held)
+    return Problem(view, model, view.field(scene), model.field(obj), A, B, A_held, B_held)
 
 
 def find_candidates(
@@ -100,7 +114,7 @@ def refine_candidates(
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
-    scene, obj, ex = problem.view.field, problem.object_field, problem.model.extremes
+    scene, obj, ex = problem.scene_field, problem.object_field, problem.model.extremes
     found = None
     T = candidates
     for stage in STAGES:

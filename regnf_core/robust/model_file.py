@@ -17,6 +17,7 @@ from regnf_core.robust.frame import WorkingFrame
 from regnf_core.robust.object_model import ObjectModel
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.self_symmetry import SelfSymmetry
+from regnf_core.robust.signature import SIGNATURE_LENGTH
 from regnf_core.sim3 import Sim3
 
 MODEL_VERSION = "1"
@@ -33,6 +34,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
     "symmetry.translation": ("K", 3),
     "symmetry.deviation": ("K",),
     "symmetry.axis": ("A", 3),
+    "signature": (SIGNATURE_LENGTH,),
 }
 
 
@@ -51,6 +53,7 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
         "symmetry.translation": model.symmetry.T.translation,
         "symmetry.deviation": model.symmetry.deviation,
         "symmetry.axis": axis[None] if axis is not None else torch.zeros(0, 3),
+        "signature": model.signature,
     }
     content = save(
         {name: tensor.contiguous() for name, tensor in tensors.items()}, {"regnf_object_model": MODEL_VERSION}
@@ -87,6 +90,7 @@ def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:
         float(lengths[1]),
         tensors["extremes"].float(),
         SelfSymmetry(T, axes[0].double() if len(axes) else None, tensors["symmetry.deviation"].float()),
+        tensors["signature"].float(),
     )
 
 

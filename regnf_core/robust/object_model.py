@@ -17,6 +17,7 @@ from regnf_core.robust.residuals import Samples
 from regnf_core.robust.rotations import super_fibonacci
 from regnf_core.robust.samples import sample_object_surface
 from regnf_core.robust.self_symmetry import SelfSymmetry, confirmed, self_symmetry
+from regnf_core.robust.signature import signature
 
 _EXTREMES = 16
 _SEED = 0  # an object's model is the same for every registration
@@ -27,7 +28,8 @@ _ROTATIONS = 600  # tried for symmetries
 class ObjectModel:
     """An object's surface and symmetries. Points in the working frame: the surface's centroid at 0, its diameter 1.
 
-    spacing: between samples · extremes: (E, 3) outermost points, by which two placements are told apart.
+    spacing: between samples · extremes: (E, 3) outermost points, by which two placements are told apart · signature:
+    (310,), see :mod:`regnf_core.robust.signature`.
     """
 
     frame: WorkingFrame
@@ -35,6 +37,7 @@ class ObjectModel:
     spacing: float
     extremes: Tensor
     symmetry: SelfSymmetry
+    signature: Tensor
 
     @cached_property
     def proxy(self) -> ProxyField:
@@ -59,6 +62,7 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     proxy = proxy_of(sampled.samples, sampled.spacing)
     proposed = self_symmetry(proxy, sampled.samples, extremes, super_fibonacci(_ROTATIONS), generator)
     symmetry = confirmed(proposed, sampled.field, sampled.samples, extremes, generator)
-    model = ObjectModel(sampled.frame, sampled.samples, sampled.spacing, extremes, symmetry)
-    model.__dict__["proxy"] = proxy
+    samples = sampled.samples
+    model = ObjectModel(sampled.frame, samples, sampled.spacing, extremes, symmetry, signature(samples))
+    model.__dict__["proxy"] = proxy  # what the property would make again
     return model

@@ -8,7 +8,7 @@ from functools import cached_property
 import torch
 
 from regnf_core.box import OrientedBox
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.frame import WorkingField, WorkingFrame
 from regnf_core.robust.proxy import ProxyField, proxy_of
@@ -23,14 +23,19 @@ _FEWEST = 30  # samples in front of the supports; with fewer, the supports are k
 class SceneView:
     """The surface in the detection box. Working frame: the box's centre at 0, its diagonal 1.
 
-    foreground: the samples that stand in front of floors and walls · spacing: between samples.
+    foreground: the samples that stand in front of floors and walls · spacing: between samples · evaluations: of the
+    scene's field, that it took to make this.
     """
 
-    field: WorkingField
     frame: WorkingFrame
     detection: OrientedBox
     foreground: Samples
     spacing: float
+    evaluations: int
+
+    def field(self, scene: SdfField) -> WorkingField:
+        """The scene's field, the one that this view is of, in the working frame."""
+        return WorkingField(scene, self.frame)
 
     @cached_property
     def proxy(self) -> ProxyField:
@@ -38,16 +43,16 @@ class SceneView:
         return proxy_of(self.foreground, self.spacing)
 
 
-def view_scene(
-    scene: SdfField, detection: OrientedBox, options: RobustOptions, generator: torch.Generator
-) -> SceneView:
-    """Sample the scene's surface in the box and set floors and walls aside.
+def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions, seed: int) -> SceneView:
+    """Sample the scene's surface in the box and set floors and walls aside. Deterministic for ``seed``.
 
     Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
     InvalidInputError (FIELD_NOT_FINITE).
     """
-    sampled = sample_scene_surface(scene, detection, options.scene_samples, generator)
+    generator = torch.Generator().manual_seed(seed)
+    counted = CountingField(scene)
+    sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
     foreground = sampled.samples[~support(sampled.samples, generator)]
     if len(foreground) < _FEWEST:
         foreground = sampled.samples
-    return SceneView(sampled.field, sampled.frame, detection, foreground, sampled.spacing)
+    return SceneView(sampled.frame, detection, foreground, sampled.spacing, counted.evaluations)

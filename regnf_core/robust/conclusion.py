@@ -1,0 +1,70 @@
+"""What is to be said of the finalists: the winner, its rivals, the verdict and the covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.options import RegistrationOptions
+from regnf_core.result import Alternative, Verdict
+from regnf_core.robust.covariance import covariance, in_object_units
+from regnf_core.robust.engine import Outcome, Problem
+from regnf_core.robust.finalists import LAST
+from regnf_core.robust.judgement import verdict
+from regnf_core.robust.levenberg import fitting_width
+from regnf_core.robust.poses import distinct, select
+from regnf_core.robust.relation import relation
+from regnf_core.robust.residuals import residuals
+from regnf_core.sim3 import Sim3
+
+_RIVALS_APART = 0.1  # object diameters: poses closer together are one answer with its uncertainty
+_MARGIN_PER_SCORE = 0.15  # the worse the fields agree at all, the less a difference says
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """The winner by the held-out samples, and all that is to be said of it. winner: its number among the finalists."""
+
+    verdict: Verdict
+    reason: str
+    winner: int
+    T: Sim3
+    metrics: dict[str, float]
+    alternatives: list[Alternative]
+    covariance: Tensor
+
+
+def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -> Conclusion:
+    """The winner by the held-out samples, its rivals, verdict and covariance."""
+    evidence, poses = outcome.evidence, outcome.finalists.T
+    winner = int(evidence.scores.argmin())
+    ranked = distinct(poses, evidence.scores, problem.model.extremes, _RIVALS_APART, poses.scale.numel())
+    best = float(evidence.scores[winner])
+    close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
+    rivals = [i for i in ranked.tolist() if i != winner and close[i]]
+    decision, reason = verdict(evidence, winner, len(rivals), options.robust)
+    T_work = select(poses, torch.tensor(winner))
+    T = problem.in_field_frames(T_work)
+    alternatives = []
+    axis = problem.model.symmetry.axis
+    for i in rivals if decision != "rejected" else []:
+        other = problem.in_field_frames(select(poses, torch.tensor(i)))
+        alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T, axis)))
+    diameter = problem.model.frame.length
+    metrics = {
+        **evidence.of(winner),
+        "object_diameter": diameter,
+        "iterations": float(len(outcome.finalists.trail.steps)),
+        "finalists": float(evidence.scores.numel()),
+    }
+    return Conclusion(decision, reason, winner, T, metrics, alternatives, _covariance(problem, T_work))
+
+
+def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
+    A, B = problem.A, problem.B
+    batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
+    r = residuals(problem.scene_field, problem.object_field, A, B, batch)
+    cov = covariance(r, fitting_width(r, LAST.widths[-1]))
+    return in_object_units(cov, T_work, problem.view.frame, problem.model.frame)
