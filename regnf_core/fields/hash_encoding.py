@@ -71,12 +71,12 @@ class HashEncoding:
         self.config = config
         self.table = table
         self.active_levels = config.levels if active_levels is None else min(active_levels, config.levels)
-        entries, resolutions = config.level_entries(), config.level_resolutions()
+        entries, strides = config.level_entries(), config.level_strides()
         active = slice(0, self.active_levels)
         # Resolutions never fall from level to level, so the dense levels come first.
         self._dense = sum(config.level_is_dense()[active])
         offsets = [sum(entries[:level]) for level in range(config.levels)]
-        rows = [(1, res, res * res) for res in resolutions[: self._dense]]
+        rows = [(1, nodes, nodes * nodes) for nodes in strides[: self._dense]]
         rows += [_PRIMES] * (self.active_levels - self._dense)
         self._strides = torch.tensor(rows, dtype=torch.int64, device=table.device).T.unsqueeze(-1)  # (3, A, 1)
         self._scales = self._column(torch.tensor(config.scales()[active], dtype=torch.float32))

@@ -41,14 +41,17 @@ class HashGridConfig:
     """Ratio of the resolutions of neighbouring levels."""
     resolutions: tuple[Annotated[int, Gt(1), Le(1 << 24)], ...] | None = None
     """Nodes along an edge, per level, where they must differ from the computed ones (see :meth:`with_entry_count`)."""
+    strides: tuple[Annotated[int, Gt(1), Le(1 << 24)], ...] | None = None
+    """Nodes along an edge by which a level's rows were indexed in training, where that device rounded otherwise than
+    the machine that laid out the table (see :meth:`stride_variants`)."""
     interpolation: Interpolation = "smoothstep"
 
     def __post_init__(self) -> None:
-        if self.resolutions is not None and len(self.resolutions) != self.levels:
-            raise FieldFormatError(
-                f"hash grid has {self.levels} levels and {len(self.resolutions)} resolutions",
-                reason="FIELD_SHAPES_MISMATCH",
-            )
+        for name, values in (("resolutions", self.resolutions), ("strides", self.strides)):
+            if values is not None and len(values) != self.levels:
+                raise FieldFormatError(
+                    f"hash grid has {self.levels} levels and {len(values)} {name}", reason="FIELD_SHAPES_MISMATCH"
+                )
 
     @classmethod
     def from_top_resolution(cls, top_resolution: int, **values: Any) -> HashGridConfig:
@@ -83,6 +86,10 @@ class HashGridConfig:
         cap = 1 << self.log2_table_size
         return tuple(min(_round_up(res**3), cap) for res in self.level_resolutions())
 
+    def level_strides(self) -> tuple[int, ...]:
+        """Nodes along an edge by which each level's rows are indexed."""
+        return self.level_resolutions() if self.strides is None else self.strides
+
     def level_is_dense(self) -> tuple[bool, ...]:
         """Whether each level keeps one entry a node (else its nodes are hashed)."""
         pairs = zip(self.level_resolutions(), self.level_entries(), strict=True)
@@ -112,17 +119,38 @@ class HashGridConfig:
         """This config, then those with other roundings of the doubtful levels, fewest changes first."""
         yield self
         usual = self.level_resolutions()
-        doubtful = []
+        for changed in _changed(usual, self._otherwise_rounded()):
+            yield replace(self, resolutions=changed)
+
+    def stride_variants(self) -> Iterator[HashGridConfig]:
+        """This table indexed by other roundings of its dense, doubtful levels, fewest changes first; not this config.
+
+        The table's length tells how its levels were laid out, but not how the device that trained it computed a row.
+        """
+        fits = {
+            level: other
+            for level, other in self._otherwise_rounded().items()
+            if self.level_is_dense()[level] and other**3 <= self.level_entries()[level]
+        }
+        for changed in _changed(self.level_resolutions(), fits):
+            yield replace(self, strides=changed)
+
+    def _otherwise_rounded(self) -> dict[int, int]:
+        """The levels whose resolution hangs on the last bit of exp2f, each with its other resolution."""
+        usual = self.level_resolutions()
+        doubtful = {}
         for level, scale in enumerate(self.scales()):
             nearest = round(scale)
             if abs(scale - nearest) <= _ROUNDING_REACH * max(1.0, scale / 1000):
-                doubtful.append((level, (nearest + 2) if usual[level] == nearest + 1 else (nearest + 1)))
-        for changes in range(1, len(doubtful) + 1):
-            for chosen in itertools.combinations(doubtful, changes):
-                resolutions = list(usual)
-                for level, resolution in chosen:
-                    resolutions[level] = resolution
-                yield replace(self, resolutions=tuple(resolutions))
+                doubtful[level] = nearest + 2 if usual[level] == nearest + 1 else nearest + 1
+        return doubtful
+
+
+def _changed(usual: tuple[int, ...], others: dict[int, int]) -> Iterator[tuple[int, ...]]:
+    """``usual`` with one or more levels replaced by their other value, fewest changes first."""
+    for changes in range(1, len(others) + 1):
+        for chosen in itertools.combinations(others, changes):
+            yield tuple(others[level] if level in chosen else value for level, value in enumerate(usual))
 
 
 def _round_up(nodes: int) -> int:

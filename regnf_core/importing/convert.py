@@ -35,7 +35,7 @@ def convert_file(
     """
     from regnf_core.fields.safe_format import open_field, write_safe_field
 
-    converted = _convert(upload, description, limits.tensor_bytes)
+    converted = _settled(_convert(upload, description, limits.tensor_bytes))
     _require_text(converted.description)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
@@ -86,6 +86,15 @@ def _require_text(description: dict[str, Any]) -> None:
         raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
+def _settled(converted: ConvertedField) -> ConvertedField:
+    """The one function that the field stands for, where its shapes leave several."""
+    if not converted.readings:
+        return converted
+    from regnf_core.importing.choice import choose_reading  # loads torch
+
+    return choose_reading(converted)
+
+
 def _mapped(upload: Path) -> memoryview:
     with open(upload, "rb") as file:
         if os.fstat(file.fileno()).st_size == 0:
@@ -113,9 +122,11 @@ def main(arguments: list[str]) -> int:
     """The process: confine, convert, report."""
     request = json.load(sys.stdin)
     limits = ImportLimits(**request["limits"])
-    isolation = confine(limits, request["parent_pid"])
-    upload, out_dir = map(Path, arguments)
-    report = run(upload, out_dir, request["description"], limits)
+    out_dir = Path(arguments[1])
+    # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
+    upload = os.open(arguments[0], os.O_RDONLY)
+    isolation = confine(limits, request["parent_pid"], upload, out_dir)
+    report = run(Path(f"/proc/self/fd/{upload}"), out_dir, request["description"], limits)
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
     sys.stdout.flush()

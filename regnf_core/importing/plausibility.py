@@ -8,26 +8,27 @@ from torch import Tensor
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 
-_SAMPLES = 16_384
-_NEAREST = 1_024
+SAMPLES = 16_384
+_NEAREST_SHARE = 16
 _STEPS = 8
 _SURFACE_SHARE = 1e-3
 """A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
 _GRADIENT_RANGE = (0.5, 2.0)
 
 
-def check_plausibility(field: SdfField, seed: int = 0) -> tuple[dict[str, float], list[str]]:
+def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
     """Figures of the field, and warnings: share_inside, surface_points, gradient_p10, gradient_median, gradient_p90.
 
-    Points are drawn uniformly in the bounds; those of least |distance| walk down to the surface along the gradient.
+    ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
+    along the gradient.
     Raises FieldFormatError: FIELD_NOT_FINITE, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
     """
     lower, upper = field.bounds[0].float(), field.bounds[1].float()
     generator = torch.Generator().manual_seed(seed)
-    points = lower + (upper - lower) * torch.rand(_SAMPLES, 3, generator=generator)  # (N, 3)
+    points = lower + (upper - lower) * torch.rand(samples, 3, generator=generator)  # (N, 3)
     distance = field.signed_distance(points)
     _require_finite(distance)
-    nearest = points[distance.abs().argsort()[:_NEAREST]]
+    nearest = points[distance.abs().argsort()[: samples // _NEAREST_SHARE]]
     norms, signs = _walk_to_surface(field, nearest, (lower, upper))
     inside = distance < 0
     both_sides = bool(inside.any() or (signs < 0).any()) and bool((~inside).any() or (signs > 0).any())

@@ -1,7 +1,8 @@
 """A seccomp filter for a process that computes and writes files, and nothing else (Linux, x86-64 and 64-bit ARM).
 
-No sockets, no other programs, no child processes, no signals to others, no namespaces, no tracing. Threads are allowed.
-The refused calls fail with EPERM. The filter holds for the rest of the process's life.
+No sockets, no other programs, no child processes, no signals to others, no namespaces, no tracing, no shared memory or
+messages, no say in other processes' limits and priorities, no change to a file's owner, mode or times. Threads are
+allowed. The refused calls fail with EPERM. The filter holds for the rest of the process's life.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ vfork 58 -
 kill 62 129
 tkill 200 130
 rt_sigqueueinfo 129 138
+rt_tgsigqueueinfo 297 240
 ptrace 101 117
 unshare 272 97
 setns 308 268
@@ -50,8 +52,50 @@ perf_event_open 298 241
 pidfd_open 434 434
 pidfd_getfd 438 438
 pidfd_send_signal 424 424
+process_madvise 440 440
+process_mrelease 448 448
+kcmp 312 272
+sched_setparam 142 118
+sched_setscheduler 144 119
+sched_setattr 314 274
+setpriority 141 140
+ioprio_set 251 30
+migrate_pages 256 238
+move_pages 279 239
+chmod 90 -
+fchmod 91 52
+fchmodat 268 53
+fchmodat2 452 452
+chown 92 -
+fchown 93 55
+lchown 94 -
+fchownat 260 54
+setxattr 188 5
+lsetxattr 189 6
+fsetxattr 190 7
+removexattr 197 14
+lremovexattr 198 15
+fremovexattr 199 16
+utime 132 -
+utimes 235 -
+futimesat 261 -
+utimensat 280 88
+shmget 29 194
+shmat 30 196
+shmctl 31 195
+semget 64 190
+semop 65 193
+semctl 66 191
+semtimedop 220 192
+msgget 68 186
+msgsnd 69 189
+msgrcv 70 188
+msgctl 71 187
+mq_open 240 180
+mq_unlink 241 181
+syslog 103 116
 """
-"""Name, number on x86-64, number on 64-bit ARM (which has no fork of its own)."""
+"""Name, number on x86-64, number on 64-bit ARM (which has not the calls that others have replaced)."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +106,8 @@ class _Machine:
     column: int
     clone: int
     tgkill: int
+    prlimit: int
+    set_affinity: int
     has_x32: bool
 
     @property
@@ -73,8 +119,8 @@ class _Machine:
 
 _CLONE3 = 435
 _MACHINES = {
-    "x86_64": _Machine(0xC000003E, column=1, clone=56, tgkill=234, has_x32=True),
-    "aarch64": _Machine(0xC00000B7, column=2, clone=220, tgkill=131, has_x32=False),
+    "x86_64": _Machine(0xC000003E, column=1, clone=56, tgkill=234, prlimit=302, set_affinity=203, has_x32=True),
+    "aarch64": _Machine(0xC00000B7, column=2, clone=220, tgkill=131, prlimit=261, set_affinity=122, has_x32=False),
 }
 
 
@@ -108,9 +154,10 @@ def _filter(machine: _Machine) -> list[bytes]:
     code += [_op(_JUMP_EQUAL, _CLONE3, 0, 1), _op(_RETURN, _ERROR | _ENOSYS)]
     code += [_op(_JUMP_EQUAL, machine.clone, 0, 4), _op(_LOAD_WORD, _FIRST_ARGUMENT_AT)]
     code += [_op(_JUMP_ANY_BIT, _CLONE_THREAD, 1, 0), _op(_RETURN, _ERROR | _EPERM), _op(_RETURN, _ALLOW)]
-    # abort() signals its own process, which must stay possible.
-    code += [_op(_JUMP_EQUAL, machine.tgkill, 0, 4), _op(_LOAD_WORD, _FIRST_ARGUMENT_AT)]
-    code += [_op(_JUMP_EQUAL, os.getpid(), 1, 0), _op(_RETURN, _ERROR | _EPERM), _op(_RETURN, _ALLOW)]
+    # Done to oneself these are in order: abort() is a signal, torch sets its affinity; 0 is the caller itself.
+    for number, itself in ((machine.tgkill, os.getpid()), (machine.prlimit, 0), (machine.set_affinity, 0)):
+        code += [_op(_JUMP_EQUAL, number, 0, 4), _op(_LOAD_WORD, _FIRST_ARGUMENT_AT)]
+        code += [_op(_JUMP_EQUAL, itself, 1, 0), _op(_RETURN, _ERROR | _EPERM), _op(_RETURN, _ALLOW)]
     code += [_op(_RETURN, _ALLOW)]
     return code
 

@@ -9,6 +9,16 @@ from regnf_core.importing.tensors import Float32Array
 
 
 @dataclass(frozen=True)
+class Reading:
+    """One function that a checkpoint's tensors may stand for: the safe file's description and tensors."""
+
+    name: str
+    """What tells it from the other readings, in a few words."""
+    description: dict[str, Any]
+    tensors: dict[str, Float32Array]
+
+
+@dataclass(frozen=True)
 class ConvertedField:
     """A field ready to be written: the safe file's description and tensors, and how the family was told."""
 
@@ -18,3 +28,17 @@ class ConvertedField:
     description: dict[str, Any]
     tensors: dict[str, Float32Array]
     warnings: tuple[str, ...] = ()
+    readings: tuple[Reading, ...] = ()
+    """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
+    one that behaves most like a distance; see :mod:`regnf_core.importing.choice`. Empty: there is no doubt."""
+    sign_is_open: bool = False
+    """Whether trainers of this family save fields of either sign."""
+
+
+def converted_of(
+    family: str, why: tuple[str, ...], readings: tuple[Reading, ...], warnings: tuple[str, ...] = ()
+) -> ConvertedField:
+    """The field of the first of one or more readings, the others to be tried."""
+    first = readings[0]
+    doubtful = readings if len(readings) > 1 else ()
+    return ConvertedField(family, why, first.description, first.tensors, warnings, doubtful)

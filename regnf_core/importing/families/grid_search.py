@@ -1,7 +1,8 @@
-"""Which hash grid a bare table of parameters belongs to: the usual configurations, compared by their size."""
+"""Which hash grids a bare table of parameters may belong to: the usual configurations, compared by their size."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,8 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.hash_grid_config import HashGridConfig, Interpolation
 from regnf_core.importing.upload_description import GridDescription
 
+MAX_GRIDS = 24
+"""Most configurations that are worth trying out."""
 _LOG2_SIZES = (19, *(size for size in range(24, 7, -1) if size != 19))
 _MAX_LEVELS = 32
 
@@ -22,18 +25,11 @@ class GridHabits:
     interpolation: Interpolation
 
 
-@dataclass(frozen=True)
-class FoundGrid:
-    """The chosen configuration, and whether others of the same size would have fitted too."""
+def find_grids(parameters: int, width: int, habits: GridHabits, wanted: GridDescription) -> tuple[HashGridConfig, ...]:
+    """The grids with ``parameters`` numbers whose encoding is ``width`` wide, the most usual first, at most MAX_GRIDS.
 
-    config: HashGridConfig
-    ambiguous: bool
-
-
-def find_grid(parameters: int, width: int, habits: GridHabits, wanted: GridDescription) -> FoundGrid:
-    """The grid with ``parameters`` numbers whose encoding is ``width`` wide; ``wanted`` narrows the search.
-
-    Exact layouts come first; then those in which another machine's rounding moved a level by one node.
+    ``wanted`` narrows the search. Exact layouts are preferred to those in which another machine's rounding moved a
+    level by one node. At the end come the ways in which the training device may have indexed the same tables.
     Raises FieldFormatError (HASH_GRID_NOT_RECOGNISED).
     """
     candidates = list(_candidates(parameters, width, habits, wanted))
@@ -43,9 +39,20 @@ def find_grid(parameters: int, width: int, habits: GridHabits, wanted: GridDescr
     if not fitting:
         message = f"no usual hash grid has {parameters} parameters and {width} features; describe it under 'hash'"
         raise FieldFormatError(message, reason="HASH_GRID_NOT_RECOGNISED")
-    first = fitting[0]
-    ambiguous = any(_shape(other) != _shape(first) for other in fitting[1:])
-    return FoundGrid(first, ambiguous)
+    distinct: dict[object, HashGridConfig] = {}
+    for config in fitting:
+        distinct.setdefault(_function(config), config)
+    indexed = itertools.chain.from_iterable(config.stride_variants() for config in distinct.values())
+    return tuple(itertools.islice(itertools.chain(distinct.values(), indexed), MAX_GRIDS))
+
+
+def grid_name(config: HashGridConfig) -> str:
+    """A few words that tell one layout from another."""
+    resolutions = config.level_resolutions()
+    name = f"{config.levels} levels of {config.features_per_level}, {resolutions[0]} to {resolutions[-1]} nodes"
+    strides = config.level_strides()
+    moved = [f"level {i} by {strides[i]}" for i, nodes in enumerate(resolutions) if strides[i] != nodes]
+    return f"{name}, indexed {' and '.join(moved)}" if moved else name
 
 
 def _candidates(parameters: int, width: int, habits: GridHabits, wanted: GridDescription) -> Iterator[HashGridConfig]:
@@ -81,6 +88,7 @@ def _rounded(config: HashGridConfig, parameters: int) -> HashGridConfig | None:
         return None
 
 
-def _shape(config: HashGridConfig) -> tuple[int, int, int, float]:
+def _function(config: HashGridConfig) -> object:
     """What distinguishes functions: another table cap that no level reaches does not."""
-    return config.levels, config.features_per_level, config.base_resolution, config.per_level_scale
+    growth = config.per_level_scale if config.levels > 1 else 1.0
+    return config.levels, config.features_per_level, config.base_resolution, growth, config.level_entries()

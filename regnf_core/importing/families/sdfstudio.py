@@ -8,15 +8,16 @@ uploader may overrule. Training state, colour, background, proposal networks and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.fields.kinds.neus_facto import SKIP_LAYER
-from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.geometry_layers import GeometryLayers, count_layers, read_layers
-from regnf_core.importing.families.grid_search import GridHabits, find_grid
+from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
+from regnf_core.importing.families.grid_field import grid_readings
+from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.tensors import TensorSource, as_tensor, lookup, require_shape
@@ -59,21 +60,17 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     pipeline = checkpoint.get("pipeline")
     if isinstance(pipeline, (Placeholder, GlobalRef)):
         as_tensor("pipeline", pipeline)
-    if not isinstance(pipeline, dict):
-        return None
-    prefix = next((p for p in _PREFIXES if any(_has_prefix(key, p + "glin") for key in pipeline)), None)
+    prefix = next((p for p in _PREFIXES if below(pipeline, p + "glin")), None)
     if prefix is None:
         return None
-    state = {key.removeprefix(prefix): value for key, value in pipeline.items() if _has_prefix(key, prefix)}
+    state = below(pipeline, prefix)
     refuse_other_entries(wanted, "a checkpoint of sdfstudio or nerfstudio", ("contraction", "level_mask", "hash"))
-    count = count_layers(state)
-    variant, why = _tell_variant(state, count, wanted)
-    evidence = (f"keys {prefix}glin*, {count} layers", why)
-    return _assemble(state, read_layers(state, source), variant, evidence, source, wanted)
-
-
-def _has_prefix(key: object, prefix: str) -> bool:
-    return isinstance(key, str) and key.startswith(prefix)
+    names = numbered(state, "glin")
+    variant, why = _tell_variant(state, len(names), wanted)
+    layers = read_layers(state, names, source)
+    require_extra_columns(layers, names, {SKIP_LAYER: layers.input_width})
+    evidence = (f"keys {prefix}glin*, {len(names)} layers", why)
+    return _assemble(state, layers, variant, evidence, source, wanted)
 
 
 def _tell_variant(state: dict[str, Any], layers: int, wanted: UploadDescription) -> tuple[_Variant, str]:
@@ -94,61 +91,53 @@ def _tell_variant(state: dict[str, Any], layers: int, wanted: UploadDescription)
 
 def _assemble(
     state: dict[str, Any],
-    layers: GeometryLayers,
+    layers: Layers,
     variant: _Variant,
     why: tuple[str, ...],
     source: TensorSource,
     wanted: UploadDescription,
 ) -> ConvertedField:
     warnings: list[str] = []
-    if layers.input_width <= _PLAIN_WIDTH:
+    width = layers.input_width - _PLAIN_WIDTH
+    if width <= 0:
         message = f"{layers.input_width} inputs; expected {_PLAIN_WIDTH} of the position and those of a hash grid"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     table = source.array("encoding.params", lookup(state, "encoding.params"))
     require_shape("encoding.params", table, (None,))
-    uses_grid = layers.uses_columns(_PLAIN_WIDTH, None)
-    grid = _grid(table.size, layers.input_width - _PLAIN_WIDTH, uses_grid, variant, wanted, warnings)
-    tensors = layers.tensors()
-    if uses_grid:
-        tensors["hash_table"] = table.reshape(-1, grid.features_per_level)
-    uses_sines = layers.uses_columns(3, _PLAIN_WIDTH)
-    description = {
-        "family": "neus_facto",
+    uses_sines = _uses_columns(layers, 3, _PLAIN_WIDTH)
+    entries = {
         **shared_entries(wanted, _bounds(state, source, wanted, warnings)),
-        "hash": _as_dict(grid),
         "positional_encoding": {"degree": _DEGREE, "two_pi": variant.two_pi, "used": uses_sines},
-        "use_grid": uses_grid,
         "contraction": wanted.contraction or variant.contraction,
         "level_mask": wanted.level_mask,
         "source": {"family": variant.name},
     }
-    return ConvertedField(variant.name, why, description, tensors, tuple(warnings))
+    if _uses_columns(layers, _PLAIN_WIDTH, None):
+        grids = find_grids(table.size, width, variant.habits, wanted.hash)
+        readings = grid_readings(table, grids, layers.tensors(), entries)
+    else:
+        unused = asdict(_unused_grid(table.size, width, variant, wanted))
+        description = {"family": "neus_facto", **entries, "hash": unused, "use_grid": False}
+        readings = (Reading("no grid", description, layers.tensors()),)
+    return converted_of(variant.name, why, readings, tuple(warnings))
 
 
-def _grid(
-    size: int, width: int, used: bool, variant: _Variant, wanted: UploadDescription, warnings: list[str]
-) -> HashGridConfig:
+def _uses_columns(layers: Layers, start: int, stop: int | None) -> bool:
+    """Whether these columns of the input have any weight: unused encodings keep the zeros they began with."""
+    seen = [layers.weights[0]]
+    if len(layers.weights) > SKIP_LAYER:
+        seen.append(layers.weights[SKIP_LAYER][:, -layers.input_width :])
+    return any(bool(weight[:, start:stop].any()) for weight in seen)
+
+
+def _unused_grid(size: int, width: int, variant: _Variant, wanted: UploadDescription) -> HashGridConfig:
+    """A grid that stands for the columns alone: no table is kept."""
     try:
-        found = find_grid(size, width, variant.habits, wanted.hash)
+        return find_grids(size, width, variant.habits, wanted.hash)[0]
     except FieldFormatError:
-        if used or width > 32:
+        if width > 32:
             raise
-        return HashGridConfig(levels=width, features_per_level=1)  # stands for the columns alone: no table is kept
-    if used and found.ambiguous:
-        warnings.append("HASH_GRID_AMBIGUOUS: other resolutions give a table of this size; describe it under 'hash'")
-    return found.config
-
-
-def _as_dict(grid: HashGridConfig) -> dict[str, Any]:
-    return {
-        "levels": grid.levels,
-        "features_per_level": grid.features_per_level,
-        "log2_table_size": grid.log2_table_size,
-        "base_resolution": grid.base_resolution,
-        "per_level_scale": grid.per_level_scale,
-        "resolutions": list(grid.resolutions) if grid.resolutions is not None else None,
-        "interpolation": grid.interpolation,
-    }
+        return HashGridConfig(levels=width, features_per_level=1)
 
 
 def _bounds(

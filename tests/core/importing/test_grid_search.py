@@ -4,24 +4,29 @@ from typing import Any
 
 import pytest
 
-from regnf_core.importing.families.grid_search import FoundGrid, GridHabits, find_grid
+from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.importing.families.grid_search import MAX_GRIDS, GridHabits, find_grids, grid_name
 from regnf_core.importing.upload_description import GridDescription
 from tests.core.importing.archives import assert_refused
 
 HABITS = GridHabits((2, 4, 8), ((16, 2048), (16, 512), (64, 4096)), "smoothstep")
 
 
-def find(parameters: int, width: int, **wanted: Any) -> FoundGrid:
-    return find_grid(parameters, width, HABITS, GridDescription(**wanted))
+def find(parameters: int, width: int, **wanted: Any) -> tuple[HashGridConfig, ...]:
+    return find_grids(parameters, width, HABITS, GridDescription(**wanted))
+
+
+def only(parameters: int, width: int, **wanted: Any) -> HashGridConfig:
+    (config,) = find(parameters, width, **wanted)
+    return config
 
 
 def test_the_published_sizes_are_recognised() -> None:
     """12 196 240 and 446 837 120 are what tiny-cuda-nn reports for neus-facto's and angelo's grids."""
-    facto = find(12_196_240, 32)
-    assert not facto.ambiguous
-    assert (facto.config.levels, facto.config.features_per_level, facto.config.log2_table_size) == (16, 2, 19)
-    assert facto.config.per_level_scale == pytest.approx(1.3819128799677762, abs=1e-15)
-    angelo = find(446_837_120, 128).config
+    facto = only(12_196_240, 32)
+    assert (facto.levels, facto.features_per_level, facto.log2_table_size) == (16, 2, 19)
+    assert facto.per_level_scale == pytest.approx(1.3819128799677762, abs=1e-15)
+    angelo = only(446_837_120, 128)
     assert (angelo.levels, angelo.features_per_level, angelo.log2_table_size) == (16, 8, 22)
     assert angelo.base_resolution == 64
 
@@ -31,9 +36,7 @@ def test_every_usual_table_size_is_told_by_its_total(log2_size: int) -> None:
     """Totals by hand: the dense lattices of neus-facto's resolutions, rounded up to eights, capped at 2^T."""
     resolutions = [16, 23, 31, 43, 59, 81, 112, 154, 213, 295, 407, 562, 777, 1073, 1483, 2048]
     entries = sum(min((r**3 + 7) // 8 * 8, 2**log2_size) for r in resolutions)
-    found = find(2 * entries, 32)
-    assert found.config.log2_table_size == log2_size
-    assert not found.ambiguous
+    assert only(2 * entries, 32).log2_table_size == log2_size
 
 
 def test_another_machines_rounding_is_settled_by_the_total() -> None:
@@ -43,19 +46,31 @@ def test_another_machines_rounding_is_settled_by_the_total() -> None:
     hashed = 9 * 2**19
     for doubtful, expected in ((exact, (32, 64)), (bumped, (33, 65)), ([32**3, 65**3], (32, 65))):
         entries = sum((nodes + 7) // 8 * 8 for nodes in others + doubtful) + hashed
-        resolutions = find(2 * entries, 32, top_resolution=512).config.level_resolutions()
+        resolutions = find(2 * entries, 32, top_resolution=512)[0].level_resolutions()
         assert (resolutions[3], resolutions[6]) == expected
 
 
-def test_a_table_that_fits_several_grids_says_so() -> None:
-    assert find(16 * 4096 * 2, 32).ambiguous
+def test_the_training_device_may_have_indexed_a_level_otherwise() -> None:
+    """Neuralangelo's grid: level 5 has 129 nodes an edge by the table's length, its rows may be 128 apart."""
+    habits = GridHabits((8,), ((32, 2048),), "linear")
+    usual, other = find_grids(365_792_384, 128, habits, GridDescription())
+    assert usual.level_strides()[5] == usual.level_resolutions()[5] == 129
+    assert (other.level_strides()[5], other.level_resolutions()[5]) == (128, 129)
+    assert other.entries == usual.entries
+    assert "indexed level 5 by 128" in grid_name(other)
+
+
+def test_a_table_that_fits_several_grids_gives_them_all_the_most_usual_first() -> None:
+    found = find(16 * 4096 * 2, 32)
+    assert 1 < len(found) <= MAX_GRIDS
+    assert len(set(found)) == len(found)
+    assert (found[0].features_per_level, found[0].base_resolution, found[0].level_resolutions()[-1]) == (2, 16, 2048)
 
 
 def test_the_description_narrows_the_search() -> None:
-    found = find(16 * 4096 * 2, 32, base_resolution=16, top_resolution=512, features_per_level=2)
-    assert not found.ambiguous
-    assert found.config.scales()[-1] == pytest.approx(511, abs=0.01)
-    assert find(12_196_240, 32, interpolation="linear").config.interpolation == "linear"
+    found = only(16 * 4096 * 2, 32, base_resolution=16, top_resolution=512, features_per_level=2)
+    assert found.scales()[-1] == pytest.approx(511, abs=0.01)
+    assert only(12_196_240, 32, interpolation="linear").interpolation == "linear"
 
 
 def test_no_usual_grid_is_a_refusal() -> None:

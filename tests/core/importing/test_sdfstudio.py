@@ -137,7 +137,7 @@ def test_bounds_come_from_the_aabb_or_are_assumed_aloud() -> None:
     assert converted.description["bounds"] == box.tolist()
     assumed = convert(changed(lambda pipeline: pipeline.pop(F + "aabb")))
     assert assumed.description["bounds"] == [[-1.0] * 3, [1.0] * 3]
-    assert [w.split(":")[0] for w in assumed.warnings] == ["HASH_GRID_AMBIGUOUS", "BOUNDS_ASSUMED"]
+    assert [w.split(":")[0] for w in assumed.warnings] == ["BOUNDS_ASSUMED"]
     empty = changed(lambda pipeline: pipeline.update({F + "aabb": box.flip(0)}))
     assert_refused(lambda: convert(empty), "BOUNDS_INVALID")
 

@@ -1,0 +1,104 @@
+"""The linear layers of a geometry network, weight normalisation folded in, their shapes checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.kinds.neus_facto import MAX_LAYERS
+from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+
+_NORMALISED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
+"""How torch names direction and length of a normalised weight: the older way, the newer way."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """weights[i]: (out_i, in_i), biases[i]: (out_i,). Of the last layer only the first row is kept: the distance."""
+
+    weights: tuple[Float32Array, ...]
+    biases: tuple[Float32Array, ...]
+
+    @property
+    def input_width(self) -> int:
+        """Columns of the first layer."""
+        return int(self.weights[0].shape[1])
+
+    @property
+    def extra_columns(self) -> tuple[int, ...]:
+        """Per layer, how many columns it has beyond the rows of the layer before; 0 for the first."""
+        pairs = zip(self.weights, self.weights[1:], strict=False)
+        return (0, *(int(after.shape[1] - before.shape[0]) for before, after in pairs))
+
+    def tensors(self) -> dict[str, Float32Array]:
+        """The layers under the names of the safe field file."""
+        named = {f"layers.{i}.weight": weight for i, weight in enumerate(self.weights)}
+        return named | {f"layers.{i}.bias": bias for i, bias in enumerate(self.biases)}
+
+
+def numbered(state: Mapping[str, Any], prefix: str) -> list[str]:
+    """The names ``<prefix>0``, ``<prefix>1`` ... of the layers in ``state``.
+
+    Raises FieldFormatError: TENSOR_MISSING (a gap in the numbers) or FAMILY_NOT_SUPPORTED (fewer than two layers).
+    """
+    numbers = {key.removeprefix(prefix).split(".")[0] for key in state if key.startswith(prefix)}
+    layers = len(numbers)
+    if layers > MAX_LAYERS or numbers != {str(i) for i in range(layers)}:
+        raise FieldFormatError("the geometry network's layers are not numbered from 0 on", reason="TENSOR_MISSING")
+    if layers < 2:
+        raise FieldFormatError("a geometry network of one layer", reason="FAMILY_NOT_SUPPORTED")
+    return [f"{prefix}{i}" for i in range(layers)]
+
+
+def read_layers(state: Mapping[str, Any], names: Sequence[str], source: TensorSource) -> Layers:
+    """The layers of these names, in order.
+
+    Raises FieldFormatError: TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
+    """
+    weights, biases = [], []
+    for name in names:
+        weight = folded_weight(state, name, source)
+        bias = source.array(f"{name}.bias", lookup(state, f"{name}.bias"))
+        require_shape(f"{name}.bias", bias, (weight.shape[0],))
+        rows = slice(0, 1) if name == names[-1] else slice(None)
+        weights.append(weight[rows])
+        biases.append(bias[rows])
+    return Layers(tuple(weights), tuple(biases))
+
+
+def require_extra_columns(layers: Layers, names: Sequence[str], allowed: Mapping[int, int] | None = None) -> None:
+    """Raise FieldFormatError (TENSOR_SHAPE) unless each layer continues the one before, plus ``allowed`` columns."""
+    for i, extra in enumerate(layers.extra_columns):
+        want = (allowed or {}).get(i, 0)
+        if extra != want:
+            columns = layers.weights[i].shape[1]
+            raise tensor_error(f"{names[i]} has {columns} columns, expected {columns - extra + want}", "TENSOR_SHAPE")
+
+
+def folded_weight(state: Mapping[str, Any], name: str, source: TensorSource) -> Float32Array:
+    """W = g v / |v|, row by row; or the plain weight of a network without weight normalisation."""
+    if f"{name}.weight" in state:
+        weight = source.array(f"{name}.weight", state[f"{name}.weight"])
+        require_shape(f"{name}.weight", weight, (None, None))
+        return weight
+    v, g = next((pair for pair in _NORMALISED if f"{name}.{pair[0]}" in state), _NORMALISED[0])
+    direction = source.array(f"{name}.{v}", lookup(state, f"{name}.{v}"))
+    require_shape(f"{name}.{v}", direction, (None, None))
+    length = source.array(f"{name}.{g}", lookup(state, f"{name}.{g}"))
+    require_shape(f"{name}.{g}", length, (direction.shape[0], 1))
+    norm = np.linalg.norm(direction.astype(np.float64), axis=1, keepdims=True)
+    if not norm.all():
+        raise FieldFormatError(f"a row of {name}.{v} is zero and has no direction", reason="TENSOR_NOT_FINITE")
+    return np.asarray(length * (direction / norm), dtype=np.float32)
+
+
+def below(values: object, prefix: str) -> dict[str, Any]:
+    """The entries of a state dictionary whose keys begin with ``prefix``, without it; empty where there are none."""
+    if not isinstance(values, dict):
+        return {}
+    named = ((key, value) for key, value in values.items() if isinstance(key, str) and key.startswith(prefix))
+    return {key.removeprefix(prefix): value for key, value in named}
