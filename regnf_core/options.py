@@ -109,29 +109,36 @@ class RobustOptions:
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     up_axis: Literal["x", "y", "z"] | None = None
-    """The vertical axis of scene and object alike: only turns about it are tried. None: every orientation."""
+    """The vertical axis of scene and object alike: only turns about it are tried. None: every orientation.
+    Set it where things stand upright: the search is shorter, and no toppled twin is listed."""
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
-    """Rotations that the search starts from, evenly spread over all; with an up axis a tenth of them, about it."""
+    """Rotations that the search starts from, evenly spread over all; with an up axis a tenth of them, about it.
+    More when a pose that a person sees was missed; the search takes longer in proportion."""
     scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
-    """Most samples of the scene's surface in the detection box."""
+    """Most samples of the scene's surface in the detection box. More when the object is small in its box."""
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
-    """Most samples of the object's surface."""
+    """Most samples of the object's surface. More for thin parts."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
-    """Share of the samples kept from the refinement, for the verdict."""
+    """Share (0..1) of the samples kept from the refinement, for the verdict. More for a surer verdict, at the cost of
+    the pose's accuracy."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
-    """Largest |residual| of a sample on which both fields agree."""
+    """Largest residual, in size, of a sample on which both fields agree, object diameters.
+    More for coarse or noisy fields."""
     min_inlier_share: _Ratio = 0.6
-    """Least share of agreeing samples, in each direction; under it: LOW_OVERLAP. More is asked of accurate fields."""
+    """Least share (0..1) of agreeing samples, in each direction; under it: LOW_OVERLAP. More is asked of accurate
+    fields. Less where the scene's copy of the object is damaged or covered."""
     min_explained_share: _Ratio = 0.4
-    """Least share of all that stands in the box that the object explains; under it: SCENE_UNEXPLAINED."""
+    """Least share (0..1) of all that stands in the box that the object explains; under it: SCENE_UNEXPLAINED.
+    Less for boxes that hold other things too."""
     max_free_space_violations: _Ratio = 0.2
-    """Largest share of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED.
-    Less is allowed of accurate fields."""
+    """Largest share (0..1) of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED. Less is
+    allowed of accurate fields. More where the scene's field lacks parts of the object."""
     max_hidden_share: _Ratio = 0.75
-    """Largest share of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE."""
+    """Largest share (0..1) of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE.
+    More for things of which hardly one side was seen."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Poses whose score (0..1) is within this of the best one's, plus 0.15 times that one, explain the data as well:
-    all of them are listed."""
+    all of them are listed. More to be told of near-twins too."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from service.records import ACTIVE, JobRecord
 from service.results import ARTIFACTS, Manifest, read_manifest, read_result
 from service.routes.documentation import BINARY, header, refusals
 from service.schemas.common import whole_problem
-from service.schemas.jobs import ResultDocument
+from service.schemas.results import ResultDocument
 
 router = APIRouter(tags=["results"])
 _BLOCK_BYTES = 256 * 1024

@@ -1,4 +1,4 @@
-"""Jobs and their results as the contract shows them."""
+"""Jobs as the contract shows them."""
 
 from __future__ import annotations
 
@@ -43,37 +43,6 @@ class JobPage(Outgoing):
 
     jobs: list[JobDocument]
     next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
-
-
-class TransformDocument(Outgoing):
-    """A similarity transform x -> s R x + t. `matrix` is row-major 4x4 and holds all of it."""
-
-    matrix: list[list[float]]
-    scale: float
-    rotation_quaternion_xyzw: list[float]
-    translation: list[float]
-
-
-class ArtifactEntry(Outgoing):
-    """One file that the job wrote."""
-
-    name: str
-    bytes: int
-    sha256: str
-    url: str
-
-
-class ResultDocument(Outgoing):
-    """What a registration found. Transforms carry their direction in their name."""
-
-    verdict: Literal["registered", "ambiguous", "rejected"]
-    verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    T_object_scene: TransformDocument = Field(description="Scene coordinates to object coordinates.")
-    T_scene_object: TransformDocument = Field(description="Its inverse.")
-    alternatives: list[dict[str, Any]] = Field([])
-    metrics: dict[str, float | None] = Field({})
-    seed: int = 0
-    artifacts: list[ArtifactEntry] = Field([])
 
 
 def job_document(record: JobRecord, queue_position: int | None, retention_s: float, prefix: str) -> dict[str, Any]:

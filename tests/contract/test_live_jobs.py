@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service.schemas.results import ResultDocument
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.test_openapi import validator
 from tests.contract.world import assert_refused, field_bytes, sha256
@@ -94,6 +95,25 @@ def test_a_registration_from_request_to_artifacts(client: httpx.Client, fields: 
     assert submit(client, fields).status_code == 200
     states = [line for line in client.get(job["links"]["events"]).text.splitlines() if "successful" in line]
     assert len(states) == 1
+
+
+def test_the_usual_preset_over_the_wire_and_a_second_look_from_its_result(
+    client: httpx.Client, fields: dict[str, str]
+) -> None:
+    first = finished(client, submit(client, fields, options={}).json()["id"])
+    assert first["status"] == "successful", first
+    result = client.get(first["links"]["result"]).json()
+    validator("ResultDocument").validate(result)
+    assert set(result) == set(ResultDocument.model_fields)
+    assert (result["verdict"], result["options"]["preset"]) == ("registered", "robust")
+    assert len(result["covariance"]) == len(result["covariance_ordering"]) == 7
+    variance = result["covariance"][6][6]
+    assert result["uncertainty"]["scale_percent"] == pytest.approx(100 * variance**0.5)
+    start = {"options": {}, "initial_transform": result["T_object_scene"]}
+    second = finished(client, submit(client, fields, **start).json()["id"])
+    again = client.get(second["links"]["result"]).json()
+    assert again["verdict"] == "registered"
+    assert again["T_object_scene"]["scale"] == pytest.approx(result["T_object_scene"]["scale"], rel=0.01)
 
 
 def test_a_box_in_empty_space_fails_with_its_own_problem(client: httpx.Client, fields: dict[str, str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 
+from regnf_core.options import RobustOptions
+from regnf_core.verdicts import VERDICT_REASONS
 from service.reasons import REASONS
 from service.routes.examples import OBJECT, REGISTER_EXAMPLES, SCENE
 from tests.contract.world import World
@@ -32,13 +35,38 @@ def test_the_committed_contract_is_the_one_that_is_served(world: World) -> None:
     assert world.client.get("/openapi.yaml").text == committed, hint
 
 
-def test_the_script_writes_what_is_committed() -> None:
-    spec = importlib.util.spec_from_file_location("write_openapi", ROOT / "scripts" / "write_openapi.py")
+def script(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    assert script.current_contract() == script.TARGET.read_text(encoding="utf-8")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_script_writes_what_is_committed() -> None:
+    writer = script("write_openapi")
+    assert writer.current_contract() == writer.TARGET.read_text(encoding="utf-8")
+
+
+def test_the_table_of_options_is_the_one_of_the_code() -> None:
+    writer = script("write_option_table")
+    text = writer.TARGET.read_text(encoding="utf-8")
+    assert writer.with_table(text) == text, "run scripts/write_option_table.py"
+    assert [option.name for option in fields(RobustOptions) if f"| `{option.name}` | " not in text] == []
+    assert writer.with_table(text.replace("| 600 |", "| 599 |")) == text  # it would be written anew
+
+
+def test_every_option_says_what_it_is_for() -> None:
+    for group in ("RobustOptions", "RegistrationOptions"):
+        for name, option in CONTRACT["components"]["schemas"][group]["properties"].items():
+            assert "description" in option or "$ref" in option, name
+
+
+def test_the_document_tells_every_reason_of_a_verdict_in_the_same_words() -> None:
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    told = re.findall(r"^\| `([A-Z_]+)` \| (?:registered|ambiguous|rejected) \| (.*) \|$", text, flags=re.M)
+    assert dict(told) == VERDICT_REASONS
 
 
 def test_every_reference_leads_somewhere() -> None:
