@@ -18,7 +18,11 @@ EXACT = HashGridConfig.from_top_resolution(64, **VALUES, interpolation="linear")
 USUAL = EXACT.with_entry_count(EXACT.entries + 35_944 - 32_768)
 """Growth sqrt 2 from 16: level 2 has 32 nodes, or 33 where exp2 erred upwards, as it did for this table."""
 (OTHER,) = USUAL.stride_variants()
-FINER = HashGridConfig.from_top_resolution(96, **VALUES, interpolation="linear")
+COARSE, FINE = (
+    HashGridConfig.from_top_resolution(top, **VALUES | {"log2_table_size": 12}, interpolation="linear")
+    for top in (64, 96)
+)
+"""Level 0 is dense, all others are hashed: tables of one size."""
 
 
 def converted(table: Array, *grids: HashGridConfig) -> ConvertedField:
@@ -57,9 +61,8 @@ def test_the_order_does_not_matter_where_the_evidence_is_clear() -> None:
 
 def test_layouts_that_fit_alike_leave_the_most_usual_one_and_a_warning() -> None:
     """Only level 0 has anything in it, and that is the same in both."""
-    table = ball_table(USUAL, 0)
-    chosen = choose_reading(converted(table, FINER, OTHER))
-    assert chosen.description["hash"]["per_level_scale"] == FINER.per_level_scale
+    chosen = choose_reading(converted(ball_table(COARSE, 0), FINE, COARSE))
+    assert chosen.description["hash"]["per_level_scale"] == FINE.per_level_scale
     assert [warning.split(":")[0] for warning in chosen.warnings] == ["HASH_GRID_AMBIGUOUS"]
 
 
