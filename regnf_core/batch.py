@@ -1,0 +1,138 @@
+"""Several detections of one scene and several objects in one go: what they share is made once.
+
+outcomes = register_batch(scene, [box_1, box_2], [chair, table], pairs=[(0, 0), (1, 1)])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TypeVar
+
+from regnf_core.box import OrientedBox
+from regnf_core.clouds import with_clouds
+from regnf_core.errors import CancelledError, InvalidInputError, RegnfError
+from regnf_core.fields.base import SdfField
+from regnf_core.options import RegistrationOptions
+from regnf_core.result import Phase, ProgressCallback, RegistrationResult
+from regnf_core.robust.object_model import ObjectModel, model_object
+from regnf_core.robust.register import register_robust
+from regnf_core.robust.scene_view import SceneView, view_scene
+from regnf_core.run import Run
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """One pair's end: a result, or the error that it alone would have raised."""
+
+    detection: int
+    object: int
+    result: RegistrationResult | None
+    error: RegnfError | None = None
+
+
+def register_batch(
+    scene: SdfField,
+    detections: Sequence[OrientedBox],
+    objects: Sequence[SdfField],
+    pairs: Sequence[tuple[int, int]] | None = None,
+    options: RegistrationOptions | None = None,
+    seed: int = 0,
+    progress: ProgressCallback | None = None,
+    models: Sequence[ObjectModel] | None = None,
+    clouds: bool = True,
+) -> list[BatchOutcome]:
+    """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
+
+    Every pair ends as :func:`regnf_core.register` alone would end with the same seed: a faulty pair spoils no other.
+    ``models`` are the objects' models, made earlier. Without ``clouds`` the point clouds for viewers are left out,
+    about half of the time. ``progress`` sees the phases of one pair after the other; its share is of all of them.
+    Raises InvalidInputError (PAIR_UNKNOWN) for a number beyond the lists, and CancelledError from ``progress``.
+    """
+    options = options or RegistrationOptions(preset="robust")
+    wanted = list(product(range(len(detections)), range(len(objects)))) if pairs is None else list(pairs)
+    for d, o in wanted:
+        if not (0 <= d < len(detections) and 0 <= o < len(objects)):
+            raise InvalidInputError(f"no pair ({d}, {o}) among the detections and objects", reason="PAIR_UNKNOWN")
+    batch = _Batch(scene, detections, objects, options, seed, dict(enumerate(models or ())))
+    outcomes = []
+    for number, (d, o) in enumerate(wanted):
+        run = Run(_share_of(progress, number, len(wanted)))
+        try:
+            outcomes.append(BatchOutcome(d, o, batch.register(d, o, run, clouds)))
+        except CancelledError:
+            raise
+        except RegnfError as error:
+            outcomes.append(BatchOutcome(d, o, None, error))
+    return outcomes
+
+
+class _Batch:
+    """Views and models, made when first needed; what failed once fails again without being tried."""
+
+    def __init__(
+        self,
+        scene: SdfField,
+        detections: Sequence[OrientedBox],
+        objects: Sequence[SdfField],
+        options: RegistrationOptions,
+        seed: int,
+        models: dict[int, ObjectModel],
+    ) -> None:
+        self.scene, self.detections, self.objects = scene, detections, objects
+        self.options, self.seed = options, seed
+        self._views: dict[int, SceneView | RegnfError] = {}
+        self._models: dict[int, ObjectModel | RegnfError] = dict(models)
+
+    def register(self, d: int, o: int, run: Run, clouds: bool) -> RegistrationResult:
+        with run.phase("sampling"):
+            view, model = self._view(d), self._model(o)
+        box = self.detections[d]
+        result = register_robust(
+            self.scene,
+            self.objects[o],
+            box,
+            self.options,
+            self.seed,
+            run,
+            object_model=model,
+            scene_view=view,
+        )
+        if clouds:
+            with run.phase("exporting"):
+                result = with_clouds(result, self.scene, self.objects[o], box, self.options.sampling)
+        run.report("exporting", 1.0)
+        result.metrics.update(run.seconds)
+        return result
+
+    def _view(self, d: int) -> SceneView:
+        return _once(self._views, d, lambda: view_scene(self.scene, self.detections[d], self.options.robust, self.seed))
+
+    def _model(self, o: int) -> ObjectModel:
+        return _once(self._models, o, lambda: model_object(self.objects[o], self.options.robust))
+
+
+def _once(made: dict[int, _T | RegnfError], key: int, make: Callable[[], _T]) -> _T:
+    """What ``make`` gave or raised the first time."""
+    if key not in made:
+        try:
+            made[key] = make()
+        except RegnfError as error:
+            made[key] = error
+    found = made[key]
+    if isinstance(found, RegnfError):
+        raise found
+    return found
+
+
+def _share_of(progress: ProgressCallback | None, number: int, count: int) -> ProgressCallback | None:
+    if progress is None:
+        return None
+
+    def shared(phase: Phase, done: float) -> None:
+        progress(phase, (number + done) / count)
+
+    return shared
