@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families import sdfstudio, unsupported
+from regnf_core.importing.families import deepsdf, instant_nsr_pl, neuralangelo, neus, sdfstudio, siren, unsupported
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.tensors import TensorSource
@@ -16,7 +16,15 @@ Family = Callable[[dict[Any, Any], TensorSource, UploadDescription], ConvertedFi
 """Takes a checkpoint's top-level dictionary. Returns None unless it is the family's; raises FieldFormatError if it is
 but cannot be taken."""
 
-FAMILIES: tuple[Family, ...] = (sdfstudio.convert, unsupported.refuse)
+FAMILIES: tuple[Family, ...] = (
+    sdfstudio.convert,
+    neus.convert,
+    instant_nsr_pl.convert,
+    neuralangelo.convert,
+    deepsdf.convert,
+    siren.convert,
+    unsupported.refuse,
+)
 
 _SHOWN_KEYS = 8
 

@@ -204,9 +204,9 @@ def test_odd_objects_beside_the_weights_do_no_harm() -> None:
         ({"pipeline": {F + "encoding.params": torch.ones(8)}}, "FIELD_NOT_RECOGNISED"),
         ({"pipeline": _Odd()}, "UNSAFE_GLOBAL_IN_WEIGHTS"),
         (_Odd(), "UNSAFE_GLOBAL_IN_WEIGHTS"),
-        ({"sdf_network_fine": {}}, "FAMILY_NOT_SUPPORTED"),
-        ({"model": {"module.neural_sdf.x": 1}}, "FAMILY_NOT_SUPPORTED"),
-        ({"net.net.0.0.weight": torch.ones(3)}, "FAMILY_NOT_SUPPORTED"),
+        ({"neural_points": 1}, "FAMILY_NOT_SUPPORTED"),
+        ({"model": {"encoder.embeddings": 1}}, "FAMILY_NOT_SUPPORTED"),
+        ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FAMILY_NOT_SUPPORTED"),
     ],
 )
 def test_other_files_are_refused(values: object, reason: str) -> None:

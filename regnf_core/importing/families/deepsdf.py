@@ -1,0 +1,126 @@
+"""DeepSDF (Park et al. 2019): one network for many shapes, which sees [latent code, position].
+
+The authors' code saves the network and the codes in two files. One upload holds both (``model_state_dict`` and
+``latent_codes`` in one dictionary), or it is the network alone and the description gives the code. The code of one
+shape is constant, so it is folded into the biases, and what remains is a field.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.pickle_values import TensorRef
+from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
+
+FAMILY = "deepsdf"
+_PREFIXES = ("module.lin", "lin")
+_CODES = "latent_codes"
+
+
+def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+    """The signed distance field of one shape, or None where the keys are not theirs.
+
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, LATENT_MISSING, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and
+    what TensorSource raises.
+    """
+    network = checkpoint.get("model_state_dict")
+    prefix = next((p for p in _PREFIXES if below(network, p)), None)
+    if prefix is None:
+        if network is None and _CODES in checkpoint:
+            message = "DeepSDF's latent codes without its network; upload both in one file"
+            raise FieldFormatError(message, reason="FIELD_NOT_RECOGNISED")
+        return None
+    require_family(wanted, FAMILY)
+    refuse_other_entries(wanted, FAMILY, ("latent", "latent_index"))
+    state = below(network, prefix.removesuffix("lin"))
+    names = numbered(state, "lin")
+    layers = read_layers(state, names, source)
+    width = layers.input_width - 3
+    if width < 0:
+        raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 or more", "TENSOR_SHAPE")
+    latent, whence = _latent(checkpoint, source, wanted, width)
+    whole = [i for i, extra in enumerate(layers.extra_columns) if extra == layers.input_width]
+    seeing = [i for i, extra in enumerate(layers.extra_columns) if extra]
+    require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
+    norms = _norms(state, layers, source)
+    description = {
+        "family": "mlp",
+        **shared_entries(wanted, UNIT_CUBE),
+        "activation": "relu",
+        "input_at": seeing,
+        "normalised": sorted({int(name.split(".")[1]) for name in norms}),
+        "output_tanh": 1,
+        "source": {"family": FAMILY},
+    }
+    why = (
+        f"keys model_state_dict.{prefix}*, {len(names)} layers",
+        whence,
+        "bounds [-1, 1]: the cube round the unit sphere, into which DeepSDF scales its shapes",
+    )
+    return ConvertedField(FAMILY, why, description, _at_code(layers, latent, (0, *whole)).tensors() | norms)
+
+
+def _latent(
+    checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription, width: int
+) -> tuple[Float32Array, str]:
+    """The shape's code (width,), and where it is from."""
+    if wanted.latent is not None:
+        if wanted.latent_index is not None or len(wanted.latent) != width:
+            message = f"description.latent: expected {width} numbers, and no latent_index beside them"
+            raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
+        return np.array(wanted.latent, dtype=np.float32), "latent code from the description"
+    if width == 0:
+        return np.zeros(0, dtype=np.float32), "no latent code: a network of one shape"
+    if _CODES not in checkpoint:
+        message = (
+            f"DeepSDF's network alone: put its latent_codes into the same file, or give the shape's {width} numbers"
+            " as latent in the description"
+        )
+        raise FieldFormatError(message, reason="LATENT_MISSING")
+    codes = _all_codes(checkpoint[_CODES], source, width)
+    index = wanted.latent_index or 0
+    if index >= len(codes):
+        message = f"description.latent_index: {index}, but the file has {len(codes)} codes, counted from 0"
+        raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
+    return codes[index], f"latent code {index} of {len(codes)} (counted from 0)"
+
+
+def _all_codes(stored: object, source: TensorSource, width: int) -> Float32Array:
+    """(N, width): an embedding's state, or, of older runs and of single reconstructions, a tensor (N, 1, width)."""
+    value = stored if isinstance(stored, TensorRef) else lookup(below(stored, ""), "weight")
+    codes = source.array(_CODES, value)
+    if codes.ndim == 3:
+        require_shape(_CODES, codes, (None, 1, width))
+        codes = codes[:, 0]
+    require_shape(_CODES, codes, (None, width))
+    return codes
+
+
+def _norms(state: dict[str, Any], layers: Layers, source: TensorSource) -> dict[str, Float32Array]:
+    """The layer normalisations that networks without weight normalisation have behind some layers."""
+    found = {}
+    for i in range(len(layers.weights) - 1):
+        if f"bn{i}.weight" in state:
+            for part in ("weight", "bias"):
+                name = f"bn{i}.{part}"
+                found[f"norms.{i}.{part}"] = source.array(name, lookup(state, name))
+                require_shape(name, found[f"norms.{i}.{part}"], (layers.weights[i].shape[0],))
+    return found
+
+
+def _at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Layers:
+    """The layers that see [..., code, position], with the code's part moved into the bias."""
+    weights, biases = list(layers.weights), list(layers.biases)
+    for i in whole:
+        start = weights[i].shape[1] - layers.input_width
+        coded = weights[i][:, start : start + len(latent)].astype(np.float64)
+        biases[i] = np.asarray(biases[i] + coded @ latent, dtype=np.float32)
+        weights[i] = np.delete(weights[i], slice(start, start + len(latent)), axis=1)
+    return Layers(tuple(weights), tuple(biases))

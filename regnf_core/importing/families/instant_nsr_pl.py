@@ -1,0 +1,101 @@
+"""instant-nsr-pl's NeuS: a hash grid over the scene's cube and a small network, in a Lightning checkpoint.
+
+The network sees [x / r, grid((x + r) / 2r)] for a scene within [-r, r]^3. Its progressive grid opens a level every
+thousand steps, from four on; how many are open is not saved, but the number of steps is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.converted import ConvertedField, converted_of
+from regnf_core.importing.families.grid_field import grid_readings, step_of
+from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.layers import Layers, below, read_layers, require_extra_columns
+from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape
+from regnf_core.importing.upload_description import UploadDescription
+
+FAMILY = "instant_nsr_pl"
+_PREFIX = "model.geometry."
+_TABLE = "encoding.encoding.params"
+_PROGRESSIVE_TABLE = "encoding.encoding.encoding.params"
+_HABITS = GridHabits((2, 4, 8, 1), ((32, 2048), (16, 2048), (16, 1024), (32, 4096), (16, 4096), (16, 512)), "linear")
+_FIRST_LEVELS, _STEPS_A_LEVEL = 4, 1000
+
+
+def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+    """The signed distance field of such a checkpoint, or None where the keys are not theirs.
+
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, BOUNDS_INVALID,
+    HASH_GRID_NOT_RECOGNISED and what TensorSource raises.
+    """
+    state = below(checkpoint.get("state_dict"), _PREFIX)
+    if not state:
+        return None
+    require_family(wanted, FAMILY)
+    refuse_other_entries(wanted, FAMILY, ("level_mask", "hash"))
+    layers = _layers(state, source)
+    bounds, radius = _scene_cube(checkpoint["state_dict"], source)
+    table_name = _PROGRESSIVE_TABLE if _PROGRESSIVE_TABLE in state else _TABLE
+    table = source.array(table_name, lookup(state, table_name))
+    require_shape(table_name, table, (None,))
+    grids = find_grids(table.size, layers.input_width - 3, _HABITS, wanted.hash)
+    why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", f"scene_aabb: the scene lies within {radius:g} of 0"]
+    warnings: list[str] = []
+    mask = wanted.level_mask
+    if mask is None and table_name == _PROGRESSIVE_TABLE:
+        mask = _open_levels(checkpoint, grids[0].levels, why, warnings)
+    entries = {
+        **shared_entries(wanted, bounds),
+        "grid_radius": radius,
+        "level_mask": mask,
+        "source": {"family": FAMILY},
+    }
+    readings = grid_readings(table, grids, _in_scene_units(layers, radius), entries)
+    return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
+
+
+def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
+    """Linear layers have the even numbers; activations between them have the odd ones, and no parameters."""
+    count = len({key.split(".")[2] for key in state if key.startswith("network.layers.")})
+    if count < 2:
+        message = "instant-nsr-pl without plain layers: a NeRF, or a network of tiny-cuda-nn's own (FullyFusedMLP)"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    names = [f"network.layers.{2 * i}" for i in range(count)]
+    layers = read_layers(state, names, source)
+    require_extra_columns(layers, names)
+    if len(names) > 4:
+        raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
+    return layers
+
+
+def _scene_cube(state: dict[Any, Any], source: TensorSource) -> tuple[list[list[float]], float]:
+    """The scene's cube [-r, r]^3, and r."""
+    box = source.array("model.scene_aabb", lookup(state, "model.scene_aabb"))
+    require_shape("model.scene_aabb", box, (6,))
+    radius = float(box.max())
+    if radius <= 0.0 or not np.array_equal(box, np.repeat(np.array((-radius, radius), dtype=np.float32), 3)):
+        raise FieldFormatError("the scene_aabb is no cube round the origin", reason="BOUNDS_INVALID")
+    return [[-radius] * 3, [radius] * 3], radius
+
+
+def _open_levels(checkpoint: dict[Any, Any], levels: int, why: list[str], warnings: list[str]) -> int | None:
+    """How many levels the progressive grid had opened by its last step."""
+    step = step_of(checkpoint, "global_step")
+    if step is None:
+        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no global_step; all levels are taken to be in use")
+        return None
+    opened = min(_FIRST_LEVELS + step // _STEPS_A_LEVEL, levels)
+    why.append(f"progressive grid, step {step}: {opened} of {levels} levels are in use")
+    return opened
+
+
+def _in_scene_units(layers: Layers, radius: float) -> dict[str, Float32Array]:
+    """The layers for the position x itself instead of x / r."""
+    first = layers.weights[0].copy()
+    first[:, :3] /= np.float32(radius)
+    return Layers((first, *layers.weights[1:]), layers.biases).tensors()

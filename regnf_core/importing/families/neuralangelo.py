@@ -1,0 +1,96 @@
+"""Neuralangelo (Li et al. 2023): a hash grid over [-2, 2]^3 and a small network, opened from coarse to fine.
+
+How many levels are open is not saved, but the number of iterations is. Where the formula leaves it open, the table
+tells: the features of a level that never opened keep the small random values they began with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.importing.families.converted import ConvertedField, converted_of
+from regnf_core.importing.families.grid_field import grid_readings, step_of
+from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape
+from regnf_core.importing.upload_description import UploadDescription
+
+FAMILY = "neuralangelo"
+_PREFIXES = ("module.neural_sdf.", "neural_sdf.")
+_TABLE = "tcnn_encoding.params"
+_FEATURES = (8, 4, 2, 1)
+_HABITS = GridHabits(_FEATURES, ((32, 2048), (16, 2048), (32, 4096), (16, 1024), (16, 512), (64, 4096)), "linear")
+_WARM_UP, _STEPS_A_LEVEL = 5000, 5000
+_FIRST_LEVELS = (4, 8)
+"""Levels open from the start: the usual number, and that of the large scenes' configuration."""
+_UNTRAINED = 1.01e-4
+"""tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
+
+
+def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+    """The signed distance field of such a checkpoint, or None where the keys are not theirs.
+
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNISED and what
+    TensorSource raises.
+    """
+    model = checkpoint.get("model")
+    prefix = next((p for p in _PREFIXES if below(model, p)), None)
+    if prefix is None:
+        return None
+    require_family(wanted, FAMILY)
+    refuse_other_entries(wanted, FAMILY, ("level_mask", "hash"))
+    state = below(model, prefix)
+    layers = _layers(state, source)
+    table = source.array(_TABLE, lookup(state, _TABLE))
+    require_shape(_TABLE, table, (None,))
+    grids = find_grids(table.size, layers.input_width - 3, _HABITS, wanted.hash)
+    why = [f"keys {prefix}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
+    warnings: list[str] = []
+    mask = wanted.level_mask or _open_levels(checkpoint, table, grids[0], why, warnings)
+    entries = {**shared_entries(wanted, UNIT_CUBE), "level_mask": mask, "source": {"family": FAMILY}}
+    readings = grid_readings(table, grids, layers.tensors(), entries)
+    return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
+
+
+def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
+    """The hidden layers, then the one for the distance. The last of ``linears`` makes colour's features alone."""
+    names: Sequence[str] = [*numbered(state, "mlp.linears.")[:-1], "mlp.linear_sdf"]
+    layers = read_layers(state, names, source)
+    require_extra_columns(layers, names)
+    if len(names) > 4:
+        raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
+    return layers
+
+
+def _open_levels(
+    checkpoint: dict[Any, Any], table: Float32Array, grid: HashGridConfig, why: list[str], warnings: list[str]
+) -> int | None:
+    """How many levels coarse-to-fine training had opened by its last iteration."""
+    iteration = step_of(checkpoint, "iteration")
+    if iteration is None:
+        warnings.append("LEVEL_MASK_ASSUMED: the checkpoint has no iteration; all levels are taken to be in use")
+        return None
+    by_step = (iteration - _WARM_UP) // _STEPS_A_LEVEL
+    few, many = (min(max(first, by_step), grid.levels) for first in _FIRST_LEVELS)
+    opened = few
+    if few != many:
+        opened = many if _is_trained(table, grid, many - 1) else few
+        warnings.append(
+            f"LEVEL_MASK_ASSUMED: coarse to fine from {_FIRST_LEVELS[0]} or {_FIRST_LEVELS[1]} levels on; by the table"
+            f" {opened} are in use; say level_mask if not"
+        )
+    why.append(f"coarse to fine, iteration {iteration}: {opened} of {grid.levels} levels are in use")
+    return opened
+
+
+def _is_trained(table: Float32Array, grid: HashGridConfig, level: int) -> bool:
+    entries = grid.level_entries()
+    start = sum(entries[:level]) * grid.features_per_level
+    features = table[start : start + entries[level] * grid.features_per_level]
+    return bool(np.abs(features).max() > _UNTRAINED)
