@@ -8,6 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from benchmarks.robust.symmetries import declared, in_frame
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core import open_field as open_safe_field
@@ -15,6 +18,7 @@ from regnf_core.fields.transformed import TransformedField
 from regnf_core.symmetry import Symmetries
 
 MAIN, HELD_OUT, FULL_SIZE = "pairs.json", "pairs-held-out.json", "pairs-full-size.json"
+KINDS = {"main": MAIN, "held out": HELD_OUT}
 UNDER_TRAINED = ("pairs-after-3-percent.json", "pairs-after-10-percent.json")
 
 
@@ -93,6 +97,13 @@ def load_pairs(folder: Path, file: str = MAIN) -> list[Pair]:
 def open_field(folder: Path, name: str) -> SdfField:
     """The field of a room or an object; opened once."""
     return open_safe_field(folder / f"{name}.safetensors")
+
+
+@cache
+def exact_surface(folder: Path, room: str) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """The exact scene's vertices (V, 3), scene frame, and faces (F, 3)."""
+    with np.load(folder / f"{room}.surface.npz") as file:
+        return file["vertices"], file["faces"]
 
 
 def _pair(folder: Path, values: dict[str, Any]) -> Pair:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from benchmarks.robust.bent_field import BentField
@@ -87,7 +88,7 @@ def _jobs(context: Context) -> Iterator[Job]:
 
 
 def _bent_job(pair: Pair, amplitude: float, length: float, seed: int, bend: int) -> Job:
-    return Job(lambda: bent(pair, amplitude, length, bend), f"bent {100 * amplitude:g} %, length {length:g}", seed)
+    return Job(partial(bent, pair, amplitude, length, bend), f"bent {100 * amplitude:g} %, length {length:g}", seed)
 
 
 def bent(pair: Pair, amplitude: float, length: float, bend: int) -> Case:

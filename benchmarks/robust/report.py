@@ -61,6 +61,11 @@ def successes(runs: Sequence[Run]) -> int:
     return len(runs) - len(failures_of(runs))
 
 
+def of_kind(runs: Sequence[Run], kind: str) -> list[Run]:
+    """The runs whose group starts with ``kind``."""
+    return [run for run in runs if run["group"].startswith(kind)]
+
+
 def count(runs: Sequence[Run], category: str) -> int:
     """How many of the runs fall into a category."""
     return sum(run["category"] == category for run in runs)
@@ -122,7 +127,9 @@ def accuracy_section(text: str, first: str, runs: Sequence[Run], key: str = "gro
 
 def share_bar(asked: str, hits: int, total: int, least: float) -> Bar:
     """A bar on a share."""
-    return Bar(asked, f"{hits}/{total} ({100 * hits / max(total, 1):.1f} %)", total > 0 and hits >= least * total)
+    if total == 0:
+        return Bar(asked, "none run", False)
+    return Bar(asked, f"{hits}/{total} ({100 * hits / total:.1f} %)", hits >= least * total)
 
 
 def write(table: Table, command: str, folder: Path | None, show: Callable[[str], None]) -> None:

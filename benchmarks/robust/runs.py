@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,9 +42,9 @@ def run_all(
     context: Context,
     measure: Callable[[Case, RegistrationResult], dict[str, Any]] | None = None,
 ) -> list[Run]:
-    """Every job's run, in order. With a limit, that many of the jobs, evenly spread over the list."""
+    """Every job's run, in order. With a limit, that many of the jobs, drawn at random, the same ones each time."""
     if context.limit is not None and len(jobs) > context.limit:
-        jobs = [jobs[i * len(jobs) // context.limit] for i in range(context.limit)]
+        jobs = [jobs[i] for i in sorted(random.Random(0).sample(range(len(jobs)), context.limit))]
     runs = []
     for number, job in enumerate(jobs):
         runs.append(run_one(job, measure))

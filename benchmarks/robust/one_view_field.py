@@ -1,0 +1,114 @@
+"""The field that one depth image tells of: what the camera sees through is free, everything behind is solid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import igl
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """Depths along the camera's axis at the corners of a square grid of pixels.
+
+    position: (3,) scene frame · axes: (3, 3), columns right, down, forward, scene frame · reach: tangent of half the
+    angle of view · depth: (N, N), rows downwards, scene units.
+    """
+
+    position: Array
+    axes: Array
+    reach: float
+    depth: Array
+
+    def points(self) -> Array:
+        """What was seen (N, N, 3), scene frame."""
+        return self.position + self.depth[..., None] * (directions(len(self.depth), self.reach) @ self.axes.T)
+
+
+def directions(count: int, reach: float) -> Array:
+    """Where the grid's corners look, (count, count, 3), camera axes, forward component 1."""
+    across = np.linspace(-reach, reach, count)
+    u, v = np.meshgrid(across, across)
+    return np.stack([u, v, np.ones_like(u)], axis=-1)
+
+
+class OneViewField:
+    """Exact signed distance to the border of the free space in front of a depth image; solid outside its view too.
+
+    The image is taken as a surface of triangles between neighbouring pixels' depths: where one lies far behind the
+    other they form a wall along the line of sight, the border of a shadow. bounds: (2, 3), scene frame.
+    """
+
+    def __init__(self, image: DepthImage, bounds: Tensor) -> None:
+        self.image = image
+        self.bounds = bounds
+        self.vertices, self.faces = triangles(image)
+        self._tree = igl.AABB()
+        self._tree.init(self.vertices, self.faces)
+
+    @property
+    def device(self) -> torch.device:
+        """Always the CPU."""
+        return torch.device("cpu")
+
+    def to(self, device: torch.device | str) -> OneViewField:
+        """This field."""
+        del device
+        return self
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3)."""
+        return self.signed_distance_and_gradient(points)[0]
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) float32 at points (N, 3) and its gradient (N, 3)."""
+        queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64)
+        squared, _, closest = self._tree.squared_distance(self.vertices, self.faces, queries)
+        sign = np.where(self.sees(queries), 1.0, -1.0)
+        distance = np.sqrt(squared)
+        gradient = (queries - closest) * (sign / np.maximum(distance, 1e-12))[:, None]
+        return _as_float32(sign * distance), _as_float32(gradient)
+
+    def sees(self, points: Array) -> NDArray[np.bool_]:
+        """(N,): which points (N, 3) lie in view and in front of the surface."""
+        image, cells = self.image, len(self.image.depth) - 1
+        local = (points - image.position) @ image.axes
+        ahead = local[:, 2] > 1e-9
+        forward = np.where(ahead, local[:, 2], 1.0)
+        place = (local[:, :2] / forward[:, None] / image.reach + 1.0) / 2.0 * cells  # (N, 2), in pixels
+        in_view = ahead & ((place >= 0.0) & (place <= cells)).all(axis=-1)
+        cell = np.clip(np.floor(place), 0, cells - 1).astype(int)
+        u, v = (place - cell).T
+        # Along a triangle the inverse of the depth is linear in the image, so this is exact.
+        inverse = 1.0 / image.depth
+        corner = inverse[cell[:, 1], cell[:, 0]]
+        opposite = inverse[cell[:, 1] + 1, cell[:, 0] + 1]
+        right, below = inverse[cell[:, 1], cell[:, 0] + 1], inverse[cell[:, 1] + 1, cell[:, 0]]
+        upper = corner + u * (right - corner) + v * (opposite - right)
+        lower = corner + v * (below - corner) + u * (opposite - below)
+        seen: NDArray[np.bool_] = in_view & (1.0 / forward > np.where(u >= v, upper, lower))
+        return seen
+
+
+def triangles(image: DepthImage) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (V, 3) and faces (F, 3): the seen surface, and the sides of the view from the camera to its border."""
+    count = len(image.depth)
+    number = np.arange(count * count).reshape(count, count)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = [np.stack([a, b, c], axis=-1).reshape(-1, 3), np.stack([a, c, d], axis=-1).reshape(-1, 3)]
+    border = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
+    camera = np.full(len(border), count * count)
+    faces.append(np.stack([camera, np.roll(border, -1), border], axis=-1))
+    vertices = np.concatenate([image.points().reshape(-1, 3), image.position[None]])
+    return vertices, np.concatenate(faces).astype(np.int64)
+
+
+def _as_float32(values: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))
