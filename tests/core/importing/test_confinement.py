@@ -33,7 +33,11 @@ def attempt(action):
     except OSError as error:
         return ["refused", errno.errorcode.get(error.errno)]
 """
-CONFINE = "granted = sandbox.confine(ImportLimits(**request['limits']), request['parent'])\n"
+CONFINE = """
+from pathlib import Path
+upload = os.open("upload", os.O_RDONLY | os.O_CREAT)
+granted = sandbox.confine(ImportLimits(**request['limits']), request['parent'], upload, Path.cwd())
+"""
 NO_NEW_PRIVILEGES = "assert ctypes.CDLL(None).prctl(38, 1, 0, 0, 0) == 0\n"
 
 
@@ -144,11 +148,32 @@ def test_resources_are_limited(tmp_path: Path) -> None:
     assert tell(tmp_path, program, limits) == [7, 1 << 30, 1000, 0, 256]
 
 
-def test_privileges_cannot_be_gained(tmp_path: Path) -> None:
-    program = (
-        CONFINE + "print(json.dumps([l.split()[1] for l in open('/proc/self/status') if l.startswith('NoNewPrivs')]))"
-    )
-    assert tell(tmp_path, program) == ["1"]
+def test_there_are_no_privileges_and_none_can_be_gained(tmp_path: Path) -> None:
+    program = CONFINE + "print(json.dumps(dict(line.split(':\\t') for line in open('/proc/self/status'))))"
+    status = {name: value.strip() for name, value in tell(tmp_path, program).items()}
+    assert status["NoNewPrivs"] == "1"
+    assert {int(status[name], 16) for name in ("CapInh", "CapPrm", "CapEff", "CapAmb")} == {0}
+
+
+def test_a_kernel_without_landlock_is_told(tmp_path: Path) -> None:
+    """The filter and the namespace hold; only the report says that files are as readable as the user makes them."""
+    program = "from regnf_core.importing import landlock\nlandlock._CREATE_RULESET = 100_000\n" + CONFINE
+    granted = tell(tmp_path, program + "print(json.dumps(granted))")
+    assert granted["files_restricted"] is False
+    assert granted["no_new_privileges"] is True
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root has privileges to give up")
+def test_the_upload_may_lie_where_only_privileges_lead(tmp_path: Path) -> None:
+    """It was opened before they were given up."""
+    closed = tmp_path / "closed"
+    closed.mkdir()
+    (closed / "upload").write_text("seen")
+    os.chown(closed, 65534, 65534)
+    closed.chmod(0o700)
+    (tmp_path / "upload").symlink_to(closed / "upload")
+    program = CONFINE + "print(json.dumps([attempt(lambda: open('upload')), open(f'/proc/self/fd/{upload}').read()]))"
+    assert tell(tmp_path, program) == [["refused", "EACCES"], "seen"]
 
 
 def test_the_child_dies_with_its_parent(tmp_path: Path) -> None:

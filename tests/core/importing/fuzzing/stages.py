@@ -98,6 +98,7 @@ def _file(data: bytes, folder: Path) -> None:
     upload.write_bytes(data)
     try:
         converted = convert._convert(upload, None, BUDGET)
+        convert._require_text(converted.description)
         write_safe_field(out, converted.description, converted.tensors)
     finally:
         upload.unlink()

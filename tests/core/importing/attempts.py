@@ -1,0 +1,255 @@
+"""What a hijacked conversion would try. Each attempt, run in a child, ends in "done" or the name of an error number.
+
+``BY_LAYER`` names those that a confinement stops on its own. None does harm where nothing stops it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import resource
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+Where = dict[str, Any]
+"""port, unix (a path), abstract (a name), parent, secret_at (an address in the parent), store (a folder), secret (a
+file of it), home (the child's own folder)."""
+Attempt = Callable[[Where], object]
+_libc = ctypes.CDLL(None, use_errno=True)
+_PTRACE_SEIZE = 0x4206
+
+
+def outcome(attempt: Attempt, where: Where) -> str:
+    """How one attempt ended."""
+    try:
+        attempt(where)
+    except OSError as error:
+        return errno.errorcode.get(error.errno or 0, str(error))
+    return "done"
+
+
+def call(number: int, *arguments: Any) -> int:
+    """A system call by its number (x86-64). Raises OSError."""
+    result = int(_libc.syscall(number, *arguments))
+    if result < 0:
+        raise OSError(ctypes.get_errno(), f"system call {number}")
+    return result
+
+
+def connect(family: int, address: Any) -> None:
+    with socket.socket(family) as made:
+        made.settimeout(5)
+        made.connect(address)
+
+
+def send_datagram(where: Where) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as made:
+        made.sendto(b"x", ("127.0.0.1", where["port"]))
+
+
+def listen(_: Where) -> None:
+    socket.create_server(("127.0.0.1", 0)).close()
+
+
+def socket_pair(_: Where) -> None:
+    for end in socket.socketpair():
+        end.close()
+
+
+def fork(_: Where) -> None:
+    if (child := os.fork()) == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+
+
+def spawn(_: Where) -> None:
+    os.waitpid(os.posix_spawn("/bin/true", ["true"], {}), 0)
+
+
+def trace_parent(where: Where) -> None:
+    call(101, _PTRACE_SEIZE, where["parent"], 0, 0)  # without stopping it; ends with this process
+
+
+def read_parents_memory(where: Where) -> None:
+    with open(f"/proc/{where['parent']}/mem", "rb", buffering=0) as memory:
+        memory.seek(where["secret_at"])
+        memory.read(8)
+
+
+def copy_parents_memory(where: Where) -> None:
+    here = ctypes.create_string_buffer(8)
+    pair = ctypes.c_uint64 * 2
+    local, remote = pair(ctypes.addressof(here), 8), pair(where["secret_at"], 8)
+    call(310, where["parent"], ctypes.byref(local), 1, ctypes.byref(remote), 1, 0)
+
+
+def take_parents_file(where: Where) -> None:
+    opened = os.pidfd_open(where["parent"])
+    try:
+        os.close(call(438, opened, 0, 0))
+    finally:
+        os.close(opened)
+
+
+def change_parents_limits(where: Where) -> None:
+    limits = resource.prlimit(where["parent"], resource.RLIMIT_NOFILE)
+    resource.prlimit(where["parent"], resource.RLIMIT_NOFILE, limits)
+
+
+def change_parents_priority(where: Where) -> None:
+    os.setpriority(os.PRIO_PROCESS, where["parent"], os.getpriority(os.PRIO_PROCESS, where["parent"]))
+
+
+def bind_parent_to_a_core(where: Where) -> None:
+    os.sched_setaffinity(where["parent"], os.sched_getaffinity(where["parent"]))
+
+
+def signal_a_thread(where: Where) -> None:
+    call(234, where["parent"], where["parent"], 0)
+
+
+def queue_a_signal(where: Where) -> None:
+    information = (ctypes.c_int * 32)(0, 0, -1)
+    call(297, where["parent"], where["parent"], 0, ctypes.byref(information))
+
+
+def own_user_namespace(_: Where) -> None:
+    """In a thread, which may not have one: EINVAL says that the call itself was allowed."""
+    ended: list[OSError] = []
+
+    def leave() -> None:
+        try:
+            call(272, 0x10000000)
+        except OSError as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=leave)
+    thread.start()
+    thread.join()
+    if ended and ended[0].errno != errno.EINVAL:
+        raise ended[0]
+
+
+def shared_memory(_: Where) -> None:
+    call(31, call(29, 0, 4096, 0o1600), 0, None)  # made and marked for removal
+
+
+def message_queue(_: Where) -> None:
+    call(71, call(68, 0, 0o1600), 0, None)
+
+
+def read(path: str | Path) -> bytes:
+    return Path(path).read_bytes()
+
+
+def write(path: Path) -> None:
+    path.write_bytes(b"x")
+    path.unlink()
+
+
+def link(where: Where) -> None:
+    """A second name, in its own folder, for a file of the store."""
+    target = Path(where["home"], "linked")
+    os.link(where["secret"], target)
+    target.unlink()
+
+
+def move_out(where: Where) -> None:
+    source, target = Path(where["home"], "mine"), Path(where["store"], "mine")
+    source.write_bytes(b"")
+    try:
+        source.rename(target)
+    finally:
+        source.unlink(missing_ok=True)
+    target.unlink()
+
+
+def make_folder(where: Where) -> None:
+    Path(where["store"], "folder").mkdir()
+    Path(where["store"], "folder").rmdir()
+
+
+def make_link(where: Where) -> None:
+    Path(where["store"], "symbolic").symlink_to("/etc/passwd")
+    Path(where["store"], "symbolic").unlink()
+
+
+def keep_length(where: Where) -> None:
+    os.truncate(where["secret"], os.path.getsize(where["secret"]))
+
+
+def append(where: Where) -> None:
+    Path(where["secret"]).open("ab").close()
+
+
+NETWORK: dict[str, Attempt] = {
+    "connect to a port": lambda w: connect(socket.AF_INET, ("127.0.0.1", w["port"])),
+    "connect to a socket in the file system": lambda w: connect(socket.AF_UNIX, w["unix"]),
+    "connect to an abstract socket": lambda w: connect(socket.AF_UNIX, w["abstract"]),
+    "send a datagram": send_datagram,
+    "listen": listen,
+    "make a pair of sockets": socket_pair,
+}
+PROCESSES: dict[str, Attempt] = {
+    "fork": fork,
+    "start a program": spawn,
+    "signal the parent": lambda w: os.kill(w["parent"], 0),
+    "signal a thread of the parent": signal_a_thread,
+    "queue a signal to the parent": queue_a_signal,
+    "open the parent by its number": lambda w: os.close(os.pidfd_open(w["parent"])),
+    "signal its own group": lambda w: os.killpg(0, 0),
+    "change the parent's limits": change_parents_limits,
+    "change the parent's priority": change_parents_priority,
+    "bind the parent to a core": bind_parent_to_a_core,
+    "share memory by a key": shared_memory,
+    "make a message queue": message_queue,
+    "make a user namespace": own_user_namespace,
+}
+LOOKING: dict[str, Attempt] = {
+    "trace the parent": trace_parent,
+    "read the parent's memory through a file": read_parents_memory,
+    "read the parent's memory through a call": copy_parents_memory,
+    "take an open file from the parent": take_parents_file,
+}
+PEEPING: dict[str, Attempt] = {
+    "read the parent's environment": lambda w: read(f"/proc/{w['parent']}/environ"),
+    "read the parent's command line": lambda w: read(f"/proc/{w['parent']}/cmdline"),
+    "list the parent's open files": lambda w: os.listdir(f"/proc/{w['parent']}/fd"),
+}
+FILES: dict[str, Attempt] = {
+    "read a file of the store": lambda w: read(w["secret"]),
+    "list the store": lambda w: os.listdir(w["store"]),
+    "read the system's users": lambda w: read("/etc/passwd"),
+    "list the root": lambda w: os.listdir("/"),
+    "write to the store": lambda w: write(Path(w["store"], "new")),
+    "append to a file of the store": append,
+    "cut a file of the store": keep_length,
+    "move a file into the store": move_out,
+    "link a file of the store": link,
+    "make a folder": make_folder,
+    "make a symbolic link": make_link,
+    "write to a common temporary folder": lambda w: write(Path("/tmp", f"regnf-attempt-{os.getpid()}")),
+}
+ATTRIBUTES: dict[str, Attempt] = {
+    "change a mode": lambda w: os.chmod(w["secret"], os.stat(w["secret"]).st_mode & 0o777),
+    "change an owner": lambda w: os.chown(w["secret"], -1, -1),
+    "change a time": lambda w: os.utime(w["secret"]),
+}
+ATTEMPTS = NETWORK | PROCESSES | LOOKING | PEEPING | FILES | ATTRIBUTES
+BY_LAYER: dict[str, set[str]] = {
+    "filter": {*NETWORK, *PROCESSES, *ATTRIBUTES, *LOOKING} - {"read the parent's memory through a file"},
+    "landlock": {*PEEPING, *FILES, *LOOKING},
+    "everything": set(ATTEMPTS),
+}
+"""Which attempts fail with the layer alone: "filter" the system call filter, "landlock" Landlock, "everything" all."""
+NOT_EVERYWHERE = set(LOOKING)
+"""What some systems forbid without any confinement of ours."""
+
+
+def run_all(where: Where) -> dict[str, str]:
+    """Every attempt's outcome."""
+    return {name: outcome(attempt, where) for name, attempt in ATTEMPTS.items()}
