@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from functools import cached_property
 from typing import Any
 
 import igl
@@ -36,13 +37,14 @@ _FAULTS_OF_CONTENT = (
 class MeshField:
     """Distance to a triangle mesh; the generalised winding number says what is inside (Jacobson et al. 2013).
 
-    The mesh need not be watertight. Computed in float64 on the CPU whatever device the points come from; meant as a
-    fitting target and as ground truth, not for the inner loop of a registration.
-    vertices: (V, 3), own frame · faces: (F, 3) indices, normals outward.
+    The mesh need not be watertight. Computed in float64 on the CPU whatever device the points come from; several times
+    slower than a small network, see docs/families.md.
+    vertices: (V, 3), own frame · faces: (F, 3) indices, normals outward · bounds: (2, 3), lowest and highest corner of
+    the region where the field has meaning; None: the mesh's own bounding box.
     Raises FieldFormatError (MESH_INVALID) when the arrays do not form a mesh.
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike) -> None:
+    def __init__(self, vertices: ArrayLike, faces: ArrayLike, bounds: ArrayLike | None = None) -> None:
         self.vertices: NDArray[np.float64] = np.ascontiguousarray(vertices, dtype=np.float64)
         self.faces: NDArray[np.int64] = np.ascontiguousarray(faces, dtype=np.int64)
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.isfinite(self.vertices).all():
@@ -51,6 +53,7 @@ class MeshField:
             raise FieldFormatError("mesh faces are not (F, 3) with at least one triangle", reason="MESH_INVALID")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise FieldFormatError("a mesh face names a vertex that does not exist", reason="MESH_INVALID")
+        self._bounds = None if bounds is None else torch.as_tensor(np.asarray(bounds, dtype=np.float64))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> MeshField:
@@ -79,7 +82,9 @@ class MeshField:
 
     @property
     def bounds(self) -> Tensor:
-        """(2, 3) float64 on the CPU: the mesh's own bounding box."""
+        """(2, 3) float64 on the CPU, own frame."""
+        if self._bounds is not None:
+            return self._bounds
         used = self.vertices[np.unique(self.faces)]
         return torch.from_numpy(np.stack((used.min(axis=0), used.max(axis=0))))
 
@@ -110,8 +115,9 @@ class MeshField:
         queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64).reshape(-1, 3)
         if len(queries) == 0:
             return torch.zeros(0), torch.zeros(0, 3)
-        squared, triangles, closest = igl.point_mesh_squared_distance(queries, self.vertices, self.faces)
-        inside = igl.fast_winding_number(self.vertices, self.faces, queries) > _INSIDE
+        nearest, winding = self._trees
+        squared, triangles, closest = nearest.squared_distance(self.vertices, self.faces, queries)
+        inside = winding.winding_number(queries) > _INSIDE
         sign = np.where(inside, -1.0, 1.0)
         distance = np.sqrt(squared)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -130,6 +136,14 @@ class MeshField:
         corner, first, second = (self.vertices[self.faces[chosen, i]] for i in range(3))
         points: NDArray[np.float64] = corner + a * (first - corner) + b * (second - corner)
         return points
+
+    @cached_property
+    def _trees(self) -> tuple[Any, Any]:
+        """The hierarchies for the closest point and for the winding number: without them each call would build both."""
+        nearest, winding = igl.AABB(), igl.FastWindingNumberBVH()
+        nearest.init(self.vertices, self.faces)
+        winding.init(self.vertices, self.faces)
+        return nearest, winding
 
     def _normals_and_areas(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Unit normals (F, 3) and areas (F,) of the triangles."""

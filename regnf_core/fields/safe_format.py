@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
 
 FORMAT_VERSION = "1"
-_TYPE_NAMES = {"float32": "F32", "float16": "F16"}
+_TYPE_NAMES = {"float32": "F32", "float16": "F16", "int32": "I32"}
 _ALIGNMENT = 64
 _MAX_DESCRIPTION = 1 << 20
 
@@ -37,8 +37,8 @@ def write_safe_field(
 ) -> None:
     """Write a field file, whole or not at all: a temporary file beside ``path`` is renamed once it is on the disk.
 
-    The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32 or
-    float16 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH or
+    The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32,
+    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH or
     FIELD_NOT_FINITE.
     """
     parsed = parse_description(description)
@@ -134,5 +134,5 @@ def _header(
 def _type_name(name: str, array: NDArray[Any]) -> str:
     type_name = _TYPE_NAMES.get(array.dtype.name)
     if type_name is None:
-        raise FieldFormatError(f"{name} is {array.dtype}, expected float32 or float16", reason="FIELD_SHAPES_MISMATCH")
+        raise FieldFormatError(f"{name} is {array.dtype}, expected float32, float16 or int32", reason="FIELD_SHAPES_MISMATCH")
     return type_name

@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.container import TorchArchive
+from regnf_core.importing.container import Entry
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder, StorageRef, TensorRef
 
 Float32Array = npt.NDArray[np.float32]
+StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.int32]
+"""What a safe field holds."""
 
 _STORED: dict[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
@@ -33,13 +35,26 @@ def tensor_error(message: str, reason: str) -> FieldFormatError:
     return FieldFormatError(message, reason=reason)
 
 
+class Archive(Protocol):
+    """A container of torch.save: its storages' bytes under ``data/<key>``."""
+
+    @property
+    def entries(self) -> Mapping[str, Entry]:
+        """Where the entries lie, by name."""
+        ...
+
+    def read(self, name: str) -> memoryview:
+        """An entry's bytes. Raises FieldFormatError where they are damaged."""
+        ...
+
+
 class TensorSource:
     """Materialises tensors of one archive. Float32 tensors are views of the map; nothing else of the file is touched.
 
     ``budget`` caps the bytes of all tensors together, as float32.
     """
 
-    def __init__(self, archive: TorchArchive, budget: int) -> None:
+    def __init__(self, archive: Archive, budget: int) -> None:
         self._archive = archive
         self._budget = budget
 

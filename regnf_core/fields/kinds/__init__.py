@@ -6,11 +6,13 @@ docs/families.md tells how to add one.
 from __future__ import annotations
 
 from regnf_core.fields.kinds.kind import FieldDescription
+from regnf_core.fields.kinds.mesh import MeshDescription
 from regnf_core.fields.kinds.mlp import MlpDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
 
 KINDS: dict[str, type[FieldDescription]] = {
     "neus_facto": NeusFactoDescription,
     "mlp": MlpDescription,
+    "mesh": MeshDescription,
 }
 """By the description's ``family``."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from regnf_core.errors import FieldFormatError
 
 FLOAT_TYPES = ("F32", "F16")
+INTEGER_TYPES = ("I32",)
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,15 @@ def require(condition: bool, message: str) -> None:
         raise FieldFormatError(message, reason="FIELD_SHAPES_MISMATCH")
 
 
-def require_names(tensors: Mapping[str, TensorSpec], names: Set[str]) -> None:
-    """Exactly these tensors, all of them real numbers. Raises FieldFormatError (FIELD_SHAPES_MISMATCH)."""
+def require_names(tensors: Mapping[str, TensorSpec], names: Set[str], integers: Set[str] = frozenset()) -> None:
+    """Exactly these tensors, all of them real numbers but those in ``integers``, which are whole ones.
+
+    Raises FieldFormatError (FIELD_SHAPES_MISMATCH).
+    """
     require(set(tensors) == names, f"unexpected or missing tensors: {sorted(names ^ set(tensors))[:4]}")
     for name, spec in sorted(tensors.items()):
-        require(spec.dtype in FLOAT_TYPES, f"{name} is {spec.dtype}, expected one of {FLOAT_TYPES}")
+        types = INTEGER_TYPES if name in integers else FLOAT_TYPES
+        require(spec.dtype in types, f"{name} is {spec.dtype}, expected one of {types}")
 
 
 def require_shape(tensors: Mapping[str, TensorSpec], name: str, expected: tuple[int, ...]) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.importing.tensors import Float32Array
+from regnf_core.importing.tensors import StoredArray
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class Reading:
     name: str
     """What tells it from the other readings, in a few words."""
     description: dict[str, Any]
-    tensors: dict[str, Float32Array]
+    tensors: Mapping[str, StoredArray]
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class ConvertedField:
     why: tuple[str, ...]
     """The evidence, one short sentence each."""
     description: dict[str, Any]
-    tensors: dict[str, Float32Array]
+    tensors: Mapping[str, StoredArray]
     warnings: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
     """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the

@@ -12,11 +12,11 @@ from regnf_core.fields.safe_format import read_description
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family
 from regnf_core.importing.safetensors_header import StoredTensor, read_header
-from regnf_core.importing.tensors import Float32Array
+from regnf_core.importing.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 
 _OVERRULED = frozenset({"contraction", "level_mask"})
-_TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2")}
+_TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
 
 
 def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
@@ -46,9 +46,10 @@ def _overruled(description: dict[str, Any], wanted: UploadDescription) -> dict[s
     return changed
 
 
-def _array(name: str, tensor: StoredTensor, data: memoryview) -> Float32Array:
+def _array(name: str, tensor: StoredTensor, data: memoryview) -> StoredArray:
     stored = _TYPES.get(tensor.dtype)
     if stored is None:
         raise FieldFormatError(f"{name} is stored as {tensor.dtype}", reason="TENSOR_DTYPE")
     raw = data[tensor.offset : tensor.offset + tensor.size]
-    return np.asarray(np.frombuffer(raw, dtype=stored).reshape(tensor.shape), dtype=np.float32)
+    values = np.frombuffer(raw, dtype=stored).reshape(tensor.shape)
+    return values.astype(np.int32) if tensor.dtype == "I32" else np.asarray(values, dtype=np.float32)

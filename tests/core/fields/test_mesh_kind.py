@@ -1,0 +1,80 @@
+"""The kind mesh: the exact distance, from a safe field file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
+
+DESCRIPTION = {"family": "mesh", "bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]}
+
+
+def sphere() -> dict[str, np.ndarray[Any, Any]]:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    return {"vertices": ball.vertices.astype(np.float32), "faces": ball.faces.astype(np.int32)}
+
+
+def test_a_sphere_is_read_back(tmp_path: Path) -> None:
+    write_safe_field(tmp_path / "f", DESCRIPTION | {"label": "ball"}, sphere())
+    assert read_description(tmp_path / "f")["label"] == "ball"
+    field = open_field(tmp_path / "f")
+    points = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    distance, gradient = field.signed_distance_and_gradient(points)
+    radius = points.norm(dim=1)
+    # A chord of the icosphere lies at most 0.5 (1 - cos(edge / 2)) < 1.5e-3 below the sphere.
+    torch.testing.assert_close(distance, radius - 0.5, rtol=0, atol=1.5e-3)
+    assert ((gradient * points).sum(dim=1) / radius)[radius > 0.1].min() > 0.99
+    assert field.bounds.tolist() == DESCRIPTION["bounds"]
+
+
+def test_unit_and_sign_go_round_it(tmp_path: Path) -> None:
+    write_safe_field(
+        tmp_path / "f", {"family": "mesh", "bounds": [[-3.0] * 3, [3.0] * 3], "world_scale": 2.0}, sphere()
+    )
+    assert open_field(tmp_path / "f").signed_distance(torch.tensor([[2.0, 0.0, 0.0]])).item() == pytest.approx(
+        1.0, abs=3e-3
+    )
+    write_safe_field(tmp_path / "f", DESCRIPTION | {"sign": -1}, sphere())
+    assert open_field(tmp_path / "f").signed_distance(torch.zeros(1, 3)).item() > 0.49
+
+
+def test_queries_share_the_trees(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = sphere()
+    field = MeshField(mesh["vertices"], mesh["faces"])
+    field.signed_distance(torch.zeros(1, 3))
+    monkeypatch.setattr("regnf_core.fields.mesh.igl", None)  # nothing is built a second time
+    assert field.signed_distance(torch.zeros(1, 3)).item() < -0.49
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"faces": np.zeros((4, 3), np.float32)}, "FIELD_SHAPES_MISMATCH"),
+        ({"vertices": np.zeros((4, 3), np.int32)}, "FIELD_SHAPES_MISMATCH"),
+        ({"faces": np.zeros((0, 3), np.int32)}, "FIELD_SHAPES_MISMATCH"),
+        ({"faces": np.zeros((4, 4), np.int32)}, "FIELD_SHAPES_MISMATCH"),
+        ({"normals": np.zeros((4, 3), np.float32)}, "FIELD_SHAPES_MISMATCH"),
+        ({"vertices": np.full((4, 3), np.nan, np.float32)}, "FIELD_NOT_FINITE"),
+    ],
+)
+def test_what_is_no_mesh_is_not_written(change: dict[str, Any], reason: str, tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        write_safe_field(tmp_path / "f", DESCRIPTION, sphere() | change)
+    assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("index", [-1, 4, 2**31 - 1])
+def test_faces_of_no_vertex_are_refused_on_opening(index: int, tmp_path: Path) -> None:
+    tensors = {"vertices": np.eye(4, 3, dtype=np.float32), "faces": np.array([[0, 1, index]], np.int32)}
+    write_safe_field(tmp_path / "f", DESCRIPTION, tensors)
+    with pytest.raises(FieldFormatError) as caught:
+        open_field(tmp_path / "f")
+    assert caught.value.reason == "MESH_INVALID"
