@@ -15,6 +15,7 @@ from regnf_core.errors import RegnfError
 from service.records import FieldRecord, StaleAttemptError
 from worker.context import Context
 from worker.engine import Importer
+from worker.patience import patiently
 from worker.problems import fault, new_incident, problem
 
 _CLAIM_KEPT_S = 24 * 3600
@@ -30,13 +31,14 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
 
     The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
-    record, or one that has ended and an original of their own. Raises RedisError when the end cannot be written down.
+    record, or one that has ended and an original of their own. Writes that Redis refuses for a while are waited for,
+    until the import's time is over. Raises RedisError when the end cannot be written down.
     """
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         logger.info("import %s attempt %d is not run", sha256, attempt)
         return
-    if not claim_import(context, sha256, attempt, worker):
+    if not patiently(f"the record of import {sha256}", lambda: claim_import(context, sha256, attempt, worker)):
         logger.info("import %s attempt %d is somebody else's", sha256, attempt)
         return
     try:
@@ -44,18 +46,24 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except RedisError:
         raise
     except RegnfError as error:
-        reject(context, sha256, attempt, problem(error.reason, str(error)))
+        _refuse(context, sha256, attempt, problem(error.reason, str(error)))
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
     except JobTimeoutException:
-        reject(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
+        _refuse(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
     except Exception as error:
         incident = new_incident()
         logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
-        reject(context, sha256, attempt, fault(error, incident))
+        _refuse(context, sha256, attempt, fault(error, incident))
     else:
         context.blobs.delete(_original(sha256))
-        _end(context, sha256, attempt, state="ready", report=report)
+        patiently(
+            f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=report)
+        )
+
+
+def _refuse(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
+    patiently(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error))
 
 
 def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """The worker process: takes ids from the queue and forks a child for each, which it outlives, limits and settles.
 
-RQ's forking worker, with what it lacks: children die with it, time limits hold against native code, a short loss of
-Redis does not end it, and a child's death never leaves a record that says it runs. It never loads torch itself:
+RQ's forking worker, with what it lacks: children die with it, time limits hold against native code, a Redis that is
+full or away does not end it, and a child's death never leaves a record that says it runs. It never loads torch itself:
 a parent that has run a torch operation hangs its forked children.
 """
 
@@ -15,7 +15,6 @@ from types import FrameType
 from typing import Any
 
 from redis.exceptions import RedisError
-from rq import Worker
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 
@@ -23,19 +22,18 @@ from service.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
 from service.redis_client import connect
 from service.redis_queue import attempt_of
 from worker import kernel
+from worker.bookkeeping import PatientWorker
 from worker.context import Context
 from worker.scratch import Scratch
 from worker.settle import HorseEnd, settle_import, settle_registration
 
-_LIVE_FOR_S = 45
-"""A worker that has not reported for this long is not counted as live."""
 _IDLE_REPORT_S = 30
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
 
 
-class RegnfWorker(Worker):
+class RegnfWorker(PatientWorker):
     """One worker of the service. ``monitor_s`` is how often it looks after the child it runs."""
 
     def __init__(self, context: Context, scratch: Scratch, monitor_s: int = 1) -> None:
@@ -59,6 +57,7 @@ class RegnfWorker(Worker):
             QUEUE_NAME: context.settings.job_timeout_s,
         }
         self._started = 0.0
+        self._begun = False
         self._exit_status: int | None = None
         self._late = False
         self._give_back_at: float | None = None
@@ -71,20 +70,22 @@ class RegnfWorker(Worker):
         try:
             self.work(logging_level=None)
         except StopRequested:
-            self.teardown()  # type: ignore[no-untyped-call]
+            self.teardown()
 
     # one job
 
     def execute_job(self, job: Any, queue: Any) -> None:
         job.timeout = self._limits[queue.name]
-        self._started, self._exit_status, self._late, self._given_back = time.monotonic(), None, False, False
+        self._started, self._exit_status = time.monotonic(), None
+        self._begun = self._late = self._given_back = False
         oom_kills = kernel.oom_kills()
         try:
             super().execute_job(job, queue)
         finally:
             self._scratch.empty()
-            if self._horse_pid == 0:
+            if self._begun and self._horse_pid == 0:
                 self._settle(job, queue, kernel.oom_kills() > oom_kills)
+            # one that was taken and not begun is in no queue any more: the reaper puts it back
 
     def _settle(self, job: Any, queue: Any, out_of_memory: bool) -> None:
         status = self._exit_status
@@ -95,8 +96,12 @@ class RegnfWorker(Worker):
             out_of_memory=out_of_memory,
             given_back=self._given_back,
         )
+        settle = self._settlers[queue.name]
         try:
-            self._settlers[queue.name](self._context, job.args[0], attempt_of(job.id), self.name, end)
+            self._patiently(
+                f"settling job {job.id}",
+                lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
+            )
         except (RedisError, OSError) as error:
             self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
 
@@ -110,7 +115,7 @@ class RegnfWorker(Worker):
             self._scratch.use()
             self.main_work_horse(job, queue)
             os._exit(0)
-        self._horse_pid = child
+        self._horse_pid, self._begun = child, True
 
     def wait_for_horse(self) -> tuple[int | None, int | None, Any]:
         pid, status, usage = super().wait_for_horse()
@@ -127,21 +132,9 @@ class RegnfWorker(Worker):
         elif self._give_back_at is not None and now >= self._give_back_at:
             self._given_back = True
             self.kill_horse()
-        try:
-            super().maintain_heartbeats(job)
-        except RedisError as error:
-            self.log.warning("no word from Redis while job %s runs: %s", job.id, error)
-
-    def set_current_job_working_time(self, current_job_working_time: float, pipeline: Any = None) -> None:
-        try:
-            super().set_current_job_working_time(current_job_working_time, pipeline)
-        except RedisError as error:
-            self.log.warning("no word from Redis while a job runs: %s", error)
+        super().maintain_heartbeats(job)
 
     # the worker itself
-
-    def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:  # noqa: ARG002 - one time for all
-        super().heartbeat(_LIVE_FOR_S, pipeline)
 
     def request_stop(self, signum: int, frame: FrameType | None) -> None:
         """Told to stop: a running job has ``shutdown_grace_s`` to end, then goes back to the queue."""

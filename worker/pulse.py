@@ -14,6 +14,7 @@ from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError
 from service.records import JobRecord, RecordStore, StaleAttemptError
+from worker.patience import patiently
 
 STOP_WITHIN_S = 5.0
 _REPORT_EVERY_S = 0.25
@@ -65,8 +66,11 @@ class Pulse:
             raise CancelledError("the job was cancelled" if not self.superseded else "another attempt has taken over")
 
     def confirm(self) -> None:
-        """Ask the record, here and now, whether this attempt still counts. Raises CancelledError, RedisError."""
-        self._note(self._records.heartbeat, self._job_id, self._attempt)
+        """Ask the record, as soon as it answers, whether this attempt counts. Raises CancelledError, RedisError."""
+        patiently(
+            f"the record of job {self._job_id}",
+            lambda: self._note(self._records.heartbeat, self._job_id, self._attempt),
+        )
         self.check()
 
     def _beat(self) -> None:

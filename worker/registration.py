@@ -17,6 +17,7 @@ from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts
 from worker.context import Context
 from worker.engine import RegistrationEngine
+from worker.patience import patiently
 from worker.problems import fault, new_incident, problem
 from worker.pulse import Pulse
 
@@ -34,11 +35,12 @@ def run_attempt(
 ) -> None:
     """Claim the attempt, do its work with the engine, write down how it ended.
 
-    Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Raises RedisError and
-    OSError of the network kind when the end cannot be written down; the worker's parent process then sees to it.
+    Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
+    refuses for a while are waited for, until the job's time is over. Raises RedisError and OSError of the network kind
+    when the end cannot be written down; the worker's parent process then sees to it.
     """
     try:
-        record = context.records.update_job(job_id, attempt, status="running", phase="loading", worker=worker)
+        record = _update(context, job_id, attempt, status="running", phase="loading", worker=worker)
     except StaleAttemptError as error:
         logger.info("job %s attempt %d is not run: %s", job_id, attempt, error)
         return
@@ -64,9 +66,13 @@ def run_attempt(
             discard_others(context.blobs, job_id, manifest)
 
 
+def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+    return patiently(f"the record of job {job_id}", lambda: context.records.update_job(job_id, attempt, **changes))
+
+
 def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
     try:
-        context.records.update_job(job_id, attempt, **changes)
+        _update(context, job_id, attempt, **changes)
     except StaleAttemptError as error:
         logger.info("job %s attempt %d has no say any more: %s", job_id, attempt, error)
     else:
@@ -80,7 +86,9 @@ def _fail(context: Context, job_id: str, attempt: int, error: dict[str, Any]) ->
 
 def _give_back(context: Context, job_id: str, attempt: int) -> None:
     with suppress(StaleAttemptError):
-        again = context.records.requeue_job(job_id, attempt, lost=False)
+        again = patiently(
+            f"the record of job {job_id}", lambda: context.records.requeue_job(job_id, attempt, lost=False)
+        )
         context.queue.enqueue_registration(job_id, again.attempt)
         logger.info("job %s attempt %d given back: its fields are still being imported", job_id, attempt)
 
@@ -92,7 +100,7 @@ def _work(context: Context, record: JobRecord, make_engine: Callable[[], Registr
         scene, object_ = (stack.enter_context(_field(context, request[name], pulse)) for name in ("scene", "object"))
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
         engine = make_engine()
-        context.records.update_job(record.id, record.attempt, engine=engine.describe())
+        _update(context, record.id, record.attempt, engine=engine.describe())
         names = engine.register(scene, object_, request, pulse.report, folder)
         pulse.confirm()
         manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)

@@ -30,11 +30,13 @@ DEADLINE_S = 60.0
 _Value = TypeVar("_Value")
 
 
-def eventually(look: Callable[[], _Value], what: str = "condition", deadline_s: float = DEADLINE_S) -> _Value:
-    """What ``look`` returns once that is truthy. Fails after the deadline."""
+def eventually(
+    look: Callable[[], _Value], what: str | Callable[[], str] = "condition", deadline_s: float = DEADLINE_S
+) -> _Value:
+    """What ``look`` returns once that is truthy. Fails after the deadline, telling what was waited for."""
     end = time.monotonic() + deadline_s
     while not (value := look()):
-        assert time.monotonic() < end, f"{what} did not come about within {deadline_s} s"
+        assert time.monotonic() < end, f"{what if isinstance(what, str) else what()}: not within {deadline_s} s"
         time.sleep(0.02)
     return value
 
@@ -52,12 +54,17 @@ class Bench:
     def start_worker(self, module: str = "tests.worker.tiny_worker", **settings: object) -> subprocess.Popen[bytes]:
         """A worker process; returns once it is listed as live."""
         before = self.context.queue.live_workers()
+        worker = self.launch_worker(module, **settings)
+        eventually(lambda: self.context.queue.live_workers() > before or worker.poll() is not None, "live worker")
+        assert worker.poll() is None, self.log()
+        return worker
+
+    def launch_worker(self, module: str = "tests.worker.tiny_worker", **settings: object) -> subprocess.Popen[bytes]:
+        """A worker process, however far it gets."""
         environment = self.environment | {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
         with (self.folder / f"worker-{len(self.workers)}.log").open("wb") as log:
             worker = subprocess.Popen([sys.executable, "-m", module], env=environment, stderr=log)
         self.workers.append(worker)
-        eventually(lambda: self.context.queue.live_workers() > before or worker.poll() is not None, "live worker")
-        assert worker.poll() is None, self.log()
         return worker
 
     def log(self) -> str:
@@ -87,7 +94,7 @@ class Bench:
         return record
 
     def finished(self, job_id: str = "j1") -> JobRecord:
-        return eventually(lambda: record if (record := self.job(job_id)).status in FINISHED else None, self.log())
+        return eventually(lambda: record if (record := self.job(job_id)).status in FINISHED else None, self.log)
 
     def reaches(self, phase: str, job_id: str = "j1") -> JobRecord:
         return eventually(lambda: record if (record := self.job(job_id)).phase == phase else None, phase)

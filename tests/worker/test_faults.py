@@ -4,7 +4,8 @@ import os
 import signal
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from regnf_cli.embedded_redis import answers, server_command
 from service.reaper import Reaper
 from tests.worker.bench import Bench, bench, children_of, eventually
 from worker.artifacts import read_manifest
+
+Full = Callable[[], AbstractContextManager[None]]
 
 
 @dataclass
@@ -137,16 +140,79 @@ def test_redis_forgets_everything(table: Bench) -> None:
     table.submit("succeed", "next")
     table_done = table.finished("next")
     assert table_done.status == "successful"
+    eventually(lambda: table.context.queue.live_workers() == 1, "the worker's being known again")
 
 
-@pytest.mark.skip(reason="known fault: a worker that meets a full Redis in its own bookkeeping may not go on")
+@pytest.fixture
+def full(table: Bench) -> Full:
+    """Redis takes no writes for as long as the block lasts, and at least until a worker has met with that."""
+
+    @contextmanager
+    def lasting() -> Iterator[None]:
+        table.redis.config_set("maxmemory", 1)
+        yield
+        eventually(lambda: "Redis refuses" in table.log(), table.log)
+        table.redis.config_set("maxmemory", 0)
+
+    return lasting
+
+
 def test_a_full_redis_refuses_and_recovers(table: Bench) -> None:
-    table.start_worker()
+    worker = table.start_worker()
     redis: Redis = table.redis
     redis.config_set("maxmemory", 1)
     with pytest.raises(RedisError):
         table.submit("succeed")
     redis.config_set("maxmemory", 0)
-    table.start_worker()  # as the supervisor does: one that meets a full Redis in its own bookkeeping does not go on
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+    assert worker.poll() is None, "one worker, the same all the while"
+
+
+def test_a_worker_that_starts_at_a_full_redis(table: Bench, full: Full) -> None:
+    with full():
+        worker = table.launch_worker()
+    table.submit("succeed")
+    assert table.finished().status == "successful"
+    assert worker.poll() is None
+    assert table.context.queue.live_workers() == 1
+
+
+def test_a_worker_told_to_stop_at_a_full_redis(table: Bench, full: Full) -> None:
+    with full():
+        worker = table.launch_worker()
+        eventually(lambda: "Redis refuses" in table.log(), table.log)
+        worker.send_signal(signal.SIGTERM)
+        assert worker.wait(30) == 0
+    assert "Traceback" not in table.log()
+
+
+@pytest.mark.parametrize("do", ["wait_for_file", "refuse_after_file"])
+def test_a_job_caught_by_a_full_redis_loses_nothing(table: Bench, full: Full, do: str) -> None:
+    """Its end cannot be written down: it waits with what it has found, and so does its worker."""
+    worker = table.start_worker()
+    table.submit(do)
+    table.reaches("sampling")
+    with full():
+        (table.context.settings.state_dir / "go").write_bytes(b"")
+    done = table.finished()
+    assert (done.status, done.attempt) == ("successful" if do == "wait_for_file" else "failed", 1)
+    assert (done.error or {}).get("reason") == (None if do == "wait_for_file" else "NO_SURFACE_IN_DETECTION")
+    assert worker.poll() is None
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+
+
+def test_a_child_that_dies_at_a_full_redis_is_settled_afterwards(table: Bench, full: Full) -> None:
+    worker = table.start_worker()
+    table.submit("wait_for_file")
+    table.reaches("sampling")
+    (child,) = children_of(worker.pid)
+    with full():
+        os.kill(child, signal.SIGKILL)
+    failed = table.finished()
+    assert failed.error is not None
+    assert (failed.status, failed.error["reason"]) == ("failed", "WORKER_LOST")
+    assert worker.poll() is None
     table.submit("succeed", "next")
     assert table.finished("next").status == "successful"

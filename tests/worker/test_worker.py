@@ -201,7 +201,7 @@ def field_state(table: Bench, sha256: str) -> FieldRecord:
         record = table.context.records.get_field(sha256)
         return record if record is not None and record.state != "validating" else None
 
-    return eventually(ended, table.log())
+    return eventually(ended, table.log)
 
 
 def test_imports_and_registrations_that_wait_for_them(tmp_path: Path) -> None:

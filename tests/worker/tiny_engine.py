@@ -57,6 +57,10 @@ class TinyEngine:
         while not (Settings().state_dir / "go").exists():
             time.sleep(0.01)
 
+    def refuse_after_file(self, report: Report) -> None:
+        self.wait_for_file(report)
+        self.refuse(report)
+
     def hang(self, report: Report) -> None:
         """Native code that never comes back to Python: no alarm is heard, nothing is reported."""
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
