@@ -1,0 +1,173 @@
+"""Waiting for a Redis that refuses: how long, for what, and that jobs lose nothing by it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from redis.exceptions import RedisError
+from rq.exceptions import StopRequested
+
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.records import FieldRecord, JobRecord
+from service.settings import Settings
+from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
+from tests.worker.tiny_engine import TinyEngine, tiny_importer
+from worker.context import Context
+from worker.imports import run_import_attempt
+from worker.patience import LONGEST_WAIT_S, passes, patiently
+from worker.process import RegnfWorker
+from worker.registration import run_attempt
+from worker.scratch import Scratch
+
+SHA = "a" * 64
+
+
+def accept(context: Context, do: str = "succeed") -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
+    context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
+    request = {"scene": SHA, "object": SHA, "options": {"do": do}}
+    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+
+
+# waiting
+
+
+def test_waits_grow_and_are_bounded(waits: list[float]) -> None:
+    do = Refusals(8, answer="done")
+    assert patiently("it", do) == "done"
+    assert len(do.calls) == 9
+    assert waits == [0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0, 2.0]
+    assert max(waits) == LONGEST_WAIT_S
+
+
+@pytest.mark.parametrize("error", PASSING, ids=str)
+def test_what_passes_is_waited_for(waits: list[float], error: RedisError) -> None:
+    assert passes(error)
+    assert patiently("it", Refusals(2, error, answer=3)) == 3
+
+
+@pytest.mark.parametrize("error", [LASTING, StopRequested(), ValueError()], ids=repr)
+def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Exception) -> None:
+    do = Refusals(1, error)
+    with pytest.raises(type(error)):
+        patiently("it", do)
+    assert (len(do.calls), waits) == (1, [])
+
+
+def test_who_is_told_to_stop_waits_no_longer(waits: list[float]) -> None:
+    do = Refusals(9)
+    with pytest.raises(StopRequested):
+        patiently("it", do, stopped=lambda: len(do.calls) == 3)
+    assert len(do.calls) == 3
+    assert patiently("it", Refusals(0, answer=1), stopped=lambda: True) == 1, "what succeeds is not given up"
+
+
+def test_a_refusal_and_its_end_are_logged_once(waits: list[float], caplog: pytest.LogCaptureFixture) -> None:
+    patiently("the claim", Refusals(5))
+    assert [record.message for record in caplog.records] == [
+        f"the claim: Redis refuses, trying until it does not: {FULL}",
+        "the claim: done after 5 refusals",
+    ]
+
+
+# our own worker around a job
+
+
+@pytest.fixture
+def worker(tmp_path: Path, redis: RefusingRedis, monkeypatch: pytest.MonkeyPatch) -> RegnfWorker:
+    monkeypatch.setattr("worker.process.connect", lambda *_, **__: redis)
+    settings = Settings(state_dir=tmp_path, redis_url="unix:///nowhere")
+    context = Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
+    return RegnfWorker(context, Scratch(tmp_path / "scratch"))
+
+
+class TakenJob:
+    id = "j1-1"
+    args = ("j1",)
+    timeout = 1
+
+
+class JobsQueue:
+    name = "regnf"
+
+
+def test_a_job_taken_but_not_begun_is_left_to_the_reaper(worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch) -> None:
+    accept(worker._context)
+    before = worker._context.records.get_job("j1")
+    monkeypatch.setattr("rq.worker.base.BaseWorker.prepare_execution", lambda *_: Refusals(9)())
+    worker._stop_requested = True
+    with pytest.raises(StopRequested):
+        worker.execute_job(TakenJob, JobsQueue)
+    assert worker._context.records.get_job("j1") == before
+
+
+def test_a_job_is_settled_once_redis_takes_it(
+    worker: RegnfWorker, monkeypatch: pytest.MonkeyPatch, waits: list[float]
+) -> None:
+    """The child died because Redis was full, and Redis is still full when its parent wants to say so."""
+    accept(worker._context)
+    refuse(monkeypatch, worker._context, "update_job", 3)
+    monkeypatch.setattr("rq.Worker.execute_job", lambda *_: setattr(worker, "_begun", True))
+    worker.execute_job(TakenJob, JobsQueue)
+    again = worker._context.records.get_job("j1")
+    assert again is not None
+    assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)
+    assert len(waits) == 3
+
+
+# a job in its child
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Context:
+    settings = Settings(state_dir=tmp_path, heartbeat_s=60)
+    return Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
+
+
+@pytest.mark.parametrize("name", ["update_job", "heartbeat"])
+@pytest.mark.parametrize(("do", "status"), [("succeed", "successful"), ("refuse", "failed")])
+def test_a_job_waits_for_redis_and_loses_nothing(
+    context: Context, monkeypatch: pytest.MonkeyPatch, waits: list[float], name: str, do: str, status: str
+) -> None:
+    """Each of its writes in turn is refused twice: progress is skipped, the rest waited for."""
+    accept(context, do)
+    real: Callable[..., Any] = getattr(context.records, name)
+    calls: list[int] = []
+
+    def every_third(*arguments: Any, **changes: Any) -> Any:
+        calls.append(1)
+        if len(calls) % 3:
+            raise FULL
+        return real(*arguments, **changes)
+
+    monkeypatch.setattr(context.records, name, every_third)
+    run_attempt(context, "j1", 1, "w", TinyEngine)
+    job = context.records.get_job("j1")
+    assert job is not None
+    assert (job.status, job.attempt, job.engine["version"]) == (status, 1, "tiny")
+    if calls:
+        assert waits
+
+
+@pytest.mark.parametrize("name", ["remember", "update_field"])
+@pytest.mark.parametrize(("data", "state"), [(b"f", "ready"), (b"raise", "rejected")])
+def test_an_import_waits_for_redis_and_rejects_nothing_for_it(
+    context: Context, monkeypatch: pytest.MonkeyPatch, waits: list[float], name: str, data: bytes, state: str
+) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
+    context.blobs.put(f"fields/{SHA}/original", data)
+    refuse(monkeypatch, context, name, 2)
+
+    def importer(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+        if upload.read_bytes() == b"raise":
+            raise ValueError("no field")
+        return tiny_importer(upload, folder, description)
+
+    run_import_attempt(context, SHA, 1, "w", importer)
+    field = context.records.get_field(SHA)
+    assert field is not None
+    assert field.state == state
+    assert len(waits) == 2
