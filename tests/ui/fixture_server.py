@@ -18,7 +18,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, ClassVar
 
-from tests.ui.synthetic import JOB_ID, Synthetic, rotation, sim3_document, similarity, synthetic
+from tests.ui.synthetic import JOB_ID, Synthetic, synthetic
+from tests.ui.verdicts import ambiguous_result
 
 WEB = Path(__file__).resolve().parents[2] / "service" / "web"
 CONTENT_SECURITY_POLICY = "default-src 'self'"
@@ -110,14 +111,7 @@ class Stage:
             return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
         if story != "ambiguous":
             return self.data.result
-        half_turn = similarity(1.0, rotation([0, 0, 1], 3.0), [0, 0, 0]) @ self.data.T_object_scene
-        return self.data.result | {
-            "verdict": "ambiguous",
-            "verdict_reason": "SYMMETRIC_ALTERNATIVES",
-            "alternatives": [
-                {"T_object_scene": sim3_document(half_turn), "score": 0.93, "relation": "172 degrees about z"}
-            ],
-        }
+        return ambiguous_result(self.data)
 
 
 FAILURE = {

@@ -1,10 +1,12 @@
 // The page of one job: reads it, follows it while it runs, then shows the result.
 
 import { JobApi, jobBase } from './api.js';
+import { showCertainty } from './certainty.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
 import { announce, byId, copyText, show } from './dom.js';
 import { followJob } from './events.js';
 import { prefersStillness } from './motion.js';
+import { showOptions } from './options.js';
 import {
   checkPose, showAgreement, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
 } from './panel.js';
@@ -48,6 +50,8 @@ async function showResult(job, result) {
   const frames = framesOf(result, trace);
   showBadge(result.verdict ?? job.status, job.id);
   if (result.verdict) showVerdict(result);
+  showCertainty(result);
+  showOptions(result.options);
   if (frames.length) showTransform(frames.at(-1).pose);
   showAgreement(result.metrics);
   showTimes(result.metrics);
@@ -66,9 +70,9 @@ async function showStage(job, result, frames, names) {
   } catch (error) {
     show(byId('canvas'), false);
     showNoView(error);
+    offerPoses(result, frames, () => {});
     return;
   }
-  const alternatives = (result.alternatives ?? []).filter((one) => readSim3(one?.T_object_scene));
   const loss = new LossPlot(byId('loss'), frames, (index) => playback.seek(index));
   const playback = new Playback(frames, (position) => {
     stage.moveTo(position);
@@ -82,15 +86,25 @@ async function showStage(job, result, frames, names) {
     event.preventDefault();
     playback.toggle();
   });
-  showPoses(alternatives, (index) => {
-    const pose = index === 0 ? frames.at(-1).pose : readSim3(alternatives[index - 1].T_object_scene);
+  offerPoses(result, frames, (alternative) => {
     playback.seek(frames.length - 1);
-    stage.place(inverse(pose));
-    showTransform(pose);
-    checkPose(index);
+    if (!alternative) return;
+    stage.placeAlternative(inverse(alternative));
+    playback.nameInstead('Alternative');
   });
   announce('The point clouds are shown.');
   if (!prefersStillness() && frames.length > 1) playback.play();
+}
+
+/** Lets the reader choose among the poses; onChoose hears the alternative's T_object_scene, or null for the result's. */
+function offerPoses(result, frames, onChoose) {
+  const alternatives = (result.alternatives ?? []).filter((one) => readSim3(one?.T_object_scene));
+  showPoses(alternatives, result.metrics?.score, (index) => {
+    const alternative = index === 0 ? null : readSim3(alternatives[index - 1].T_object_scene);
+    onChoose(alternative);
+    showTransform(alternative ?? frames.at(-1).pose, alternative ? `An alternative: ${alternatives[index - 1].relation}` : '');
+    checkPose(index);
+  });
 }
 
 async function readTrace() {

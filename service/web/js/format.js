@@ -12,7 +12,9 @@ export function number(value, digits = 4) {
 
 /** Fixed decimals in an even column, for matrices. */
 export function fixed(value, decimals = 5) {
-  return Number.isFinite(value) ? signed((value === 0 ? 0 : value).toFixed(decimals)) : '–';
+  if (!Number.isFinite(value)) return '–';
+  const text = value.toFixed(decimals);
+  return Number(text) === 0 ? text.replace('-', '') : signed(text);
 }
 
 export function percent(share, decimals = 1) {

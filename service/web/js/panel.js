@@ -16,23 +16,27 @@ export function showVerdict(result) {
   const { verdict, verdict_reason: reason, metrics = {} } = result;
   byId('verdict').dataset.verdict = verdict;
   byId('verdict-word').textContent = words(verdict);
-  const why = el('span', {}, words(reason));
+  const why = el('span', {}, result.verdict_detail || words(reason));
   byId('verdict-reason').replaceChildren(why, ' ', el('code', { title: 'Stable reason, for programs' }, reason ?? ''));
   const hint = verdict === 'registered' ? '' : hintFor(reason);
   if (hint) byId('verdict-reason').append(el('span', { className: 'hint' }, hint));
   const scale = readSim3(result.T_object_scene);
+  const deviation = result.uncertainty?.scale_percent;
   const total = totalSeconds(metrics);
   fillFacts(byId('figures'), [
     ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
-    ['Scale', figure(scale ? fixed(partsOf(scale).scale, 4) : '–', 'object ← scene')],
+    ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
+      Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],
     ['Inliers', figure(percent(Math.min(metrics.inlier_share_scene, metrics.inlier_share_object)), 'weaker side')],
     ['Time', figure(seconds(total), metrics.iterations ? `${number(metrics.iterations)} iterations` : '')],
   ]);
   show(byId('verdict'));
 }
 
-/** The matrix in both directions, as text to read and to copy. */
-export function showTransform(matrix) {
+/** The matrix in both directions, as text to read and to copy; note says whose it is when it is not the result's. */
+export function showTransform(matrix, note = '') {
+  byId('transform-note').textContent = note;
+  show(byId('transform-note'), note !== '');
   const shown = { T_object_scene: matrix, T_scene_object: inverse(matrix) };
   const direction = () => document.querySelector('input[name="direction"]:checked').value;
   const draw = () => {
@@ -78,9 +82,9 @@ export function showTimes(metrics = {}) {
   show(byId('time'), rows.length > 0);
 }
 
-/** One radio button a pose; onChoose(index) with 0 for the result itself. */
-export function showPoses(alternatives, onChoose) {
-  const poses = [{ relation: 'The result', score: null }, ...alternatives];
+/** One radio button a pose; onChoose(index) with 0 for the result itself, whose score is given apart. */
+export function showPoses(alternatives, score, onChoose) {
+  const poses = [{ relation: 'The result', score }, ...alternatives];
   byId('pose-list').replaceChildren(el('legend', { className: 'unseen' }, 'Pose shown'), ...poses.map((pose, i) => {
     const input = el('input', { type: 'radio', name: 'pose', value: String(i), checked: i === 0, onchange: () => onChoose(i) });
     const score = Number.isFinite(pose.score) ? el('span', { className: 'mono' }, number(pose.score, 3)) : '';
@@ -116,6 +120,7 @@ export function showJob(job, result) {
     ['Created', moment(job.created_at)],
     ['Finished', moment(job.finished_at)],
     ['Expires', moment(job.expires_at)],
+    ['Start', job.inputs?.initial_transform ? 'given with the request' : null],
     ['Seed', mono(String(result?.seed ?? job.inputs?.seed ?? ''))],
     ['Engine', typeof engine === 'string' ? engine : Object.values(engine).filter((value) => typeof value !== 'object').join(' · ')],
     ...inputs.map(([name, value]) => [words(name), mono(value)]),

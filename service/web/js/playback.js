@@ -63,6 +63,12 @@ export class Playback {
     this.onMove(position);
   }
 
+  /** Says that something else than a frame of the path is shown, until it moves again. */
+  nameInstead(label) {
+    byId('iteration-text').textContent = label;
+    this.slider.setAttribute('aria-valuetext', label);
+  }
+
   showState() {
     this.button.setAttribute('aria-label', this.playing ? 'Pause' : "Play the optimiser's iterations");
     this.button.toggleAttribute('data-playing', Boolean(this.playing));

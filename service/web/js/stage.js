@@ -44,7 +44,14 @@ export class Stage {
   moveTo(position) {
     const low = Math.min(Math.floor(position), this.poses.length - 1);
     const high = Math.min(low + 1, this.poses.length - 1);
+    noteResiduals(position >= this.poses.length - 1);
     this.place(position > low ? between(this.poses[low], this.poses[high], position - low) : this.poses[low]);
+  }
+
+  /** Shows the object in another pose (T_scene_object) than the result's or one on the way to it. */
+  placeAlternative(pose) {
+    noteResiduals(false);
+    this.place(pose);
   }
 
   /** T_scene_object: where the object stands in the scene. */
@@ -128,4 +135,9 @@ export class Stage {
       return null;
     }
   }
+}
+
+// The residuals are the result's, wherever the object is shown: nothing is computed in the browser.
+function noteResiduals(areOfThePoseShown) {
+  byId('legend-note').textContent = areOfThePoseShown ? '' : ' – of the result’s pose, not of the one shown';
 }

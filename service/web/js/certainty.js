@@ -1,0 +1,49 @@
+// How sure the pose is: one standard deviation each, the covariance they come from, and the object's own symmetry.
+
+import { byId, el, fillFacts, show } from './dom.js';
+import { number } from './format.js';
+
+const AXES = ['x', 'y', 'z'];
+
+/** Bars within each group of deviations: their units differ, so lengths are comparable within a group alone. */
+export function showCertainty(result) {
+  const { uncertainty, covariance, covariance_ordering: ordering, symmetry } = result;
+  if (uncertainty) {
+    byId('sigmas').replaceChildren(
+      ...group('Rotation about the object’s axes', 'degrees', AXES, uncertainty.rotation_deg),
+      ...group('Translation', 'object units', AXES, uncertainty.translation),
+      ...group('Scale', '%', [''], [uncertainty.scale_percent]),
+    );
+  }
+  if (covariance && ordering) byId('covariance').replaceChildren(...matrixRows(covariance, ordering));
+  show(byId('covariance-details'), Boolean(covariance && ordering));
+  fillFacts(byId('symmetry'), [['Symmetry of the object', symmetry ? symmetryInWords(symmetry) : null]]);
+  show(byId('certainty'), Boolean(uncertainty || symmetry));
+}
+
+/** { order, axis, continuous } as people say it. */
+export function symmetryInWords({ order, axis, continuous }) {
+  const about = axis ? ` about (${axis.map((value) => (Math.round(value * 100) / 100 + 0).toFixed(2)).join(', ')})` : '';
+  if (continuous) return `any turn${about}${order > 1 ? ', and either end up' : ''}`;
+  return order === 1 ? 'none found' : `${order} turns${about} look alike`;
+}
+
+function group(name, unit, labels, values = []) {
+  const largest = Math.max(...values.filter(Number.isFinite), 0);
+  const rows = labels.map((label, i) => {
+    const fill = el('span', {});
+    fill.style.width = `${Number.isFinite(values[i]) && largest > 0 ? (100 * values[i]) / largest : 0}%`;
+    return el('div', { className: 'sigma' }, el('span', { className: 'mono' }, label),
+      el('span', { className: 'track', 'aria-hidden': 'true' }, fill),
+      el('span', { className: 'mono' }, `± ${number(values[i], 2)}`));
+  });
+  return [el('h3', {}, name, ' ', el('small', {}, unit)), ...rows];
+}
+
+function matrixRows(covariance, ordering) {
+  const head = el('tr', {}, el('td', {}), ...ordering.map((name) => el('th', { scope: 'col' }, name)));
+  const rows = covariance.map((row, i) => el('tr', {}, el('th', { scope: 'row' }, ordering[i]), ...row.map((value, j) => el(
+    'td', i === j ? { className: 'own' } : {}, number(value, 2),
+  ))));
+  return [el('thead', {}, head), el('tbody', {}, ...rows)];
+}

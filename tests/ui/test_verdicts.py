@@ -1,0 +1,127 @@
+"""What the page tells of the preset `robust`: words, twins to choose from, deviations, covariance, options."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+
+from tests.ui.conftest import Visit
+from tests.ui.pixels import canvas_pixels, changed_share
+from tests.ui.verdicts import DETAIL, ORDERING, SIGMAS
+
+pytestmark = pytest.mark.browser
+
+
+def numbers(texts: list[str]) -> list[float]:
+    return [float(text.replace("±", "").replace("−", "-")) for text in texts]
+
+
+def test_the_reason_is_told_in_words_and_what_to_do(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    assert page.locator("#status").inner_text() == "Ambiguous"
+    said = page.locator("#verdict-reason").inner_text()
+    assert DETAIL in said
+    assert "SEVERAL_POSES_AGREE" in said
+    assert "robust.up_axis" in said
+    assert "± 0.5 %" in page.locator("#figures").inner_text()
+
+
+def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    assert page.locator("#pose-list label").all_inner_texts() == [
+        "The result\n0.041",
+        "172 degrees about z\n0.043",
+        "180 degrees about x\n0.071",
+    ]
+    result, matrix = canvas_pixels(page), page.locator("#matrix").inner_text()
+    shown = {matrix}
+    for relation in ("172 degrees about z", "180 degrees about x"):
+        page.locator("#pose-list label", has_text=relation).click()
+        assert changed_share(result, canvas_pixels(page)) > 0.005
+        assert page.locator("#transform-note").inner_text() == f"An alternative: {relation}"
+        assert page.locator("#iteration-text").inner_text() == "Alternative"
+        shown.add(page.locator("#matrix").inner_text())
+    assert len(shown) == 3
+    page.locator("#pose-list label", has_text="The result").click()
+    assert changed_share(result, canvas_pixels(page)) < 0.001
+    assert page.locator("#matrix").inner_text() == matrix
+    assert page.locator("#iteration-text").inner_text() == "Result"
+    expect(page.locator("#transform-note")).to_be_hidden()
+
+
+def test_residual_colours_say_whose_they_are(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    page.locator("#colour").select_option("residual")
+    page.wait_for_selector("#legend svg rect")
+    assert page.locator("#legend figcaption").inner_text() == "Residual, object units"
+    page.locator("#pose-list label", has_text="172 degrees").click()
+    assert "of the result’s pose, not of the one shown" in page.locator("#legend figcaption").inner_text()
+    page.locator("#pose-list label", has_text="The result").click()
+    assert page.locator("#legend figcaption").inner_text() == "Residual, object units"
+    page.locator("#iteration").fill("3")
+    assert "of the result’s pose" in page.locator("#legend figcaption").inner_text()
+
+
+def test_deviations_are_the_documents(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    shown = numbers(page.locator("#sigmas .mono:last-child").all_inner_texts())
+    assert shown == [0.4, 0.8, 0.2, 0.003, 0.001, 0.002, 0.5]
+    widths = [
+        page.locator("#sigmas .track span").nth(k).evaluate("node => parseFloat(node.style.width)") for k in range(7)
+    ]
+    assert widths == pytest.approx([50, 100, 25, 100, 100 / 3, 200 / 3, 100], rel=1e-3)  # within each unit
+    assert page.locator("#symmetry").inner_text().split("\n") == [
+        "Symmetry of the object",
+        "2 turns about (0.00, 0.00, 1.00) look alike",
+    ]
+
+
+def test_the_covariance_stands_in_its_order(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    expect(page.locator("#covariance")).to_be_hidden()
+    page.locator("#covariance-details summary").click()
+    assert page.locator("#covariance thead th").all_inner_texts() == ORDERING
+    assert page.locator("#covariance tbody th").all_inner_texts() == ORDERING
+    cells = np.reshape(numbers([text.replace("e−", "e-") for text in cells_of(visit)]), (7, 7))
+    np.testing.assert_allclose(cells.diagonal(), np.square(SIGMAS), rtol=0.05)
+    assert cells[0, 3] == pytest.approx(0.3 * SIGMAS[0] * SIGMAS[3], rel=0.05)
+    assert cells[0, 1] == 0
+
+
+def cells_of(visit: Visit) -> list[str]:
+    return visit.page.locator("#covariance tbody td").all_inner_texts()
+
+
+def test_the_options_that_were_used_are_shown(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    assert page.locator("#preset").inner_text() == "preset robust"
+    page.locator("#options summary").click()
+    assert page.locator("#option-groups div").all_inner_texts() == [
+        "up_axis\nnone",
+        "rotations\n600",
+        "inlier_distance\n0.015",
+    ]
+
+
+def test_results_that_know_nothing_of_all_this_are_shown_without(visit: Visit) -> None:
+    page = visit.open("done")
+    for card in ("poses", "certainty", "options"):
+        expect(page.locator(f"#{card}")).to_be_hidden()
+    assert "Surfaces agree" in page.locator("#verdict-reason").inner_text()
+
+
+def test_without_a_view_the_alternatives_still_have_their_numbers(visit: Visit) -> None:
+    visit.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page = visit.open("ambiguous")
+    matrix = page.locator("#matrix").inner_text()
+    page.locator("#pose-list label", has_text="180 degrees about x").click()
+    assert page.locator("#matrix").inner_text() != matrix
+
+
+def test_alternatives_can_be_chosen_by_keyboard(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    page.locator("#pose-list input").first.focus()
+    page.keyboard.press("ArrowDown")
+    assert page.locator("#pose-list input").nth(1).is_checked()
+    assert page.locator("#transform-note").inner_text() == "An alternative: 172 degrees about z"

@@ -1,0 +1,48 @@
+"""What results of the preset `robust` carry besides the transform, made up for the page as the contract has it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from tests.ui.synthetic import Synthetic, rotation, sim3_document, similarity
+
+SIGMAS = [math.radians(0.4), math.radians(0.8), math.radians(0.2), 0.003, 0.001, 0.002, 0.005]
+ORDERING = ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
+DETAIL = "Several poses explain the data equally well: this one and the alternatives."
+
+
+def ambiguous_result(data: Synthetic) -> dict[str, Any]:
+    """The made-up result with two more poses, a covariance, a symmetry and options."""
+    correlation = np.eye(7) + 0.3 * (np.eye(7, k=3) + np.eye(7, k=-3))
+    covariance = correlation * np.outer(SIGMAS, SIGMAS)
+    return data.result | {
+        "verdict": "ambiguous",
+        "verdict_reason": "SEVERAL_POSES_AGREE",
+        "verdict_detail": DETAIL,
+        "alternatives": [
+            _alternative(data, [0, 0, 1], 3.0, 0.043, "172 degrees about z"),
+            _alternative(data, [1, 0, 0], math.pi, 0.071, "180 degrees about x"),
+        ],
+        "covariance": covariance.tolist(),
+        "covariance_ordering": ORDERING,
+        "uncertainty": {
+            "rotation_deg": [0.4, 0.8, 0.2],
+            "translation": SIGMAS[3:6],
+            "scale_percent": 100 * SIGMAS[6],
+        },
+        "symmetry": {"order": 2, "axis": [-0.001, 0.0, 1.0], "continuous": False},
+        "metrics": data.result["metrics"] | {"score": 0.041},
+        "options": {
+            "preset": "robust",
+            "sampling": {"views": 5},
+            "robust": {"up_axis": None, "rotations": 600, "inlier_distance": 0.015},
+        },
+    }
+
+
+def _alternative(data: Synthetic, axis: list[float], angle: float, score: float, relation: str) -> dict[str, Any]:
+    turned = similarity(1.0, rotation(axis, angle), [0, 0, 0]) @ data.T_object_scene
+    return {"T_object_scene": sim3_document(turned), "score": score, "relation": relation}
