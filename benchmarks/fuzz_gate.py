@@ -26,11 +26,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from benchmarks.fuzz_worker import CASE_S, MEMORY_BYTES
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
 from tests.core.importing.fuzzing.cases import STAGES
 from tests.core.importing.fuzzing.seeds import make_seeds
+from tests.core.importing.fuzzing.worker import CASE_S, MEMORY_BYTES
 
 _ANSWER_S = 600.0
 _GATE = "whole gate"
@@ -43,7 +43,7 @@ class Worker:
 
     def __init__(self, seeds: Path, folder: Path, seed: str) -> None:
         self._folder = folder
-        command = [sys.executable, "-m", "benchmarks.fuzz_worker", str(seeds), str(folder), seed]
+        command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", str(seeds), str(folder), seed]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def run(self, first: int, count: int) -> dict[str, Any] | None:
@@ -184,7 +184,7 @@ def report(tally: Tally, arguments: argparse.Namespace, seconds: float) -> str:
             f"Slowest case in its stage: {slowest:.2f} s ({where}), of {CASE_S:.0f} s allowed; slowest through the "
             f"whole gate: {tally.slowest_gate:.1f} s. Largest resident size of the process that runs the stages: "
             f"{tally.peak_bytes / 1e6:.0f} MB, of {MEMORY_BYTES / 1e6:.0f} MB of address space allowed.",
-            f"Feedback: half of the cases are traced line by line; {tally.lines} lines of `regnf_core/importing` were "
+            f"Feedback: half of the cases are traced line by line; {tally.lines} lines of the gate's own modules were "
             f"reached, and {tally.finds} cases kept because they took a new step, for later ones to build upon.",
         ]
     )

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import io
+import json
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
+from random import Random
+from typing import Any
 
+import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -21,6 +28,11 @@ from regnf_core.importing.tensors import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import torch_zip
 from tests.core.importing.checkpoints import checkpoint
+from tests.core.importing.fuzzing.cases import STAGES, make_case
+from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
+
+ROOT = Path(__file__).resolve().parents[3]
+CASES = 3_000
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
@@ -142,3 +154,73 @@ def test_any_safetensors_header(body: bytes, length_fits: bool) -> None:
 @given(st.binary(max_size=600))
 def test_any_head_is_named_or_explained(head: bytes) -> None:
     assert sniff_format(head) is not None or explain_refusal(head)[0].isupper()
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Seeds:
+    return make_seeds(tmp_path_factory.mktemp("seeds"))
+
+
+@pytest.fixture(scope="module")
+def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What the fuzzing process makes of the cases that `python -m benchmarks.fuzz_gate` begins with."""
+    folder = tmp_path_factory.mktemp("fuzz")
+    seeds.save(folder / "seeds")
+    command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", str(folder / "seeds"), str(folder), "1.1"]
+    done = subprocess.run(command, input=f"0 {CASES}\n", cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"{done.stderr} at {(folder / 'case').read_bytes()!r:.300}"
+    results: dict[str, Any] = json.loads(done.stdout)
+    return results
+
+
+@pytest.mark.slow
+def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
+    """No other exception, no import, no file left or opened, nothing slow, nothing large."""
+    assert [(failure["at"], failure["fault"]) for failure in fuzzed["failures"]] == []
+    assert sum(fuzzed["outcomes"].values()) == CASES
+
+
+@pytest.mark.slow
+def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
+    """A fuzzer whose cases all fail at the first check would find nothing."""
+    outcomes = fuzzed["outcomes"]
+    assert all(outcomes[f"{stage} taken"] > 10 for stage in STAGES)
+    deep = ("ARCHIVE_CRC_MISMATCH", "TENSOR_NOT_DENSE", "TENSOR_NOT_FINITE", "TENSOR_STORAGE_MISMATCH", "TENSOR_SHAPE")
+    assert all(any(key.endswith(reason) for key in outcomes) for reason in deep)
+    assert len({key.split()[1] for key in outcomes}) > 40
+    assert fuzzed["finds"] > 50
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_seed_gives_the_same_cases_again(seeds: Seeds, stage: str) -> None:
+    first, second = ([make_case(Random(i), stage, seeds, []) for i in range(50)] for _ in range(2))
+    assert first == second
+    assert len(set(first)) > 40
+
+
+WATCHED = """
+import sys
+from tests.core.importing.fuzzing.stages import Watch
+watch = Watch()
+with watch.over("pickle"):
+    {action}
+print("heard" if watch.events else "silent")
+"""
+
+
+@pytest.mark.parametrize(
+    ("action", "heard"),
+    [
+        ("import this_is_no_module_of_ours", "heard"),
+        ("__import__('os').system('true')", "heard"),
+        ("open('/dev/null')", "heard"),
+        ("eval('1')", "heard"),
+        ("__import__('socket').socket()", "heard"),
+        ("sorted([3, 1, 2])", "silent"),
+    ],
+)
+def test_the_watch_hears_what_a_file_must_not_bring_about(action: str, heard: str) -> None:
+    action = f"try: {action}\n    except ImportError: pass"
+    program = WATCHED.format(action=action)
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == heard, done.stderr

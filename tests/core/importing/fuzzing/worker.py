@@ -1,6 +1,6 @@
 """The process that runs a fuzzer's cases: little memory, a time limit each, every import and file noticed.
 
-    python -m benchmarks.fuzz_worker SEEDS FOLDER SEED
+    python -m tests.core.importing.fuzzing.worker SEEDS FOLDER SEED
 
 Reads lines "FIRST COUNT" and answers each with one line of JSON. The case under way lies in FOLDER/case, for whoever
 has to find out why this process ended. Needs no torch.
@@ -21,8 +21,8 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from benchmarks.line_coverage import Coverage
 from tests.core.importing.fuzzing.cases import STAGES, make_case
+from tests.core.importing.fuzzing.line_coverage import Coverage
 from tests.core.importing.fuzzing.seeds import load_seeds
 from tests.core.importing.fuzzing.stages import Watch, run_stage
 
