@@ -54,8 +54,10 @@ def build_contract(app: FastAPI) -> dict[str, Any]:
     components["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
     contract["security"] = [{}, {"token": []}]
     for operations in contract["paths"].values():
-        for operation in operations.values():
+        for method, operation in operations.items():
             _mend(operation)
+            if method == "head":
+                _drop_content(operation)
     return contract
 
 
@@ -69,6 +71,11 @@ def _mend(operation: dict[str, Any]) -> None:
     if schema.get("$ref", "").endswith("/HTTPValidationError"):
         del responses["422"]
     operation["responses"] = dict(sorted(responses.items()))
+
+
+def _drop_content(operation: dict[str, Any]) -> None:
+    for response in operation["responses"].values():
+        response.pop("content", None)
 
 
 def allowed_methods(contract: dict[str, Any], path: str) -> list[str]:

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from fastapi import APIRouter
 
 from service.problems import MEDIA_TYPE
 from service.reasons import REASONS
 
 _PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
 JSON = "application/json"
+_Endpoint = TypeVar("_Endpoint", bound=Callable[..., Any])
+
+
+def get_and_head(router: APIRouter, path: str, *, summary: str, **how: Any) -> Callable[[_Endpoint], _Endpoint]:
+    """Declare an endpoint for GET, and for HEAD, which has GET's status and headers; servers leave its content out."""
+
+    def declare(endpoint: _Endpoint) -> _Endpoint:
+        name = "head_" + endpoint.__name__.removeprefix("get_")
+        router.get(path, summary=summary, **how)(endpoint)
+        router.head(path, summary=f"{summary}: headers alone", operation_id=name, **how)(endpoint)
+        return endpoint
+
+    return declare
 
 
 def refusals(*reasons: str) -> dict[int | str, dict[str, Any]]:

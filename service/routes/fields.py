@@ -12,7 +12,7 @@ from service.digests import is_sha256
 from service.paging import decode_token, encode_token
 from service.problems import Problem
 from service.records import FieldRecord
-from service.routes.documentation import refusals
+from service.routes.documentation import get_and_head, refusals
 from service.routes.uploads import field_etag
 from service.schemas.fields import FieldDocument, FieldPage, field_document
 from service.waiting import wait_for
@@ -27,14 +27,18 @@ def _require(services: Services, sha256: str) -> FieldRecord:
     return record
 
 
-@router.get(
+@get_and_head(
+    router,
     "/fields/{sha256}",
     summary="A field's state and what its import found",
     response_model=FieldDocument,
     responses=refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
 )
 async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait: WaitQuery = 0) -> JSONResponse:
-    """With `wait`, the answer comes as soon as the field is no longer `validating`."""
+    """With `wait`, the answer comes as soon as the field is no longer `validating`.
+
+    200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
+    """
     record = await wait_for(
         lambda: _require(services, sha256), lambda found: found.state != "validating", wait, services.stopping
     )
@@ -42,18 +46,6 @@ async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait:
     if record.state == "validating":
         headers["Retry-After"] = "1"
     return JSONResponse(field_document(record, prefix), headers=headers)
-
-
-@router.head(
-    "/fields/{sha256}",
-    summary="Whether a field is held",
-    response_class=Response,
-    responses=refusals("FIELD_NOT_FOUND"),
-)
-def head_field(sha256: str, services: ServicesDep) -> Response:
-    """Ask before you upload: 200 when the bytes are here."""
-    record = _require(services, sha256)
-    return Response(headers={"ETag": field_etag(record.sha256, record.version)}, media_type="application/json")
 
 
 @router.get(

@@ -16,21 +16,25 @@ from service.contract import contract_yaml
 from service.dependencies import PrefixDep, Services, ServicesDep
 from service.docs_page import STYLE_POLICY, render_docs
 from service.problems import RETRY_LATER, Problem
-from service.routes.documentation import refusals
+from service.routes.documentation import get_and_head, refusals
 from service.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
 
 router = APIRouter(tags=["service"])
 logger = logging.getLogger(__name__)
 
 
-@router.get("/healthz", summary="Whether the process answers", response_model=HealthDocument)
+@get_and_head(router, "/healthz", summary="Whether the process answers", response_model=HealthDocument)
 async def healthz() -> dict[str, str]:
     """Needs no token, looks at nothing else."""
     return {"status": "ok"}
 
 
-@router.get(
-    "/readyz", summary="Whether a registration would run", response_model=ReadyDocument, responses=refusals("NOT_READY")
+@get_and_head(
+    router,
+    "/readyz",
+    summary="Whether a registration would run",
+    response_model=ReadyDocument,
+    responses=refusals("NOT_READY"),
 )
 def readyz(services: ServicesDep) -> dict[str, object]:
     """Records, storage and at least one live worker. A 503 has the same `checks`."""
@@ -57,12 +61,12 @@ def _storage_writes(services: Services) -> bool:
         return writer.write(b"probe") == len(b"probe")
 
 
-@router.get("/version", summary="What runs here", response_model=VersionDocument)
+@get_and_head(router, "/version", summary="What runs here", response_model=VersionDocument)
 async def version() -> dict[str, str]:
     return {"name": "regnf", "version": __version__, "python": platform.python_version()}
 
 
-@router.get("/", summary="Every address", response_model=IndexDocument)
+@get_and_head(router, "/", summary="Every address", response_model=IndexDocument)
 async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
     """Start here."""
     paths = request.app.openapi()["paths"]
@@ -74,7 +78,8 @@ async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
     return {"name": "regnf", "version": __version__, "addresses": addresses}
 
 
-@router.get(
+@get_and_head(
+    router,
     "/openapi.yaml",
     summary="This contract",
     response_class=Response,
@@ -84,7 +89,7 @@ async def openapi_yaml(request: Request) -> Response:
     return Response(contract_yaml(request.app), media_type="application/yaml")
 
 
-@router.get("/docs", summary="This contract, for people", response_class=HTMLResponse)
+@get_and_head(router, "/docs", summary="This contract, for people", response_class=HTMLResponse)
 async def docs(request: Request) -> HTMLResponse:
     """One page without scripts; loads nothing from elsewhere."""
     return HTMLResponse(render_docs(request.app.openapi()), headers={"Content-Security-Policy": STYLE_POLICY})

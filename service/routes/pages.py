@@ -9,14 +9,15 @@ from starlette.responses import FileResponse
 
 from service.dependencies import ServicesDep
 from service.lookup import find_job
-from service.routes.documentation import refusals
+from service.routes.documentation import get_and_head, refusals
 
 router = APIRouter(tags=["results"])
 WEB = Path(__file__).resolve().parents[1] / "web"
 PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 
 
-@router.get(
+@get_and_head(
+    router,
     "/jobs/{id}/view",
     summary="A job's page, with the registration in 3D",
     response_class=FileResponse,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
@@ -88,10 +89,23 @@ def test_get_and_head_tell_what_is_held(world: World) -> None:
     known = world.ready_field("a")
     document = world.client.get(f"/fields/{known}").json()
     assert (document["state"], document["report"]["bounds"][0]) == ("ready", [-1.0, -1.0, -1.0])
-    head = world.client.head(f"/fields/{known}")
-    assert (head.status_code, head.content) == (200, b"")
-    assert head.headers["etag"] == world.client.get(f"/fields/{known}").headers["etag"]
     assert world.client.head(f"/fields/{sha256(B)}").status_code == 404
+
+
+@pytest.mark.parametrize("state", ["validating", "ready", "rejected"])
+def test_head_is_get_without_content(world: World, state: str) -> None:
+    path = f"/fields/{sha256(A)}"
+    world.client.put(path, content=A)
+    if state != "validating":
+        world.records.update_field(sha256(A), attempt=1, state=state)
+    get, head = world.client.get(path), world.client.head(path)
+    assert (head.status_code, head.content) == (get.status_code, b"") == (200, b"")
+    own = {"x-request-id", "date"}
+    assert {name: value for name, value in head.headers.items() if name not in own} == {
+        name: value for name, value in get.headers.items() if name not in own
+    }
+    assert ("retry-after" in head.headers) == (state == "validating")
+    assert get.json()["state"] == state
 
 
 def test_get_may_wait_for_the_import(world: World) -> None:

@@ -17,6 +17,21 @@ def test_health_and_version(world: World) -> None:
     assert world.client.get("/version").json()["version"] == __version__
 
 
+@pytest.mark.parametrize("path", ["/", "/docs", "/healthz", "/readyz", "/version", "/openapi.yaml", "/v1/healthz"])
+def test_what_is_said_of_the_service_answers_head(world: World, path: str) -> None:
+    get, head = world.client.get(path), world.client.head(path)
+    assert (head.status_code, head.content) == (200, b"")
+    for name in ("content-type", "content-length"):
+        assert head.headers[name] == get.headers[name]
+
+
+def test_head_of_what_is_not_ready_is_refused_as_get_is(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world.queue, "workers", 0)
+    head = world.client.head("/readyz")
+    assert (head.status_code, head.content) == (503, b"")
+    assert "retry-after" in head.headers
+
+
 def test_ready_when_everything_is_there(world: World) -> None:
     answer = world.client.get("/readyz").json()
     assert answer == {"status": "ready", "checks": {"records": True, "storage": True, "worker": True}}
@@ -79,6 +94,7 @@ def test_the_page_of_a_job(world: World) -> None:
     page = world.client.get(f"/jobs/{job_id}/view")
     assert page.status_code == 200
     policy = dict(part.split(" ", 1) for part in page.headers["content-security-policy"].split("; "))
+    assert world.client.head(f"/jobs/{job_id}/view").headers["content-length"] == page.headers["content-length"]
     assert (policy["default-src"], policy["object-src"]) == ("'self'", "'none'")
     loaded = re.findall(r'(?:src|href)="(/static/[^"]+)"', page.text)
     assert loaded

@@ -102,7 +102,9 @@ def test_event_ids_that_nobody_gave(world: World, given: Any) -> None:
         ("/v1/fields", "GET, POST"),
         ("/jobs/x", "DELETE, GET"),
         ("/jobs/x/cancel", "POST"),
-        ("/healthz", "GET"),
+        ("/healthz", "GET, HEAD"),
+        ("/v1/", "GET, HEAD"),
+        ("/register", "POST"),
         ("/static/favicon.svg", "GET, HEAD"),
     ],
 )
