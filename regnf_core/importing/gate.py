@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import logging
+import math
 import mmap
 import os
 import re
@@ -127,13 +128,13 @@ def _report(
     try:
         size = _checked_size(field, limits.file_bytes)
         isolation = {str(key): bool(value) for key, value in values["isolation"].items()}
-        lower, upper = ((float(x), float(y), float(z)) for x, y, z in values["bounds"])
+        lower, upper = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["bounds"])
         return ImportReport(
             family=str(values["family"]),
             why=tuple(map(str, values["why"])),
             bounds=(lower, upper),
             parameters=int(values["parameters"]),
-            plausibility={str(key): float(value) for key, value in values["plausibility"].items()},
+            plausibility={str(key): _finite(value) for key, value in values["plausibility"].items()},
             warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),
             label=None if values["label"] is None else str(values["label"]),
             field_bytes=size,
@@ -142,9 +143,17 @@ def _report(
             peak_memory_bytes=int(values["peak_memory_bytes"]),
             isolation=isolation,
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OSError, FieldFormatError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, OSError, FieldFormatError) as error:
         _log.error("import process left no usable result: %r", error)
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED") from error
+
+
+def _finite(value: Any) -> float:
+    """The number, if JSON can hold it: Python's reader takes NaN and 1e999 too."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError("a number that is not finite")
+    return number
 
 
 def _isolation_warnings(isolation: dict[str, bool]) -> list[str]:

@@ -62,6 +62,7 @@ def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]
     distance, gradient = _evaluate(field, points)
     signs.append(distance.sign())
     norms = gradient.norm(dim=-1)
+    _require_finite(norms)  # its parts may be finite and their squares not
     # Where the gradient vanishes |distance| says nothing about how near the surface is.
     on_surface = (distance.abs() < _SURFACE_SHARE * diagonal * norms.clamp_max(1.0)) & (norms > 1e-6)
     return norms[on_surface], torch.cat(signs)

@@ -22,6 +22,7 @@ from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
 from regnf_core.importing.report import MIB
 from tests.core.importing.archives import assert_refused, saved, text, torch_zip
 from tests.core.importing.checkpoints import checkpoint, write_small_checkpoint
+from tests.core.importing.test_safetensors_upload import layout
 
 ROOT = Path(__file__).resolve().parents[3]
 SHORT = ImportLimits(wall_s=100)
@@ -156,6 +157,20 @@ GOOD = {"family": "f", "why": [], "bounds": [[0, 0, 0], [1, 1, 1]], "parameters"
 GOOD |= {"label": None, "isolation": {}, "peak_memory_bytes": 1}
 
 
+def claim(**values: Any) -> str:
+    """A child that leaves a sound file and says this of it."""
+    sound = layout({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, bytes(4))
+    return f"open('{FIELD_NAME}', 'wb').write({sound!r}); print({json.dumps(GOOD | values)!r})"
+
+
+def test_what_a_child_claims_is_taken_when_it_makes_sense(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the claims below would be refused for another reason."""
+    in_child(monkeypatch, claim())
+    assert import_field(upload, tmp_path, None, SHORT).parameters == 1
+
+
 @pytest.mark.parametrize(
     ("program", "reason"),
     [
@@ -174,6 +189,11 @@ GOOD |= {"label": None, "isolation": {}, "peak_memory_bytes": 1}
         (f"import os; os.symlink('/etc/passwd', '{FIELD_NAME}'); print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),
         (f"import os; os.mkdir('{FIELD_NAME}'); print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),
         ('print(\'{"family": "f"}\')', "IMPORT_CRASHED"),
+        (claim(plausibility={"gradient_median": float("nan")}), "IMPORT_CRASHED"),
+        (claim(bounds=[[0, 0, 0], [1, 1, float("inf")]]), "IMPORT_CRASHED"),
+        (claim(bounds=[[0, 0, 0], [1, 1, 10**400]]), "IMPORT_CRASHED"),
+        (claim(parameters=float("inf")), "IMPORT_CRASHED"),
+        (claim(isolation=[]), "IMPORT_CRASHED"),
     ],
 )
 def test_whatever_the_child_does_the_gate_holds(

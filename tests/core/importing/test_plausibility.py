@@ -85,3 +85,8 @@ def test_a_field_that_only_touches_zero_has_no_surface() -> None:
 def test_numbers_that_are_not_finite_are_refused() -> None:
     assert reason_of(_Field(lambda points: points[:, 0] / 0.0)) == "FIELD_NOT_FINITE"
     assert reason_of(_Field(lambda points: points[:, 0].abs().sqrt().sqrt() * torch.nan)) == "FIELD_NOT_FINITE"
+
+
+def test_gradients_whose_norm_overflows_are_refused() -> None:
+    """Each part is a number, its square is not."""
+    assert reason_of(sphere(0.5, 1e25)) == "FIELD_NOT_FINITE"
