@@ -10,14 +10,14 @@ import sys
 
 from regnf_cli import api_process
 from regnf_cli.listening import open_socket
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 from service.settings import Settings
 
 
 def main() -> int:
     try:
         listener = open_socket(Settings())
-    except ServiceError as error:
+    except StartError as error:
         sys.stderr.write(f"{error.reason}: {error}\n")
         return 2
     api_process.main(listener.detach())

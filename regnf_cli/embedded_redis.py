@@ -8,17 +8,17 @@ from pathlib import Path
 from redis import Redis
 from redis.exceptions import RedisError
 
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 
 _SERVERS = ("valkey-server", "redis-server")
 
 
 def server_binary() -> str:
-    """A server to run: the one that comes as a package, or one that is installed. Raises ServiceError."""
+    """A server to run: the one that comes as a package, or one that is installed. Raises StartError."""
     found = _packaged_binary() or next((path for name in _SERVERS if (path := shutil.which(name))), None)
     if found is None:
         detail = "no Redis server is at hand: install regnf[embedded], or set REGNF_REDIS_URL"
-        raise ServiceError(detail, reason="EMBEDDED_REDIS_MISSING")
+        raise StartError(detail, reason="EMBEDDED_REDIS_MISSING")
     return found
 
 

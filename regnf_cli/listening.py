@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 from service.settings import Settings
 
 _BACKLOG = 2048
@@ -14,11 +14,11 @@ _BACKLOG = 2048
 def open_socket(settings: Settings) -> socket.socket:
     """A listening socket on the settings' host and port (0: a free one).
 
-    Raises ServiceError: ADDRESS_UNAVAILABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others can reach while
+    Raises StartError: ADDRESS_UNAVAILABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others can reach while
     no token is asked for.
     """
     if not is_loopback(settings.host) and not settings.api_tokens and not settings.allow_unauthenticated:
-        raise ServiceError(
+        raise StartError(
             f"{settings.host} can be reached by others and no token is asked for: set REGNF_API_TOKENS, "
             "or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
@@ -36,7 +36,7 @@ def open_socket(settings: Settings) -> socket.socket:
             raise
     except OSError as error:
         detail = f"cannot listen on {settings.host}, port {settings.port}: {error.strerror or error}"
-        raise ServiceError(detail, reason="ADDRESS_UNAVAILABLE") from error
+        raise StartError(detail, reason="ADDRESS_UNAVAILABLE") from error
     return listener
 
 

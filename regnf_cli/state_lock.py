@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from types import TracebackType
 
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 
 _NAME = "serve.lock"
 _SOCKET_PREFIX = "regnf-"
@@ -19,7 +19,7 @@ _SOCKET_PREFIX = "regnf-"
 class StateLock:
     """Holds a state folder for one service, and remembers for the next one what a killed one could not tidy up.
 
-    Raises ServiceError (STATE_DIR_IN_USE, STATE_DIR_UNUSABLE) on entry.
+    Raises StartError (STATE_DIR_IN_USE, STATE_DIR_UNUSABLE) on entry.
     """
 
     def __init__(self, state_dir: Path) -> None:
@@ -32,13 +32,13 @@ class StateLock:
             self._file = (self._state_dir / _NAME).open("a+")
         except OSError as error:
             detail = f"cannot keep state in {self._state_dir}: {error.strerror}"
-            raise ServiceError(detail, reason="STATE_DIR_UNUSABLE") from error
+            raise StartError(detail, reason="STATE_DIR_UNUSABLE") from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             self._file.close()
             detail = f"another service uses {self._state_dir}; give this one its own with --state-dir"
-            raise ServiceError(detail, reason="STATE_DIR_IN_USE") from error
+            raise StartError(detail, reason="STATE_DIR_IN_USE") from error
         self._remove_leftover()
         return self
 

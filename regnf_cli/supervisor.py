@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from regnf_cli.child import Child
 from regnf_cli.embedded_redis import answers, server_command
 from regnf_cli.listening import address_of, open_socket
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
 from service.settings import Settings
 
@@ -48,7 +48,7 @@ class Supervisor:
     def run(self, ready: Callable[[str], None]) -> None:
         """Serve until SIGTERM, SIGINT or SIGHUP. ``ready`` is called with the address once the service answers.
 
-        Raises ServiceError when it cannot start; nothing is left running then either.
+        Raises StartError when it cannot start; nothing is left running then either.
         """
         with ExitStack() as stack:
             stack.enter_context(self._signals_heard())
@@ -103,15 +103,15 @@ class Supervisor:
             child.start()
 
     def _until(self, look: Callable[[], bool], child: Child | None, what: str) -> bool:
-        """Wait for a child to answer; False when a signal came first. Raises ServiceError when it ends or is late."""
+        """Wait for a child to answer; False when a signal came first. Raises StartError when it ends or is late."""
         deadline = time.monotonic() + _START_DEADLINE_S
         while not self._stop.is_set():
             if look():
                 return True
             if child is not None and child.exit_status is not None:
-                raise ServiceError(f"{what} ended while it was starting; the log above says why")
+                raise StartError(f"{what} ended while it was starting; the log above says why")
             if time.monotonic() > deadline:
-                raise ServiceError(f"{what} did not start within {_START_DEADLINE_S:.0f} s")
+                raise StartError(f"{what} did not start within {_START_DEADLINE_S:.0f} s")
             self._stop.wait(0.05)
         return False
 

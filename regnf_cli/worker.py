@@ -22,8 +22,8 @@ def worker(
 
     from redis.exceptions import ConnectionError as RedisConnectionError
 
-    from regnf_cli.service_errors import ServiceError
     from regnf_cli.settings import read_settings
+    from regnf_cli.start_errors import StartError
     from worker.context import NoRedisError
     from worker.main import run_worker
 
@@ -32,6 +32,6 @@ def worker(
     try:
         run_worker(read_settings())
     except NoRedisError as error:
-        raise ServiceError(str(error), reason=error.reason) from error
+        raise StartError(str(error), reason=error.reason) from error
     except RedisConnectionError as error:
-        raise ServiceError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE") from error
+        raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE") from error

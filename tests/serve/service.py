@@ -11,7 +11,7 @@ from pathlib import Path
 
 import httpx
 
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
 from tests.worker.bench import alive, eventually
 
@@ -90,7 +90,7 @@ class Service:
             self.process.wait()
         if self.process.stdout is not None:
             self.process.stdout.close()
-        with suppress(ServiceError), StateLock(self.state_dir):
+        with suppress(StartError), StateLock(self.state_dir):
             pass
 
 

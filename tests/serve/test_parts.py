@@ -9,7 +9,7 @@ import pytest
 
 from regnf_cli import embedded_redis
 from regnf_cli.listening import address_of, is_loopback, open_socket
-from regnf_cli.service_errors import ServiceError
+from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
 from service.settings import Settings
 from tests.worker.bench import alive, children_of, eventually
@@ -41,7 +41,7 @@ def test_addresses_to_open() -> None:
 
 
 def test_a_host_that_is_not_ours() -> None:
-    with pytest.raises(ServiceError) as caught:
+    with pytest.raises(StartError) as caught:
         open_socket(Settings(port=0, host="192.0.2.1", allow_unauthenticated=True))
     assert caught.value.reason == "ADDRESS_UNAVAILABLE"
 
@@ -49,7 +49,7 @@ def test_a_host_that_is_not_ours() -> None:
 def test_a_missing_redis_server_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(embedded_redis, "_packaged_binary", lambda: None)
     monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(ServiceError) as caught:
+    with pytest.raises(StartError) as caught:
         embedded_redis.server_binary()
     assert caught.value.reason == "EMBEDDED_REDIS_MISSING"
 

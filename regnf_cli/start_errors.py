@@ -5,7 +5,7 @@ from __future__ import annotations
 from regnf_core.errors import RegnfError
 
 
-class ServiceError(RegnfError):
+class StartError(RegnfError):
     """Reasons: STATE_DIR_IN_USE, STATE_DIR_UNUSABLE, ADDRESS_UNAVAILABLE, UNAUTHENTICATED_PUBLIC_BIND,
     EMBEDDED_REDIS_MISSING, SERVICE_START_FAILED, REDIS_URL_MISSING, REDIS_UNAVAILABLE."""
 
