@@ -18,6 +18,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.report import ImportLimits
 from regnf_core.importing.sandbox import confine
 from regnf_core.importing.sniff import HEAD_BYTES, explain_refusal, sniff_format
+from regnf_core.importing.sniff_mesh import MESH_FORMATS
 
 if TYPE_CHECKING:
     from regnf_core.importing.families.converted import ConvertedField
@@ -61,6 +62,7 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     from regnf_core.importing.container import read_archive
     from regnf_core.importing.families import convert_checkpoint
     from regnf_core.importing.families.safe_field import convert_safe_field
+    from regnf_core.importing.legacy_container import read_legacy
     from regnf_core.importing.pickle_reader import read_pickle
     from regnf_core.importing.tensors import TensorSource
     from regnf_core.importing.upload_description import UploadDescription
@@ -72,8 +74,15 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     if kind == "torch-zip":
         archive = read_archive(data)
         return convert_checkpoint(read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes), wanted)
+    if kind == "torch-legacy":
+        values, legacy = read_legacy(data)
+        return convert_checkpoint(values, TensorSource(legacy, tensor_bytes), wanted)
     if kind == "safetensors":
         return convert_safe_field(upload, data, tensor_bytes, wanted)
+    if kind in MESH_FORMATS:
+        from regnf_core.importing.families.mesh import convert_mesh
+
+        return convert_mesh(kind, data, wanted)
     reason, detail = explain_refusal(head)
     raise FieldFormatError(detail, reason=reason)
 

@@ -37,9 +37,12 @@ def call(function: object, args: object) -> Any:
 
 
 def storage(identifier: object) -> StorageRef | Placeholder:
-    """The storage a persistent id names: ("storage", storage class, key, device, element count)."""
+    """The storage a persistent id names: ("storage", storage class, key, device, element count).
+
+    Legacy files add a view of another storage, which torch has written as None since its first releases.
+    """
     match identifier:
-        case ("storage", GlobalRef() as kind, str() as key, str() as device, int() as count):
+        case ("storage", GlobalRef() as kind, str() as key, str() as device, int() as count, *view) if not any(view):
             known = kind.module in ("torch", "torch.storage")
             if not known:
                 return Placeholder(kind.full_name)

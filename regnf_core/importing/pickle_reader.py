@@ -17,7 +17,7 @@ from typing import Any
 from regnf_core.importing import pickle_globals
 from regnf_core.importing.pickle_globals import dict_key, key_work
 from regnf_core.importing.pickle_stream import PickleStream, pickle_error
-from regnf_core.importing.pickle_values import GlobalRef, NumpyType, Placeholder
+from regnf_core.importing.pickle_values import GlobalRef, NumpyType, Placeholder, StorageRef
 
 _MAX_GLOBAL_NAME = 256
 
@@ -38,7 +38,27 @@ def read_pickle(data: memoryview, limits: PickleLimits | None = None) -> Any:
     Raises FieldFormatError with PICKLE_MALFORMED, PICKLE_OPCODE_NOT_ALLOWED, PICKLE_PROTOCOL, PICKLE_TOO_COMPLEX,
     PICKLE_TOO_DEEP, PICKLE_INTEGER_TOO_LARGE, PICKLE_STRING_TOO_LARGE or PICKLE_TRAILING_DATA.
     """
-    return _Machine(data, limits or PickleLimits()).run()
+    machine = _Machine(data, limits or PickleLimits())
+    value = machine.run()
+    if machine.stream.remaining:
+        raise pickle_error("bytes behind the pickle's end", "PICKLE_TRAILING_DATA")
+    return value
+
+
+@dataclass(frozen=True)
+class LeadingPickle:
+    """A pickle with something behind it: its value, its length in bytes, and the storages it names, by their key."""
+
+    value: Any
+    length: int
+    storages: dict[str, StorageRef]
+
+
+def read_leading_pickle(data: memoryview, limits: PickleLimits | None = None) -> LeadingPickle:
+    """The pickle that ``data`` begins with. Raises what :func:`read_pickle` raises, but for what lies behind it."""
+    machine = _Machine(data, limits or PickleLimits())
+    value = machine.run()
+    return LeadingPickle(value, machine.stream.position, machine.storages)
 
 
 class _Machine:
@@ -52,6 +72,7 @@ class _Machine:
         self.marks: list[int] = []
         self.memo: dict[int, Any] = {}
         self.frame_end = 0
+        self.storages: dict[str, StorageRef] = {}
 
     def run(self) -> Any:
         self._read_protocol()
@@ -84,8 +105,6 @@ class _Machine:
             raise pickle_error(f"pickle protocol {version}", "PICKLE_PROTOCOL")
 
     def _finish(self) -> Any:
-        if self.stream.remaining:
-            raise pickle_error("bytes behind the pickle's end", "PICKLE_TRAILING_DATA")
         if len(self.stack) != 1 or self.marks:
             raise pickle_error("the pickle ends with values left over")
         return self.stack[0]
@@ -199,7 +218,10 @@ class _Machine:
             raise pickle_error("state for something that takes none")
 
     def persistent(self) -> None:
-        self.push(pickle_globals.storage(self.pop()))
+        storage = pickle_globals.storage(self.pop())
+        if isinstance(storage, StorageRef):
+            self.storages.setdefault(storage.key, storage)
+        self.push(storage)
 
     def frame(self) -> None:
         length = self.stream.unsigned(8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from regnf_core.importing.sniff_mesh import sniff_mesh
+
 HEAD_BYTES = 512
 """How many first bytes are enough to name every format."""
 
@@ -10,38 +12,37 @@ _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
     b"data.pkl data .data version byteorder .format_version .storage_alignment constants.pkl code".split()
 )
-_LEGACY_MAGIC = b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19"
-_MESH_MAGICS = (b"ply\n", b"ply\r", b"glTF", b"solid ")
+_LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 
 
 def sniff_format(head: bytes) -> str | None:
-    """The format's name, ``"torch-zip"`` or ``"safetensors"``, or None for everything the gate does not take.
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, a mesh's format, or None for what the gate does not take.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
     """
     if head.startswith(_ZIP_LOCAL_HEADER) and _may_be_torch_archive(head):
         return "torch-zip"
+    if head.startswith(_LEGACY_MAGIC):
+        return "torch-legacy"
     if head[8:9] == b"{":
         return "safetensors"
-    return None
+    return sniff_mesh(head)
 
 
 def explain_refusal(head: bytes) -> tuple[str, str]:
     """The reason and a sentence for a file that ``sniff_format`` does not name."""
     if not head:
         return "FILE_EMPTY", "the file holds no bytes"
-    if head[2:].startswith(_LEGACY_MAGIC):
-        return "LEGACY_TORCH_FILE", "a PyTorch file of before version 1.6; load it and save it again with torch.save"
     if head[257:262] == b"ustar":
         return "LEGACY_TORCH_FILE", "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
         return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
-    if head.startswith(_MESH_MAGICS):
-        return "FORMAT_NOT_SUPPORTED", "a mesh, not a neural field's checkpoint"
+    if head.lstrip()[:1] == b"{" and b'"asset"' in head:
+        return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save wrote"
-    return "FORMAT_NOT_RECOGNISED", "neither a torch.save archive nor a safetensors file"
+    return "FORMAT_NOT_RECOGNISED", "none of the formats that are taken: torch.save archives, safetensors, meshes"
 
 
 def _may_be_torch_archive(head: bytes) -> bool:

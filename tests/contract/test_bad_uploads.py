@@ -19,7 +19,7 @@ from tests.contract.world import World, assert_refused, field_bytes, make_world,
 GOOD = field_bytes("good")
 PUT_GOOD = f"/fields/{sha256(GOOD)}"
 TOO_LARGE = field_bytes("large", 4097)
-LEGACY_PICKLE = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19." + b"\0" * 600
+LEGACY_TAR = b"sys_info".ljust(257, b"\0") + b"ustar\0" + b"\0" * 600
 PNG = b"\x89PNG\r\n\x1a\n" + b"\0" * 600
 PLAIN_ZIP = b"PK\x03\x04" + b"\0" * 22 + b"\x09\0\0\0" + b"notes.txt" + b"\0" * 600
 
@@ -58,7 +58,7 @@ def announced(data: bytes) -> str:
         ("PUT", "/fields/%E2%80%AE", GOOD, {}, 400, "INVALID_DIGEST"),
         ("PUT", "/fields/..%2f..%2fetc", GOOD, {}, 404, "NOT_FOUND"),
         ("POST", "/fields", PNG, {}, 415, "FIELD_NOT_RECOGNISED"),
-        ("POST", "/fields", LEGACY_PICKLE, {}, 415, "FIELD_NOT_RECOGNISED"),
+        ("POST", "/fields", LEGACY_TAR, {}, 415, "FIELD_NOT_RECOGNISED"),
         ("POST", "/fields", PLAIN_ZIP, {}, 415, "FIELD_NOT_RECOGNISED"),
         ("POST", "/fields", GOOD, {"Content-Digest": announced(b"x")}, 400, "DIGEST_MISMATCH"),
         ("POST", "/fields", GOOD, {"Content-Type": "multipart/form-data"}, 400, "MALFORMED_MULTIPART"),

@@ -105,8 +105,42 @@ def test_other_families_are_refused_by_name(tmp_path: Path) -> None:
     assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
 
 
-def test_a_legacy_file_is_refused_by_name(tmp_path: Path) -> None:
-    checkpoint = dev_data("formats", "deepsdf") / "examples" / "toys" / "ModelParameters" / "latest.pth"
+def deepsdf_run() -> tuple[Path, dict[str, Path]]:
+    """The reference folder, and the files of its training run: the network, all codes, the code of one shape."""
+    folder = dev_data("formats", "deepsdf")
+    run = folder / "examples" / "toys"
+    return folder, {
+        "network": run / "ModelParameters" / "latest.pth",
+        "codes": run / "LatentCodes" / "latest.pth",
+        "code": run / "Reconstructions" / "2000" / "Codes" / "toys" / "solid" / "part_1.pth",
+    }
+
+
+def test_deepsdf_s_network_with_a_code_from_the_description(tmp_path: Path) -> None:
+    """The trainer's own file, in the container of before 1.6."""
+    folder, files = deepsdf_run()
+    latent = np.load(folder / "latent.npy").ravel().tolist()
+    report = convert_file(files["network"], tmp_path, {"latent": latent}, ImportLimits())
+    assert report["family"] == "deepsdf"
+    assert report["warnings"] == []
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+@pytest.mark.parametrize(("codes", "index"), [("codes", 1), ("code", 0)])
+def test_deepsdf_s_network_and_codes_in_one_file(tmp_path: Path, codes: str, index: int, zipped: bool) -> None:
+    """Put together as docs/import-gate.md says."""
+    folder, files = deepsdf_run()
+    whole = torch.load(files["network"], map_location="cpu", weights_only=True)
+    stored = torch.load(files[codes], map_location="cpu", weights_only=True)
+    whole["latent_codes"] = stored["latent_codes"] if isinstance(stored, dict) else stored
+    torch.save(whole, tmp_path / "upload.pth", _use_new_zipfile_serialization=zipped)
+    convert_file(tmp_path / "upload.pth", tmp_path, {"latent_index": index}, ImportLimits())
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+
+
+@pytest.mark.parametrize(("file", "reason"), [("network", "LATENT_MISSING"), ("codes", "FIELD_NOT_RECOGNISED")])
+def test_half_of_deepsdf_is_refused(tmp_path: Path, file: str, reason: str) -> None:
     with pytest.raises(FieldFormatError) as caught:
-        convert_file(checkpoint, tmp_path, None, ImportLimits())
-    assert caught.value.reason == "LEGACY_TORCH_FILE"
+        convert_file(deepsdf_run()[1][file], tmp_path, None, ImportLimits())
+    assert caught.value.reason == reason

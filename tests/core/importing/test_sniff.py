@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,19 @@ LEGACY_TAR = b"sys_info".ljust(257, b"\0") + b"ustar\x0000"
 
 def test_names_what_the_gate_takes() -> None:
     assert sniff_format(torch_zip()) == "torch-zip"
+    assert sniff_format(LEGACY_TORCH) == "torch-legacy"
     assert sniff_format((64).to_bytes(8, "little") + b'{"a":') == "safetensors"
+
+
+def test_names_meshes() -> None:
+    facet = struct.pack("<12fH", 0, 0, 1, *range(1, 10), 0)
+    assert sniff_format(b"ply\nformat binary_little_endian 1.0\n") == "ply"
+    assert sniff_format(b"glTF\x02\0\0\0") == "glb"
+    assert sniff_format(b"solid thing\n  facet normal 0 0 1\n") == "stl"
+    assert sniff_format((b"solid, says the header".ljust(80) + struct.pack("<I", 900) + 20 * facet)[:512]) == "stl"
+    assert sniff_format(b"# Blender v2.92\n# \xc3\xa9\nmtllib a.mtl\no Cube\n") == "obj"
+    assert sniff_format(b"\r\nv 1.0 -2e-3 .5\r\n") == "obj"
+    assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"
 
 
 def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
@@ -29,10 +42,14 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (b"", "FILE_EMPTY"),
         (b"x", "FORMAT_NOT_RECOGNISED"),
         (PNG, "FORMAT_NOT_RECOGNISED"),
-        (LEGACY_TORCH, "LEGACY_TORCH_FILE"),
+        (LEGACY_TORCH[:10], "RAW_PICKLE"),
         (LEGACY_TAR, "LEGACY_TORCH_FILE"),
         (b"\x80\x04\x95\x05", "RAW_PICKLE"),
-        (b"ply\nformat binary_little_endian 1.0\n", "FORMAT_NOT_SUPPORTED"),
+        (b'{"asset": {"version": "2.0"}, "buffers": []}', "FORMAT_NOT_SUPPORTED"),
+        (b"v is for vertex", "FORMAT_NOT_RECOGNISED"),
+        (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNISED"),
+        (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNISED"),  # an STL file's facets have corners
+        (b"x" * 512, "FORMAT_NOT_RECOGNISED"),
         (zip_bytes([("points.npy", b"\x93NUMPY")]), "FORMAT_NOT_SUPPORTED"),
         (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNISED"),
         (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNISED"),
