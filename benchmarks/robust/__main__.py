@@ -15,11 +15,23 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch loads
 
-from benchmarks.robust import boxes, covariance, one_view, orientations, pairs, scales
+from benchmarks.robust import boxes, covariance, one_view, orientations, pairs, scales, symmetry, wrong_objects
 from benchmarks.robust.report import write
 from benchmarks.robust.runs import Context
 
-TABLES = {module.NAME: module.table for module in (pairs, scales, orientations, boxes, one_view, covariance)}
+TABLES = {
+    module.NAME: module.table
+    for module in (
+        pairs,
+        scales,
+        orientations,
+        boxes,
+        one_view,
+        wrong_objects,
+        symmetry,
+        covariance,
+    )
+}
 
 
 def main() -> None:

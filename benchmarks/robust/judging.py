@@ -45,7 +45,9 @@ def judge(result: RegistrationResult, truth: Sim3 | None, symmetries: Symmetries
         "ambiguous": AMONG if right else NOT_AMONG,
         "rejected": REJECTED,
     }[result.verdict]
-    evidence = {name: result.metrics[name] for name in _METRICS if name in result.metrics}
+    evidence = {
+        name: value for name, value in result.metrics.items() if name in _METRICS or name.startswith("seconds_")
+    }
     return {
         "verdict": result.verdict,
         "reason": result.verdict_reason,

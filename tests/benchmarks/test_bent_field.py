@@ -1,0 +1,55 @@
+"""The field with random errors: its gradient against differences, its errors' size and correlation."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from benchmarks.robust.bent_field import BentField
+from regnf_core.fields.composite import BoxField
+
+BOX = BoxField((-0.5, -0.4, -0.3), (0.5, 0.4, 0.3))
+
+
+def places(count: int, seed: int = 0) -> Tensor:
+    return 4.0 * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) - 2.0
+
+
+def test_the_gradient_is_that_of_the_value() -> None:
+    field = BentField(BOX, amplitude=0.05, length=0.2, seed=3)
+    points, step = places(200), 1e-3
+    value, gradient = field.signed_distance_and_gradient(points)
+    assert torch.equal(value, field.signed_distance(points))
+    _, plain = BOX.signed_distance_and_gradient(points)
+    for axis in range(3):
+        aside = torch.zeros(3)
+        aside[axis] = step
+        bend = [field.signed_distance(p) - BOX.signed_distance(p) for p in (points + aside, points - aside)]
+        slope = (bend[0] - bend[1]) / (2 * step)
+        assert torch.allclose(gradient[:, axis] - plain[:, axis], slope, atol=2e-3)
+        assert slope.abs().max() > 0.1
+
+
+def test_errors_have_the_deviation_and_correlation_asked_for() -> None:
+    amplitude, length = 0.01, 0.3
+    points = places(400)
+    aside = torch.tensor([length, 0.0, 0.0])
+    here, there = [], []
+    for seed in range(60):
+        field = BentField(BOX, amplitude, length, seed)
+        here.append(field.signed_distance(points) - BOX.signed_distance(points))
+        there.append(field.signed_distance(points + aside) - BOX.signed_distance(points + aside))
+    a, b = torch.stack(here), torch.stack(there)
+    assert float(a.std()) == pytest.approx(amplitude, rel=0.05)
+    assert abs(float(a.mean())) < 0.05 * amplitude
+    assert float((a * b).mean() / a.square().mean()) == pytest.approx(math.exp(-0.5), abs=0.05)
+
+
+def test_seeds_bend_differently_and_reproducibly() -> None:
+    points = places(50)
+    first, again, other = (BentField(BOX, 0.01, 0.1, seed).signed_distance(points) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other, atol=1e-3)
