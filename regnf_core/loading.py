@@ -1,4 +1,4 @@
-"""Open whatever file a user has as a field: a safe field, a trainer's checkpoint, or a mesh."""
+"""Open whatever file a user has as a field: a safe field, or anything that the import gate takes."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from regnf_core import __version__
 from regnf_core.errors import FieldFormatError
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
 
-MESH_SUFFIXES = frozenset({".glb", ".gltf", ".obj", ".ply", ".stl", ".off"})
 _READ_BYTES = 1 << 20
 
 
@@ -22,19 +22,14 @@ def load_field(
 ) -> SdfField:
     """The field in a file, on ``device``.
 
-    A safe field is opened as it is; a mesh (by its suffix) becomes an exact distance field; anything else is taken for
-    a checkpoint and goes through the import gate, whose outcome is kept in ``cache_dir`` under the file's SHA-256.
-    ``description`` says what a checkpoint does not carry (contraction, level mask, label).
+    A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``
+    under the file's SHA-256. ``description`` says what the file does not carry, see UploadDescription.
 
     Raises FieldFormatError (with the gate's reason) and FileNotFoundError.
     """
-    from regnf_core.fields.mesh import MeshField
     from regnf_core.fields.safe_format import open_field
 
-    path = Path(path)
-    if path.suffix.lower() in MESH_SUFFIXES:
-        return MeshField.load(path).to(device)
-    return open_field(safe_field_path(path, description, cache_dir), device)
+    return open_field(safe_field_path(Path(path), description, cache_dir), device)
 
 
 def safe_field_path(path: Path, description: dict[str, Any] | None = None, cache_dir: Path | None = None) -> Path:
@@ -62,7 +57,7 @@ def default_cache_dir() -> Path:
 def _imported(path: Path, description: dict[str, Any] | None, cache_dir: Path) -> Path:
     from regnf_core.importing.gate import ImportLimits, import_field
 
-    key = hashlib.sha256(repr(sorted((description or {}).items())).encode())
+    key = hashlib.sha256(repr((__version__, sorted((description or {}).items()))).encode())
     with path.open("rb") as file:
         while block := file.read(_READ_BYTES):
             key.update(block)

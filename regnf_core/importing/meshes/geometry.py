@@ -1,0 +1,62 @@
+"""What a mesh file holds that a field needs, and the limits that all readers share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.errors import FieldFormatError
+
+Float64Array = npt.NDArray[np.float64]
+Int64Array = npt.NDArray[np.int64]
+
+MAX_TRIANGLES = 2_000_000
+MAX_VERTICES = 6_000_000
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Points, and the triangles between them; nothing of it is checked but its shapes."""
+
+    vertices: Float64Array
+    """(V, 3), the file's own frame and unit."""
+    faces: Int64Array
+    """(F, 3) indices; F is 0 for a point cloud."""
+    normals: Float64Array | None = None
+    """(V, 3), where the file has one a vertex."""
+    left_out: tuple[str, ...] = ()
+    """What the file holds or names that was not looked at, a few words each."""
+
+
+def malformed(message: str) -> FieldFormatError:
+    """The error for a file that breaks its own format."""
+    return FieldFormatError(message, reason="MESH_INVALID")
+
+
+def elsewhere(message: str) -> FieldFormatError:
+    """The error for a file whose geometry lies in another file, or that would have a command run."""
+    return FieldFormatError(message, reason="MESH_EXTERNAL_REFERENCE")
+
+
+def unsupported(message: str) -> FieldFormatError:
+    """The error for a sound file that uses a part of its format which is not read here."""
+    return FieldFormatError(message, reason="FORMAT_NOT_SUPPORTED")
+
+
+def require_room(vertices: int, triangles: int) -> None:
+    """Raise FieldFormatError (MESH_TOO_LARGE) beyond the limits. Ask before arrays of these lengths are made."""
+    if vertices > MAX_VERTICES:
+        raise FieldFormatError(f"{vertices} vertices, at most {MAX_VERTICES} are taken", reason="MESH_TOO_LARGE")
+    if triangles > MAX_TRIANGLES:
+        raise FieldFormatError(f"{triangles} triangles, at most {MAX_TRIANGLES} are taken", reason="MESH_TOO_LARGE")
+
+
+def fans(polygons: npt.NDArray[Any]) -> Int64Array:
+    """(F, 3) triangles from (P, n) polygons of n >= 3 corners each, as fans round their first corner."""
+    corners = np.asarray(polygons, dtype=np.int64)
+    parts = [corners[:, [0, i, i + 1]] for i in range(1, corners.shape[1] - 1)]
+    triangles: Int64Array = np.concatenate(parts) if parts else np.zeros((0, 3), np.int64)
+    return triangles

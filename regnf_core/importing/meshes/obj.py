@@ -1,0 +1,60 @@
+"""Wavefront OBJ: vertices and polygons. Materials, curves and all else is passed over; no other file is opened."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from regnf_core.importing.meshes.geometry import Geometry, elsewhere, malformed, require_room
+
+_COMMANDS = (b"call", b"csh")
+_NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"surf": "free-form surfaces", b"l": "lines"}
+
+
+def read_obj(data: memoryview) -> Geometry:
+    """The polygons of an OBJ file, as fans of triangles. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, or
+    MESH_EXTERNAL_REFERENCE for one that would have a command run.
+    """
+    vertices: list[list[float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    left_out: set[str] = set()
+    for line in bytes(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            vertices.append(_place(words))
+        elif words[0] == b"f":
+            corners = [_index(word, len(vertices)) for word in words[1:]]
+            if len(corners) < 3:
+                raise malformed("an OBJ face with fewer than three corners")
+            triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
+            require_room(len(vertices), len(triangles))
+        elif words[0] in _COMMANDS:
+            raise elsewhere("the OBJ file asks for another file or a command to be run")
+        elif words[0] in _NOTED:
+            left_out.add(_NOTED[words[0]])
+    require_room(len(vertices), len(triangles))
+    return Geometry(
+        np.array(vertices, dtype=np.float64).reshape(-1, 3),
+        np.array(triangles, dtype=np.int64).reshape(-1, 3),
+        left_out=tuple(sorted(left_out)),
+    )
+
+
+def _place(words: list[bytes]) -> list[float]:
+    try:
+        x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a colour
+    except ValueError as error:
+        raise malformed("an OBJ vertex is not three numbers") from error
+    return [x, y, z]
+
+
+def _index(word: bytes, so_far: int) -> int:
+    """A corner as v, v/vt, v//vn or v/vt/vn: counted from 1, or backwards from the latest vertex."""
+    try:
+        number = int(word.partition(b"/")[0])
+    except ValueError as error:
+        raise malformed("an OBJ face has a corner that is no number") from error
+    if number == 0 or abs(number) >= 1 << 62:
+        raise malformed("an OBJ face has a corner of no vertex")
+    return number - 1 if number > 0 else so_far + number

@@ -1,0 +1,54 @@
+"""PLY (Stanford), text and binary of either byte order: vertices, their normals, polygons."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from regnf_core.importing.meshes.geometry import Float64Array, Geometry, malformed, require_room
+from regnf_core.importing.meshes.ply_body import BinaryBody, TextBody
+from regnf_core.importing.meshes.ply_header import Element, read_ply_header
+
+_INDEX_NAMES = ("vertex_indices", "vertex_index")
+_MAX_ROWS = 50_000_000
+
+
+def read_ply(data: memoryview) -> Geometry:
+    """The vertices and polygons (as fans) of a PLY file; without faces it is a point cloud.
+
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE.
+    """
+    header = read_ply_header(data)
+    rest = data[header.size :]
+    body = TextBody(rest) if header.byte_order is None else BinaryBody(rest, header.byte_order)
+    vertices, normals = np.zeros((0, 3)), None
+    faces = np.zeros((0, 3), np.int64)
+    left_out: list[str] = []
+    for element in header.elements:
+        if element.name == "vertex":
+            require_room(element.count, 0)
+            table = body.scalars(element)
+            vertices = _columns(table, ("x", "y", "z"))
+            if {"nx", "ny", "nz"} <= table.keys():
+                normals = _columns(table, ("nx", "ny", "nz"))
+        elif element.name == "face":
+            require_room(0, element.count)
+            faces = body.triangles(element, _index_property(element))
+        elif element.count > _MAX_ROWS:
+            raise malformed(f"the PLY file claims {element.count} rows of {element.name[:40]}")
+        else:
+            body.skip(element)
+            left_out.append(f"elements {element.name[:40]}")
+    return Geometry(vertices, faces, normals, tuple(left_out))
+
+
+def _columns(table: dict[str, Float64Array], names: tuple[str, ...]) -> Float64Array:
+    if not table.keys() >= set(names):
+        raise malformed(f"PLY vertices without {', '.join(names)}")
+    return np.stack([table[name] for name in names], axis=1)
+
+
+def _index_property(element: Element) -> str:
+    found = [p.name for p in element.properties if p.count_type is not None and p.name in _INDEX_NAMES]
+    if len(found) != 1:
+        raise malformed("PLY faces without one list of vertex indices")
+    return found[0]

@@ -1,0 +1,312 @@
+"""Meshes as uploads: our readers against trimesh's, and files that lie, reach elsewhere or ask for too much."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.safe_format import open_field
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.mesh import convert_mesh
+from regnf_core.importing.gate import import_field
+from regnf_core.importing.meshes import MESH_READERS, geometry
+from regnf_core.importing.sniff import sniff_format
+from regnf_core.importing.upload_description import UploadDescription
+from tests.core.importing.archives import assert_refused, saved
+from tests.devdata import dev_data
+
+BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+PLY_TRIANGLE = (
+    "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+
+
+def converted(data: bytes, **said: Any) -> ConvertedField:
+    format_ = sniff_format(data[:512])
+    assert format_ in MESH_READERS
+    return convert_mesh(format_, memoryview(data), UploadDescription.from_dict(said))
+
+
+def refused(data: bytes, reason: str, format_: str | None = None) -> None:
+    kind = format_ or str(sniff_format(data[:512]))
+    assert_refused(lambda: convert_mesh(kind, memoryview(data), UploadDescription()), reason)
+
+
+def field_of(found: ConvertedField) -> MeshField:
+    return MeshField(found.tensors["vertices"], found.tensors["faces"])
+
+
+def assert_same_distance(found: ConvertedField, mesh: MeshField) -> None:
+    points = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    low, high = mesh.bounds.float()
+    points = (low + high) / 2 + points * (high - low)
+    expected = mesh.signed_distance(points)
+    torch.testing.assert_close(
+        field_of(found).signed_distance(points), expected, rtol=0, atol=2e-6 * float(expected.abs().max())
+    )
+
+
+def exported(kind: str, **options: Any) -> bytes:
+    data = BALL.export(file_type=kind, **options)
+    return data.encode() if isinstance(data, str) else bytes(data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        exported("ply"),
+        exported("ply", encoding="ascii"),
+        exported("stl"),
+        exported("stl_ascii"),
+        exported("obj"),
+        exported("glb"),
+    ],
+    ids=["ply", "ply text", "stl", "stl text", "obj", "glb"],
+)
+def test_every_format_gives_the_mesh_that_trimesh_wrote(data: bytes) -> None:
+    found = converted(data)
+    assert_same_distance(found, MeshField(BALL.vertices, BALL.faces))
+    assert len(found.tensors["vertices"]) == len(BALL.vertices)  # the seams of loose triangles are welded
+    assert (found.family, found.why[1], found.warnings) == ("mesh", "watertight", ())
+    low, high = np.array(found.description["bounds"])
+    np.testing.assert_allclose([low, high], [[-0.5 - 0.05 * 3**0.5] * 3, [0.5 + 0.05 * 3**0.5] * 3], atol=0.01)
+
+
+@pytest.mark.parametrize("name", ["outdoor_folding_chair", "vintage_electric_kettle", "ycb_004_sugar_box"])
+def test_real_glb_files_agree_with_trimesh(name: str) -> None:
+    path = dev_data("furniture", f"{name}.glb")
+    assert_same_distance(converted(path.read_bytes()), MeshField.load(path))
+
+
+def test_a_scene_graph_is_merged_at_its_poses() -> None:
+    scene = trimesh.Scene()
+    turned = trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0], [0.1, 0.2, 0.3])
+    mirrored = np.diag([-2.0, 1.0, 1.0, 1.0])
+    scene.add_geometry(trimesh.creation.box((0.2, 0.4, 0.6)), node_name="a", transform=turned)
+    scene.add_geometry(trimesh.creation.box((0.3, 0.2, 0.1)), node_name="b", transform=mirrored, parent_node_name="a")
+    data = trimesh.exchange.gltf.export_glb(scene)  # type: ignore[no-untyped-call]
+    expected = trimesh.load_scene(trimesh.util.wrap_as_stream(data), file_type="glb").to_mesh()
+    assert_same_distance(converted(data), MeshField(expected.vertices, expected.faces))
+
+
+def test_binary_ply_with_everything_else_in_it() -> None:
+    """Big-endian, polygons of three, four and five corners, colours, another element before and one behind."""
+    header = (
+        "ply\r\nformat binary_big_endian 1.0\r\nelement note 2\r\nproperty list uchar short words\r\n"
+        "element vertex 8\r\nproperty uchar red\r\nproperty double x\r\nproperty double y\r\nproperty double z\r\n"
+        "element face 6\r\nproperty list ushort uint vertex_index\r\nproperty float quality\r\n"
+        "element edge 1\r\nproperty int a\r\nend_header\r\n"
+    )
+    corners = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7), (1, 7, 3)]
+    body = struct.pack(">BhhB", 2, 5, 6, 0)
+    body += b"".join(struct.pack(">B3d", 7, *corner) for corner in corners)
+    body += b"".join(struct.pack(f">H{len(f)}If", len(f), *f, 0.5) for f in faces) + struct.pack(">i", 3)
+    found = converted((header.replace("face 6", "face 7")).encode() + body)
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [1, 1, 1]])
+    assert_same_distance(found, MeshField(box.vertices, box.faces))
+    assert found.why[1] == "watertight"
+
+
+def test_obj_counts_from_either_end_and_passes_over_the_rest() -> None:
+    text = (
+        "# a tetrahedron\nmtllib colours.mtl\nv 0 0 0 1.0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\n"
+        "v 0 0 1\nf 1/1 3/1/1 2//1\nf -4 -3 \\\n -1\nf 2 3 4\nf 1 4 3\n"
+    )
+    found = converted(text.encode())
+    assert found.why[1:] == ("watertight", "passed over: materials in another file")
+    inside, outside = field_of(found).signed_distance(torch.tensor([[0.1, 0.1, 0.1], [-0.5, 0.2, 0.2]])).tolist()
+    assert (inside, outside) == pytest.approx((-0.1, 0.5), abs=1e-6)
+
+
+def test_inverted_faces_are_turned_round() -> None:
+    inverted = trimesh.Trimesh(BALL.vertices, BALL.faces[:, ::-1], process=False)
+    found = converted(inverted.export(file_type="stl"))
+    assert [warning.split(":")[0] for warning in found.warnings] == ["MESH_INSIDE_OUT"]
+    assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
+
+
+def test_holes_are_reported_and_have_an_inside_nonetheless() -> None:
+    found = converted(trimesh.Trimesh(BALL.vertices, BALL.faces[16:], process=False).export(file_type="ply"))
+    assert found.why[1].startswith("not watertight: ")
+    assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
+
+
+def test_coordinates_far_away_are_warned_of() -> None:
+    far = trimesh.Trimesh(BALL.vertices + np.array([5e5, 0.0, 0.0]), BALL.faces, process=False)
+    assert [warning.split(":")[0] for warning in converted(far.export(file_type="glb")).warnings] == ["FAR_FROM_ORIGIN"]
+
+
+def test_what_is_said_goes_before() -> None:
+    found = converted(exported("stl"), world_scale=0.001, sign=-1, label="ball", up_axis="z")
+    assert {name: found.description[name] for name in ("world_scale", "sign", "label", "up_axis")} == {
+        "world_scale": 0.001,
+        "sign": -1,
+        "label": "ball",
+        "up_axis": "z",
+    }
+    assert found.description["bounds"][1][0] == pytest.approx(0.001 * (0.5 + 0.05 * 3**0.5), rel=0.02)
+    assert_refused(lambda: converted(exported("stl"), level_mask=3), "INVALID_DESCRIPTION")
+    assert_refused(lambda: converted(exported("stl"), family="neus"), "FAMILY_NOT_SUPPORTED")
+
+
+def glb(document: Any, binary: bytes = b"", version: int = 2) -> bytes:
+    text = document if isinstance(document, bytes) else json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", version, 12 + len(body)) + body
+
+
+def triangle(**changes: Any) -> dict[str, Any]:
+    """A glTF document of one triangle; its binary chunk is TRIANGLE."""
+    return {
+        "asset": {"version": "2.0"},
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "buffers": [{"byteLength": 36}],
+    } | changes
+
+
+TRIANGLE = np.eye(3, dtype="<f4").tobytes()
+POSITION = {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}
+
+
+def test_the_triangle_alone_is_taken() -> None:
+    found = converted(glb(triangle(), TRIANGLE))
+    np.testing.assert_array_equal(np.sort(found.tensors["vertices"], axis=0), np.sort(np.eye(3), axis=0))
+    strip = triangle(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "mode": 5}]}])
+    assert len(converted(glb(strip, TRIANGLE)).tensors["faces"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("document", "reason"),
+    [
+        (b"{nonsense", "MESH_INVALID"),
+        (b"[" * 100_000, "MESH_INVALID"),
+        ([1], "MESH_INVALID"),
+        (triangle(nodes=[]) | {"meshes": []}, "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": 7}]), "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": 0, "children": [0]}]), "MESH_INVALID"),  # a loop
+        (triangle(nodes=[{"mesh": 0, "children": [1, 1]}, {}]), "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": 0, "rotation": [0, 0, 0, 0]}]), "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": 0, "scale": [1e308, 1e308, 1e308]}]), "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": 0, "matrix": [1, 2, 3]}]), "MESH_INVALID"),
+        (triangle(nodes=[{"mesh": "0"}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"count": 4}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"count": 1 << 40}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"count": -1}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"byteOffset": 4}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"componentType": 5130}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"type": "MAT4"}]), "MESH_INVALID"),
+        (triangle(accessors=[POSITION | {"sparse": {}}]), "FORMAT_NOT_SUPPORTED"),
+        (triangle(bufferViews=[{"buffer": 0, "byteLength": 1 << 30}]), "MESH_INVALID"),
+        (triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 0}]), "MESH_INVALID"),
+        (triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 1 << 40}]), "MESH_INVALID"),
+        (triangle(buffers=[{"byteLength": 36, "uri": "../../secret.bin"}]), "MESH_EXTERNAL_REFERENCE"),
+        (triangle(buffers=[{"byteLength": 36, "uri": "data:;base64,AAAA"}]), "MESH_EXTERNAL_REFERENCE"),
+        (triangle(extensionsRequired=["KHR_draco_mesh_compression"]), "FORMAT_NOT_SUPPORTED"),
+        (
+            triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "extensions": {"EXT_meshopt_compression": {}}}]),
+            "FORMAT_NOT_SUPPORTED",
+        ),
+    ],
+)
+def test_faulty_glb_files(document: Any, reason: str) -> None:
+    refused(glb(document, TRIANGLE), reason)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("end_header\n", "", "MESH_INVALID"),
+        ("ascii", "utf8", "MESH_INVALID"),
+        ("vertex 3", "vertex 4", "MESH_INVALID"),
+        ("vertex 3", "vertex 3000000000", "MESH_TOO_LARGE"),
+        ("face 1", "face 2", "MESH_INVALID"),
+        ("face 1", "face 99999999999", "MESH_TOO_LARGE"),
+        ("face 1", "face -1", "MESH_INVALID"),
+        ("float z", "float x", "MESH_INVALID"),
+        ("float z", "float w", "MESH_INVALID"),
+        ("float z", "list uchar float z", "MESH_INVALID"),
+        ("float z", "quaternion z", "MESH_INVALID"),
+        ("uchar int", "float int", "MESH_INVALID"),
+        ("vertex_indices", "corners", "MESH_INVALID"),
+        ("element face", "element vertex", "MESH_INVALID"),
+        ("3 0 1 2", "3 0 1 3", "MESH_INVALID"),
+        ("3 0 1 2", "3 0 1 -1", "MESH_INVALID"),
+        ("3 0 1 2", "2 0 1", "MESH_INVALID"),
+        ("3 0 1 2", "1e300 0 1 2", "MESH_INVALID"),
+        ("3 0 1 2", "3 0 1 nan", "MESH_INVALID"),
+        ("3 0 1 2", "3 0 1 1", "MESH_INVALID"),  # no area
+        ("1 0 0", "1 0 inf", "MESH_INVALID"),
+        ("1 0 0", "1 0 zero", "MESH_INVALID"),
+    ],
+)
+def test_faulty_ply_files(old: str, new: str, reason: str) -> None:
+    assert old in PLY_TRIANGLE
+    refused(PLY_TRIANGLE.replace(old, new).encode(), reason)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 x\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3" + "0" * 30 + "\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n", "MESH_INVALID"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "MESH_INVALID"),
+        ("v 0 0 0\ncall other.obj\n", "MESH_EXTERNAL_REFERENCE"),
+        ("v 0 0 0\ncsh rm -r everything\n", "MESH_EXTERNAL_REFERENCE"),
+    ],
+)
+def test_faulty_obj_files(text: str, reason: str) -> None:
+    refused(text.encode(), reason, "obj")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        exported("stl")[:-1],
+        exported("stl") + b"\0",
+        b"solid ball\nfacet normal 0 0 1\nvertex 0 0\nendfacet",
+        b"solid ball\nfacet normal 0 0 1\nvertex 0 0 0\nvertex 1 0 0\nendfacet",
+        b"solid ball\nfacet normal 0 0 1\nendfacet",
+    ],
+)
+def test_faulty_stl_files(data: bytes) -> None:
+    refused(data, "MESH_INVALID")
+
+
+def test_more_triangles_than_anybody_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geometry, "MAX_TRIANGLES", 100)
+    for kind in ("ply", "stl", "obj", "glb"):
+        refused(exported(kind), "MESH_TOO_LARGE")
+
+
+def test_a_mesh_goes_through_the_gate(tmp_path: Path) -> None:
+    report = import_field(saved(tmp_path, exported("glb")), tmp_path / "out", {"label": "ball"})
+    assert (report.family, report.label) == ("mesh", "ball")
+    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=1e-3)
+    field = open_field(tmp_path / "out" / "field.safetensors")
+    assert field.signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.48, abs=0.03)
+
+
+def test_a_sheet_has_no_inside(tmp_path: Path) -> None:
+    upload = saved(tmp_path, PLY_TRIANGLE.encode())
+    assert_refused(lambda: import_field(upload, tmp_path / "out"), "NO_ZERO_LEVEL")
