@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from regnf_core.importing.families.converted import ConvertedField
 
 FIELD_NAME = "field.safetensors"
+_ALL_ROUND = 0.95
+_SIGN_UNCERTAIN = (
+    "all round the bounds the values are negative: a room seen from within, or an object trained with its sign turned"
+    " round; for the latter say sign -1"
+)
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
@@ -43,10 +48,13 @@ def convert_file(
     parameters = sum(array.size for array in converted.tensors.values())
     family, why, warnings = converted.family, converted.why, converted.warnings
     bounds, label = converted.description["bounds"], converted.description["label"]
+    sign_is_open = converted.sign_is_open
     del converted  # the tensors are on disk: let go of them before the evaluation
     from regnf_core.importing.plausibility import check_plausibility  # loads torch, which a refused file never needs
 
     figures, more = check_plausibility(open_field(target))
+    if sign_is_open and figures["share_inside_at_bounds"] > _ALL_ROUND:
+        more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
         "family": family,
         "why": why,

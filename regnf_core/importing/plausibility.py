@@ -17,7 +17,10 @@ _GRADIENT_RANGE = (0.5, 2.0)
 
 
 def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
-    """Figures of the field, and warnings: share_inside, surface_points, gradient_p10, gradient_median, gradient_p90.
+    """Figures of the field, and warnings.
+
+    Figures: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
+    gradient_p10, gradient_median and gradient_p90 (the gradient's norm there).
 
     ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
     along the gradient.
@@ -37,12 +40,26 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
     low, median, high = torch.quantile(norms, torch.tensor([0.1, 0.5, 0.9])).tolist()
     figures = {
         "share_inside": float(inside.float().mean()),
+        "share_inside_at_bounds": _share_inside_at_bounds(field, (lower, upper), samples, generator),
         "surface_points": float(norms.numel()),
         "gradient_p10": low,
         "gradient_median": median,
         "gradient_p90": high,
     }
     return figures, _warnings(figures)
+
+
+def _share_inside_at_bounds(
+    field: SdfField, box: tuple[Tensor, Tensor], samples: int, generator: torch.Generator
+) -> float:
+    """Share of the bounds' faces, each counting alike, that lies inside matter."""
+    each = samples // 64
+    points = torch.rand(6, each, 3, generator=generator)
+    for face in range(6):
+        points[face, :, face // 2] = float(face % 2)
+    distance = field.signed_distance(box[0] + (box[1] - box[0]) * points.view(-1, 3))
+    _require_finite(distance)
+    return float((distance < 0).float().mean())
 
 
 def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -87,5 +104,6 @@ def _warnings(figures: dict[str, float]) -> list[str]:
         text = f"the gradient's norm at the surface is {median:.2f}, not about 1: is the family or the grid another?"
         warnings.append(f"GRADIENT_NOT_UNIT: {text}")
     if figures["share_inside"] > 0.9:
-        warnings.append("MOSTLY_INSIDE: over nine tenths of the bounds are inside matter: is the sign swapped?")
+        text = "over nine tenths of the bounds are inside matter: is the sign turned round? Then say sign -1"
+        warnings.append(f"MOSTLY_INSIDE: {text}")
     return warnings

@@ -43,7 +43,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         "bounds [-1, 1]: beyond the cube in which SIREN trains its sines repeat",
         f"sines of {_OMEGA:g} times the layers' results, as usual",
     )
-    return ConvertedField(FAMILY, why, description, _with_frequency(layers).tensors(), sign_is_open=True)
+    return ConvertedField(FAMILY, why, description, _with_frequency(layers).tensors(), sign_is_open=wanted.sign is None)
 
 
 def _with_frequency(layers: Layers) -> Layers:

@@ -136,6 +136,24 @@ def test_a_level_mask_may_be_said(tmp_path: Path) -> None:
     assert_is(tmp_path, sample.function)
 
 
+def round_siren(sign: float) -> dict[str, torch.Tensor]:
+    """sign (2.8 - cos 1.2 x - cos 1.2 y - cos 1.2 z): a ball's worth round the origin, the other sign all about it."""
+    first = {"net.net.0.0.weight": 1.2 / 30 * torch.eye(3), "net.net.0.0.bias": torch.full((3,), torch.pi / 60)}
+    last = {"net.net.1.0.weight": -sign * torch.ones(1, 3), "net.net.1.0.bias": torch.tensor([2.8 * sign])}
+    return first | last
+
+
+@pytest.mark.parametrize(
+    ("sign", "description", "uncertain"),
+    [(1.0, {}, False), (-1.0, {}, True), (-1.0, {"sign": -1}, False), (-1.0, {"sign": 1}, False)],
+)
+def test_a_siren_that_is_negative_all_round_may_be_turned_round(
+    sign: float, description: dict[str, Any], uncertain: bool, tmp_path: Path
+) -> None:
+    report = imported(tmp_path, round_siren(sign), **description)
+    assert ("SIGN_UNCERTAIN" in [warning.split(":")[0] for warning in report["warnings"]]) == uncertain
+
+
 @pytest.mark.parametrize(
     ("make", "step", "words"),
     [

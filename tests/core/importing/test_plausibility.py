@@ -49,7 +49,15 @@ def test_a_sphere_is_plausible() -> None:
     figures, warnings = check_plausibility(sphere(0.5))
     assert warnings == []
     assert figures["share_inside"] == pytest.approx(0.0654, abs=0.006)
+    assert figures["share_inside_at_bounds"] == 0.0
     assert [figures[f"gradient_{q}"] for q in ("p10", "median", "p90")] == pytest.approx([1, 1, 1], abs=1e-4)
+
+
+def test_the_faces_count_alike_whatever_their_size() -> None:
+    """A half space that ends at x = 0: one face inside, one outside, half of each of the other four."""
+    field = _Field(lambda points: points[:, 0])
+    field.bounds = torch.tensor([[-1.0, -1.0, -1.0], [1.0, 9.0, 1.0]], dtype=torch.float64)
+    assert check_plausibility(field)[0]["share_inside_at_bounds"] == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_surface_too_small_for_the_samples_is_found_by_walking() -> None:
