@@ -38,8 +38,8 @@ def write_safe_field(
     """Write a field file, whole or not at all: a temporary file beside ``path`` is renamed once it is on the disk.
 
     The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32,
-    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH or
-    FIELD_NOT_FINITE.
+    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN,
+    FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
     """
     parsed = parse_description(description)
     specs = {name: TensorSpec(array.shape, _type_name(name, array)) for name, array in tensors.items()}
@@ -134,5 +134,6 @@ def _header(
 def _type_name(name: str, array: NDArray[Any]) -> str:
     type_name = _TYPE_NAMES.get(array.dtype.name)
     if type_name is None:
-        raise FieldFormatError(f"{name} is {array.dtype}, expected float32, float16 or int32", reason="FIELD_SHAPES_MISMATCH")
+        message = f"{name} is {array.dtype}, expected float32, float16 or int32"
+        raise FieldFormatError(message, reason="FIELD_SHAPES_MISMATCH")
     return type_name
