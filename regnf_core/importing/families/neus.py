@@ -1,7 +1,7 @@
 """NeuS (Wang et al. 2021) as its authors' code saves it: one softplus network under ``sdf_network_fine``.
 
 The network's own ``scale`` is not in the checkpoint: S(x) = f(scale x) / scale. It is taken as 1; for the two published
-configurations that set 3, ``world_scale`` 1/3 says the same.
+configurations that set 3, ``world_scale`` 1/3 and bounds of [-1, 1] say the same.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     why = (
         f"keys sdf_network_fine.lin*, {len(names)} layers, {degree} frequencies",
         "bounds [-1, 1]: the unit sphere's cube, in which NeuS trains",
-        "the network's scale is taken as 1, as usual (where it was 3 say world_scale 0.333333)",
+        "the network's scale is taken as 1, as usual (where it was 3 say world_scale 0.333333 and the bounds)",
     )
     return ConvertedField(FAMILY, why, description, _reordered(layers, degree, skips).tensors())
 
