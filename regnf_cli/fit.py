@@ -11,6 +11,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
 from regnf_cli.console import err, out
+from regnf_cli.extras import require
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 
 _LONGEST_LABEL = 200  # of the safe format
@@ -35,6 +36,7 @@ def fit(
 
     Example: **regnf fit chair.glb chair.safetensors --extent 1.0**
     """
+    require("engine")
     import numpy as np
 
     from regnf_core.fields.mesh import MeshField

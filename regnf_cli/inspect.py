@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from regnf_cli.console import out
+from regnf_cli.extras import require
 from regnf_cli.request_files import read_object
 
 
@@ -23,6 +24,7 @@ def inspect(
 
     Example: **regnf inspect step-000030000.ckpt**
     """
+    require("engine")
     import tempfile
 
     from regnf_core.importing.gate import ImportLimits, import_field

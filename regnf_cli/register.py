@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from regnf_cli.console import out, phase_progress
+from regnf_cli.extras import require
 from regnf_cli.report import exit_code, show_result
 from regnf_cli.request_files import parse_detection, read_object, read_options, read_transform
 from regnf_core.errors import InvalidInputError
@@ -42,6 +43,9 @@ def register(
     server: Annotated[
         str | None, typer.Option(help="Address of a regnf service; without it the work is done here.")
     ] = None,
+    worker_timeout: Annotated[
+        int, typer.Option(min=0, help="With --server: give up once it has had no live worker for so many seconds.")
+    ] = 60,
     token: Annotated[str | None, typer.Option(envvar="REGNF_API_TOKEN", help="The service's bearer token.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the whole result document.")] = False,
 ) -> None:
@@ -63,10 +67,12 @@ def register(
             "only the preset robust starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED"
         )
     if server is not None:
-        from regnf_cli.remote import register_remotely
+        from regnf_cli.remote import RemoteService, register_remotely
 
-        document = register_remotely(server, token, scene, object_, request, output)
+        service = RemoteService(server, token, worker_timeout)
+        document = register_remotely(service, scene, object_, request, output)
     else:
+        require("engine")
         document = _register_here(scene, object_, request, output)
     if as_json:
         out.print_json(json.dumps(document))

@@ -10,11 +10,13 @@ from typing import Any
 import httpx
 
 from regnf_cli.console import EXIT_UNAVAILABLE, err, fail, phase_progress
+from regnf_cli.worker_watch import WorkerWatch
 from regnf_core.errors import InvalidInputError, RegnfError
 
 _BLOCK = 1 << 20
 _FINISHED = ("successful", "failed", "dismissed")
-_POLL_S = 20
+_POLL_S = 2
+WORKER_TIMEOUT_S = 60
 Report = Callable[[str, float], None]
 """Called with a phase and a share 0..1."""
 
@@ -28,9 +30,12 @@ class ServiceError(RegnfError):
 
 
 class RemoteService:
-    """The few calls of the HTTP contract that a registration needs."""
+    """The few calls of the HTTP contract that a registration needs.
 
-    def __init__(self, address: str, token: str | None = None) -> None:
+    What waits for a worker raises NoWorkerError once the service has had none for ``worker_timeout_s``.
+    """
+
+    def __init__(self, address: str, token: str | None = None, worker_timeout_s: float = WORKER_TIMEOUT_S) -> None:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             url = httpx.URL(address)
@@ -38,13 +43,23 @@ class RemoteService:
             raise InvalidInputError(f"{address}: {error}", reason="INVALID_ADDRESS") from error
         if url.scheme not in ("http", "https") or not url.host:
             raise InvalidInputError(f"{address!r} is no http:// or https:// address", reason="INVALID_ADDRESS")
+        self.address = address
         self._http = httpx.Client(base_url=address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
+        self._watch = WorkerWatch(self._worker_lives, worker_timeout_s)
 
     def __enter__(self) -> RemoteService:
         return self
 
     def __exit__(self, *_: object) -> None:
         self._http.close()
+
+    def _worker_lives(self) -> bool:
+        """As far as the service says; one that says nothing of it is taken to have one."""
+        try:
+            checks = self._http.get("/readyz").json()["checks"]
+            return checks["worker"] is not False
+        except (KeyError, TypeError, ValueError):
+            return True
 
     def upload_field(self, path: Path, report: Report = lambda phase, share: None) -> str:
         """Send a field unless the service holds it; returns its SHA-256 once the service has found it good."""
@@ -79,6 +94,7 @@ class RemoteService:
                 return
             if document["state"] == "rejected":
                 raise _problem(document.get("error") or {})
+            self._watch.look()
 
     def submit(self, request: dict[str, Any]) -> dict[str, Any]:
         """POST /register; returns the job document."""
@@ -91,7 +107,8 @@ class RemoteService:
             report(job.get("phase") or job["status"], job.get("progress") or 0.0)
             if job["status"] in _FINISHED:
                 return job
-            job = _check(self._http.get(f"/jobs/{job_id}", params={"wait": 1}))
+            self._watch.look()
+            _check(self._http.get(f"/jobs/{job_id}", params={"wait": 1}))
 
     def result(self, job_id: str) -> dict[str, Any]:
         """The result document of a successful job; raises ServiceError with the job's own reason otherwise."""
@@ -109,14 +126,14 @@ class RemoteService:
 
 
 def register_remotely(
-    address: str, token: str | None, scene: Path, object_: Path, request: dict[str, Any], output: Path | None
+    service: RemoteService, scene: Path, object_: Path, request: dict[str, Any], output: Path | None
 ) -> dict[str, Any]:
     """The whole exchange for one registration, with progress on stderr; returns the result document.
 
-    Raises ServiceError; leaves with exit code 3 when the service cannot be reached.
+    Raises ServiceError, NoWorkerError; leaves with exit code 3 when the service cannot be reached.
     """
     try:
-        with RemoteService(address, token) as service, phase_progress() as bar:
+        with service, phase_progress() as bar:
             task = bar.add_task("uploading", total=1.0)
 
             def report(phase: str, share: float) -> None:
@@ -135,7 +152,7 @@ def register_remotely(
     except httpx.RequestError as error:
         err.print()
         raise SystemExit(
-            fail("SERVICE_UNAVAILABLE", f"{address} does not answer: {error}", EXIT_UNAVAILABLE)
+            fail("SERVICE_UNAVAILABLE", f"{service.address} does not answer: {error}", EXIT_UNAVAILABLE)
         ) from error
 
 

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from regnf_cli.extras import require
+
 
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on. [default: 127.0.0.1]")] = None,
@@ -22,11 +24,14 @@ def serve(
 
     Example: **regnf serve --port 8080**
     """
+    require("service")
     from regnf_cli.settings import read_settings
     from regnf_cli.supervisor import Supervisor
     from service.logs import configure_logging
 
     settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
+    if settings.workers:
+        require("engine")  # a worker starts without it, and then fails every job
     configure_logging(settings.log_format)
     Supervisor(settings).run(ready=lambda address: typer.echo(f"regnf serves {address} (Ctrl+C stops it)"))
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from regnf_cli.extras import require
+
 
 def worker(
     redis_url: Annotated[
@@ -18,6 +20,7 @@ def worker(
 
     Example: **regnf worker --redis-url redis://queue:6379/0**
     """
+    require("service", "engine")
     import os
 
     from redis.exceptions import ConnectionError as RedisConnectionError

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from regnf_cli.worker_watch import NoWorkerError, WorkerWatch
 from tests.cli.conftest import Run
 
 Answer = tuple[int, str]
@@ -77,6 +78,75 @@ def test_the_verdict_decides(verdict: str, code: int, run: Run, demo: list[objec
     outcome = run(*demo, "--server", serve(service(verdict)))
     assert outcome.code == code, outcome.stderr
     assert outcome.stdout.startswith(f"verdict      {verdict}  (BECAUSE)")
+
+
+def without_worker(stuck: str, checks: object = None) -> Answers:
+    """A service whose fields (``stuck`` = fields) or jobs never end, for want of a worker or as ``checks`` say."""
+    ready = service("registered")
+    unready = {"reason": "NOT_READY", "checks": {"records": True, "worker": False} if checks is None else checks}
+
+    def answers(method: str, path: str) -> Answer:
+        if path == "/readyz":
+            return 503, json.dumps(unready)
+        if stuck == "fields" and path.startswith("/fields/"):
+            return 200, json.dumps({"state": "validating"})
+        if stuck == "jobs" and path == "/jobs/j":
+            return 200, json.dumps({"id": "j", "status": "accepted"})
+        return ready(method, path)
+
+    return answers
+
+
+@pytest.mark.parametrize("stuck", ["fields", "jobs"])
+def test_nobody_waits_for_ever_for_a_worker(stuck: str, run: Run, demo: list[object], serve: Serve) -> None:
+    outcome = run(*demo, "--server", serve(without_worker(stuck)), "--worker-timeout", 0)
+    assert outcome.code == 3
+    assert "NO_WORKER " in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+
+
+@pytest.mark.parametrize("checks", [{"worker": True, "storage": False}, {}, [], "?"])
+def test_a_worker_is_missing_only_where_the_service_says_so(
+    checks: object, run: Run, demo: list[object], serve: Serve
+) -> None:
+    looks: list[str] = []
+    stuck = without_worker("jobs", checks)
+
+    def answers(method: str, path: str) -> Answer:
+        looks.append(path)
+        return stuck(method, path) if looks.count("/jobs/j") < 4 else service("registered")(method, path)
+
+    outcome = run(*demo, "--server", serve(answers), "--worker-timeout", 0)
+    assert outcome.code == 0, outcome.stderr
+    assert looks.count("/readyz") == 1
+
+
+def test_the_watch_counts_only_an_absence_without_a_break() -> None:
+    now, lives, looks = [100.0], [True], []
+
+    def look_at(seconds: float) -> None:
+        now[0] = seconds
+        watch.look()
+
+    def alive() -> bool:
+        looks.append(now[0])
+        return lives[0]
+
+    watch = WorkerWatch(alive, 60.0, clock=lambda: now[0])
+    look_at(100.0)
+    look_at(104.9)
+    assert looks == [100.0], "not more often than every five seconds"
+    lives[0] = False
+    look_at(105.0)
+    look_at(164.0)
+    lives[0] = True
+    look_at(169.0)
+    lives[0] = False
+    look_at(174.0)
+    look_at(230.0)
+    look_at(233.9)
+    with pytest.raises(NoWorkerError, match="60 s"):
+        look_at(234.0)
 
 
 def test_artifacts_stay_in_the_folder(run: Run, demo: list[object], serve: Serve, tmp_path: Path) -> None:

@@ -1,0 +1,29 @@
+"""Optional parts of the installation: a command that needs one says so, instead of failing at its import."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from regnf_core.errors import RegnfError
+
+MODULES = {
+    "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh"),
+    "service": ("fastapi", "pydantic_settings", "python_multipart", "yaml", "redis", "rq", "uvicorn"),
+}
+"""What each extra of the package brings."""
+
+
+class MissingExtraError(RegnfError):
+    """An extra of the package that the command needs is not installed, or not wholly."""
+
+    unavailable = True
+    reason = "EXTRA_MISSING"
+
+
+def require(*extras: str) -> None:
+    """Raises MissingExtraError naming the extras that are not all there. Imports nothing."""
+    missing = {extra: [name for name in MODULES[extra] if find_spec(name) is None] for extra in extras}
+    lacking = [extra for extra, names in missing.items() if names]
+    if lacking:
+        modules = ", ".join(name for names in missing.values() for name in names)
+        raise MissingExtraError(f"not installed: {modules}; pip install 'regnf[{','.join(lacking)}]'")

@@ -1,0 +1,46 @@
+"""Giving up on a service that takes requests and has nobody to work on them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from regnf_core.errors import RegnfError
+
+_LOOK_EVERY_S = 5.0
+
+
+class NoWorkerError(RegnfError):
+    """For as long as one was ready to wait, the service had no live worker."""
+
+    unavailable = True
+    reason = "NO_WORKER"
+
+
+class WorkerWatch:
+    """Call ``look`` as often as you like while waiting for a job: it asks ``lives`` every few seconds."""
+
+    def __init__(self, lives: Callable[[], bool], limit_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._lives = lives
+        self._limit_s = limit_s
+        self._clock = clock
+        self._next_look = clock()
+        self._missing_since: float | None = None
+
+    def look(self) -> None:
+        """Raises NoWorkerError once nobody has lived for ``limit_s`` on end."""
+        now = self._clock()
+        if now < self._next_look:
+            return
+        self._next_look = now + _LOOK_EVERY_S
+        if self._lives():
+            self._missing_since = None
+            return
+        if self._missing_since is None:
+            self._missing_since = now
+        if now - self._missing_since >= self._limit_s:
+            raise NoWorkerError(
+                f"the service has had no live worker for {self._limit_s:g} s; what was sent stays in its queue, "
+                "and the same command finds it again"
+            )
+        self._next_look = min(self._next_look, self._missing_since + self._limit_s)
