@@ -69,8 +69,10 @@ def convert_file(
 def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int) -> ConvertedField:
     from regnf_core.importing.container import read_archive
     from regnf_core.importing.families import convert_checkpoint
+    from regnf_core.importing.families.arrays import convert_arrays
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.legacy_container import read_legacy
+    from regnf_core.importing.npz import ArraySource
     from regnf_core.importing.pickle_reader import read_pickle
     from regnf_core.importing.tensors import TensorSource
     from regnf_core.importing.upload_description import UploadDescription
@@ -85,6 +87,8 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     if kind == "torch-legacy":
         values, legacy = read_legacy(data)
         return convert_checkpoint(values, TensorSource(legacy, tensor_bytes), wanted)
+    if kind == "npz":
+        return convert_arrays(ArraySource(data, tensor_bytes), wanted)
     if kind == "safetensors":
         return convert_safe_field(upload, data, tensor_bytes, wanted)
     if kind in MESH_FORMATS:

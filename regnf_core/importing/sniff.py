@@ -25,6 +25,8 @@ def sniff_format(head: bytes) -> str | None:
         return "torch-zip"
     if head.startswith(_LEGACY_MAGIC):
         return "torch-legacy"
+    if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head).endswith(b".npy"):
+        return "npz"
     if head[8:9] == b"{":
         return "safetensors"
     return sniff_mesh(head)
@@ -41,8 +43,12 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     if head.lstrip()[:1] == b"{" and b'"asset"' in head:
         return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
     if head.startswith(_ZIP_LOCAL_HEADER):
-        return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save wrote"
+        return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     return "FORMAT_NOT_RECOGNISED", "none of the formats that are taken: torch.save archives, safetensors, meshes"
+
+
+def _first_name(head: bytes) -> bytes:
+    return head[_ZIP_NAME_AT : _ZIP_NAME_AT + int.from_bytes(head[26:28], "little")]
 
 
 def _may_be_torch_archive(head: bytes) -> bool:

@@ -71,10 +71,10 @@ class TensorSource:
         self._spend(name, 4 * count)
         raw = self._storage(name, ref.storage, stored, count)
         _check_dense(name, ref, count)
-        flat = np.frombuffer(raw, dtype=stored)
-        values = _in_float32(_in_shape(flat, ref), ref.storage.dtype)
-        _check_finite(name, values)
-        return values
+        values = _in_shape(np.frombuffer(raw, dtype=stored), ref)
+        if ref.storage.dtype == "bfloat16":
+            values = (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
+        return finite_float32(name, values)
 
     def _spend(self, name: str, size: int) -> None:
         self._budget -= size
@@ -111,6 +111,23 @@ def require_shape(name: str, array: Float32Array, shape: tuple[int | None, ...])
         raise tensor_error(f"{name} has shape {array.shape}, expected {wanted}", "TENSOR_SHAPE")
 
 
+def finite_float32(name: str, values: npt.NDArray[Any]) -> Float32Array:
+    """The array ``name`` as contiguous float32 in its own shape. Raises FieldFormatError (TENSOR_NOT_FINITE)."""
+    with np.errstate(over="ignore"):  # a number too large for float32 becomes inf, which the check refuses
+        array = np.ascontiguousarray(values, dtype=np.float32).reshape(values.shape)
+    flat = array.reshape(-1)
+    for start in range(0, flat.size, _FINITE_CHUNK):
+        if not np.isfinite(flat[start : start + _FINITE_CHUNK]).all():
+            raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")
+    return array
+
+
+def require_possible(name: str, shape: tuple[int, ...]) -> None:
+    """Raise FieldFormatError (TENSOR_SHAPE) for a shape that no array has, even one of nothing."""
+    if math.prod(max(extent, 1) for extent in shape) > _MAX_ELEMENTS:
+        raise tensor_error(f"{name} has a shape that no array has: {shape}", "TENSOR_SHAPE")
+
+
 def lookup(values: Mapping[Any, Any], name: str) -> object:
     """The value under ``name``. Raises FieldFormatError (TENSOR_MISSING)."""
     if name not in values:
@@ -132,8 +149,7 @@ def _stored_type(name: str, ref: TensorRef) -> np.dtype[Any]:
 
 def _check_dense(name: str, ref: TensorRef, count: int) -> None:
     """Every element of the storage occurs exactly once: strides are those of some order of the axes, offset is 0."""
-    if math.prod(max(extent, 1) for extent in ref.shape) > _MAX_ELEMENTS:
-        raise tensor_error(f"{name} has a shape that no array has: {ref.shape}", "TENSOR_SHAPE")
+    require_possible(name, ref.shape)
     expected = 1
     for stride, extent in sorted((s, n) for s, n in zip(ref.strides, ref.shape, strict=True) if n != 1):
         if stride != expected and count:
@@ -147,17 +163,3 @@ def _in_shape(flat: npt.NDArray[Any], ref: TensorRef) -> npt.NDArray[Any]:
     order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
     stored = flat.reshape([ref.shape[axis] for axis in order])
     return stored.transpose(np.argsort(order)) if order else stored
-
-
-def _in_float32(values: npt.NDArray[Any], dtype: str | None) -> Float32Array:
-    if dtype == "bfloat16":
-        return (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
-    with np.errstate(over="ignore"):  # a number too large for float32 becomes inf, which the next check refuses
-        return np.ascontiguousarray(values, dtype=np.float32).reshape(values.shape)
-
-
-def _check_finite(name: str, values: Float32Array) -> None:
-    flat = values.reshape(-1)
-    for start in range(0, flat.size, _FINITE_CHUNK):
-        if not np.isfinite(flat[start : start + _FINITE_CHUNK]).all():
-            raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")

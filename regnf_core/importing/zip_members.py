@@ -25,7 +25,7 @@ _PART = re.compile(r"[^\x00-\x1f\x7f/\\]+")
 
 @dataclass(frozen=True)
 class Member:
-    """``packed_size`` bytes at ``offset`` of the file; of what they unpack to, size and CRC-32 as the directory says."""
+    """``packed_size`` bytes at ``offset`` of the file, and the size and CRC-32 of what they unpack to."""
 
     name: str
     method: int
@@ -147,9 +147,7 @@ def _descriptor_size(data: memoryview, central: Header, at: int, limit: int) -> 
         length = struct.calcsize(layout)
         if max(central.size, central.compressed_size) > largest or at + length > limit:
             continue
-        wanted = struct.pack(
-            layout, records.DESCRIPTOR_SIGNATURE, central.crc32, central.compressed_size, central.size
-        )
+        wanted = struct.pack(layout, records.DESCRIPTOR_SIGNATURE, central.crc32, central.compressed_size, central.size)
         if bytes(data[at : at + length]) == wanted:
             return length
     raise malformed("the descriptor behind an entry contradicts the central directory", "ARCHIVE_HEADER_MISMATCH")

@@ -9,10 +9,12 @@ from regnf_core.fields.kinds.kind import FieldDescription
 from regnf_core.fields.kinds.mesh import MeshDescription
 from regnf_core.fields.kinds.mlp import MlpDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
+from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 
 KINDS: dict[str, type[FieldDescription]] = {
     "neus_facto": NeusFactoDescription,
     "mlp": MlpDescription,
     "mesh": MeshDescription,
+    "voxel_grid": VoxelGridDescription,
 }
 """By the description's ``family``."""

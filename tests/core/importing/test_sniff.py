@@ -32,6 +32,10 @@ def test_names_meshes() -> None:
     assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"
 
 
+def test_an_archive_of_arrays_is_named() -> None:
+    assert sniff_format(zip_bytes([("points.npy", b"\x93NUMPY")])) == "npz"
+
+
 def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
     assert sniff_format(b"PK\x03\x04\x00") == "torch-zip"
 
@@ -50,7 +54,7 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNISED"),
         (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNISED"),  # an STL file's facets have corners
         (b"x" * 512, "FORMAT_NOT_RECOGNISED"),
-        (zip_bytes([("points.npy", b"\x93NUMPY")]), "FORMAT_NOT_SUPPORTED"),
+        (zip_bytes([("points.txt", b"1 2 3")]), "FORMAT_NOT_SUPPORTED"),
         (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNISED"),
         (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNISED"),
     ],

@@ -1,0 +1,32 @@
+"""The families of .npz files that the gate recognises: one module a family, listed in ``ARRAY_FAMILIES``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families import dense_grid
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.npz import ArraySource
+from regnf_core.importing.upload_description import UploadDescription
+
+ArrayFamily = Callable[[ArraySource, UploadDescription], ConvertedField | None]
+"""Returns None unless the arrays are the family's; raises FieldFormatError if they are but cannot be taken."""
+
+ARRAY_FAMILIES: tuple[ArrayFamily, ...] = (dense_grid.convert,)
+
+_SHOWN_NAMES = 8
+
+
+def convert_arrays(arrays: ArraySource, description: UploadDescription) -> ConvertedField:
+    """The signed distance field in the arrays. Those that it does not need are never unpacked.
+
+    Raises FieldFormatError: FIELD_NOT_RECOGNISED and what the family raises.
+    """
+    for family in ARRAY_FAMILIES:
+        converted = family(arrays, description)
+        if converted is not None:
+            return converted
+    names = [name[:40] for name in arrays.names if name.isprintable()][:_SHOWN_NAMES]
+    message = f"no known family of fields; the first arrays are {names}"
+    raise FieldFormatError(message, reason="FIELD_NOT_RECOGNISED")

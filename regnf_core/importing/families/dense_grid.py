@@ -1,0 +1,84 @@
+"""A dense grid of signed distances as .npz: regnf's own convention for fields of trainers that it does not know.
+
+``sdf`` (X, Y, Z), the first axis x; node (i, j, k) is at ``origin`` + ``spacing`` (i, j, k). See docs/families.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.npz import ArraySource
+from regnf_core.importing.tensors import require_shape, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
+
+FAMILY = "dense_sdf_grid"
+_VALUES = ("sdf", "values")
+_SPACINGS = ("spacing", "voxel_size")
+_Vector = npt.NDArray[np.float64]
+
+
+def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | None:
+    """The grid in ``arrays``, or None where there is no array ``sdf`` or ``values``.
+
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE, BOUNDS_INVALID and
+    what ArraySource raises.
+    """
+    name = next((name for name in _VALUES if name in arrays), None)
+    if name is None:
+        return None
+    require_family(wanted, FAMILY)
+    refuse_other_entries(wanted, FAMILY)
+    values = arrays.array(name)
+    require_shape(name, values, (None, None, None))
+    if min(values.shape) < 2:
+        raise tensor_error(f"{name} has shape {values.shape}, expected two nodes an axis at least", "TENSOR_SHAPE")
+    origin, spacing, told = _placement(arrays, np.array(values.shape))
+    far = origin + spacing * (np.array(values.shape) - 1)
+    description = {
+        "family": "voxel_grid",
+        **shared_entries(wanted, [origin.tolist(), far.tolist()]),
+        "origin": origin.tolist(),
+        "spacing": spacing.tolist(),
+        "source": {"family": FAMILY},
+    }
+    nodes = " x ".join(map(str, values.shape))
+    why = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
+    return ConvertedField(FAMILY, why, description, {"values": values}, sign_is_open=True)
+
+
+def _placement(arrays: ArraySource, nodes: npt.NDArray[np.int64]) -> tuple[_Vector, _Vector, str]:
+    """The first node's place, the spacing along each axis, and the arrays that told."""
+    given = [name for name in ("origin", "bounds") if name in arrays]
+    if len(given) != 1:
+        raise _invalid("either origin and spacing or bounds place a grid; there are " + (" and ".join(given) or "none"))
+    if given == ["bounds"]:
+        low, high = _vector(arrays, "bounds", (2, 3))
+        spacing, told = (high - low) / (nodes - 1), "bounds"
+    else:
+        name = next((name for name in _SPACINGS if name in arrays), _SPACINGS[0])
+        low, spacing, told = _vector(arrays, "origin", (3,)), _steps(arrays, name), f"origin and {name}"
+    if not (spacing > 0.0).all():
+        raise _invalid("the grid's spacing is not above zero along every axis")
+    return low, spacing, told
+
+
+def _steps(arrays: ArraySource, name: str) -> _Vector:
+    steps = arrays.numbers(name)
+    if steps.size == 1:
+        return np.full(3, float(steps.reshape(())))
+    return _vector(arrays, name, (3,))
+
+
+def _vector(arrays: ArraySource, name: str, shape: tuple[int, ...]) -> _Vector:
+    vector = arrays.numbers(name)
+    if vector.shape != shape:
+        raise tensor_error(f"{name} has shape {vector.shape}, expected {shape}", "TENSOR_SHAPE")
+    return vector
+
+
+def _invalid(message: str) -> FieldFormatError:
+    return FieldFormatError(message, reason="BOUNDS_INVALID")

@@ -1,0 +1,108 @@
+"""The kind ``voxel_grid``: against slow interpolation, on the grid's borders, and far outside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.build import build_field
+from regnf_core.fields.description import parse_description
+from regnf_core.fields.safe_format import open_field, write_safe_field
+from tests.core.fields.grids import numeric_gradient, slow_trilinear
+
+ORIGIN, SPACING = np.array([-0.4, 0.2, 1.0]), np.array([0.1, 0.25, 0.05])
+VALUES = np.random.default_rng(5).normal(size=(5, 4, 6)).astype(np.float32)
+FAR = ORIGIN + SPACING * (np.array(VALUES.shape) - 1)
+
+
+def description(**changes: Any) -> dict[str, Any]:
+    values = {"family": "voxel_grid", "origin": ORIGIN.tolist(), "spacing": SPACING.tolist()}
+    return values | {"bounds": [ORIGIN.tolist(), FAR.tolist()]} | changes
+
+
+def field(values: NDArray[Any] = VALUES, **changes: Any) -> SdfField:
+    return build_field(parse_description(description(**changes)), {"values": torch.from_numpy(values)})
+
+
+def slow(point: NDArray[np.float64], sign: float = 1.0) -> float:
+    """The grid's value at a point, extended: the nearest point of the box, plus the way there."""
+    inside = np.clip(point, ORIGIN, FAR)
+    position = np.clip((inside - ORIGIN) / SPACING, 0.0, np.array(VALUES.shape) - 1.000000001)
+    within = slow_trilinear(lambda node: float(VALUES[node]), position)
+    return within + sign * float(np.linalg.norm(point - inside))
+
+
+def points(count: int, reach: float) -> NDArray[np.float64]:
+    """Points in the grid's box grown by ``reach`` on all sides, off the cells' borders."""
+    rng = np.random.default_rng(2)
+    drawn = ORIGIN - reach + rng.random((count, 3)) * (FAR - ORIGIN + 2 * reach)
+    return drawn[(np.abs((drawn - ORIGIN) / SPACING % 1.0 - 0.5) < 0.49).all(axis=1)]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("reach", [0.0, 0.7])
+def test_values_and_gradients_are_those_of_slow_interpolation(reach: float, sign: int) -> None:
+    where = points(150, reach)
+    value, gradient = field(sign=sign).signed_distance_and_gradient(torch.from_numpy(where))
+    expected = [sign * slow(point, sign) for point in where]
+    slopes = [sign * numeric_gradient(lambda p: slow(p, sign), point) for point in where]
+    np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=2e-5)
+    np.testing.assert_allclose(gradient.numpy(), slopes, rtol=0, atol=2e-3)
+
+
+def test_nodes_have_their_own_values_the_last_ones_too() -> None:
+    nodes = np.stack(np.meshgrid(*map(np.arange, VALUES.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    value = field().signed_distance(torch.from_numpy(ORIGIN + SPACING * nodes))
+    np.testing.assert_allclose(value.numpy(), VALUES.reshape(-1), rtol=0, atol=1e-5)
+
+
+def test_there_is_no_jump_at_the_box_and_none_beyond() -> None:
+    ray = np.linspace(FAR - 0.01, FAR + np.array([0.5, 0.1, 0.3]), 4000)
+    value = field().signed_distance(torch.from_numpy(ray)).numpy()
+    step = float(np.linalg.norm(ray[1] - ray[0]))
+    steepest = np.abs(np.diff(VALUES, axis=0)).max() / SPACING.min() * 3
+    assert np.abs(np.diff(value)).max() < step * (steepest + 1.0)
+    assert np.isfinite(field().signed_distance(torch.tensor([[1e8, -1e8, 1e8]])).numpy()).all()
+
+
+def test_half_precision_stays_half_and_is_evaluated_in_single(tmp_path: Path) -> None:
+    half = VALUES.astype(np.float16)
+    write_safe_field(tmp_path / "f", description(), {"values": half})
+    where = torch.from_numpy(points(50, 0.2))
+    opened = open_field(tmp_path / "f")
+    torch.testing.assert_close(
+        opened.signed_distance(where), field(half.astype(np.float32)).signed_distance(where), rtol=0, atol=0
+    )
+    torch.testing.assert_close(opened.to("cpu").signed_distance(where), opened.signed_distance(where))
+
+
+def test_world_scale_moves_the_grid_along() -> None:
+    where = torch.from_numpy(points(50, 0.3))
+    bounds = [(2.0 * ORIGIN).tolist(), (2.0 * FAR).tolist()]
+    scaled = field(world_scale=2.0, bounds=bounds).signed_distance(2.0 * where)
+    torch.testing.assert_close(scaled, 2.0 * field().signed_distance(where))
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros((4, 4), np.float32), np.zeros((1, 4, 4), np.float32), np.zeros((4, 4, 4), np.int32)]
+)
+def test_other_shapes_and_types_are_refused(tmp_path: Path, values: NDArray[Any]) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        write_safe_field(tmp_path / "f", description(), {"values": values})
+    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+@pytest.mark.parametrize(
+    "changes", [{"spacing": [0.1, 0.0, 0.1]}, {"spacing": [0.1, -0.1, 0.1]}, {"origin": [0.0, float("nan"), 0.0]}]
+)
+def test_faulty_placements_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        parse_description(description(**changes))
+    assert caught.value.reason == "SAFE_FORMAT_INVALID"
