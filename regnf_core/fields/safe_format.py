@@ -56,7 +56,9 @@ def write_safe_field(
         with open(temporary, "xb") as file:
             file.write(len(header).to_bytes(8, "little") + header)
             for name in order:
-                file.write(np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<")).data)
+                file.write(
+                    np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<"), copy=False).data
+                )
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, target)

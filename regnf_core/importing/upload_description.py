@@ -61,7 +61,7 @@ class UploadDescription:
     """Lowest and highest corner of the region where the field has meaning, in its own frame, after ``world_scale``."""
     world_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
     """Length, in the unit wanted, of one unit of the checkpoint's coordinates; distances scale with it."""
-    sign: Annotated[int, AfterValidator(_whole_sign)] | None = None
+    sign: Annotated[int, Ge(-1), Le(1), AfterValidator(_whole_sign)] | None = None
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
@@ -82,7 +82,8 @@ class UploadDescription:
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise FieldFormatError(f"description.{where}: {first['msg']}", reason="INVALID_DESCRIPTION") from error
+            message = first["msg"].removeprefix("Value error, ")
+            raise FieldFormatError(f"description.{where}: {message}", reason="INVALID_DESCRIPTION") from error
         except (TypeError, ValueError, RecursionError) as error:
             raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
 
