@@ -26,6 +26,7 @@ _STORED: dict[str, np.dtype[Any]] = {
 }
 _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
 _FINITE_CHUNK = 1 << 20
+_ALIGNMENT = 16
 _MAX_ELEMENTS = 1 << 60
 """What numpy can address at eight bytes each. It counts empty axes as ones: even an array of nothing has a limit."""
 
@@ -49,7 +50,8 @@ class Archive(Protocol):
 
 
 class TensorSource:
-    """Materialises tensors of one archive. Float32 tensors are views of the map; nothing else of the file is touched.
+    """Materialises tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
+    them; nothing else of the file is touched.
 
     ``budget`` caps the bytes of all tensors together, as float32.
     """
@@ -71,7 +73,7 @@ class TensorSource:
         self._spend(name, 4 * count)
         raw = self._storage(name, ref.storage, stored, count)
         _check_dense(name, ref, count)
-        values = _in_shape(np.frombuffer(raw, dtype=stored), ref)
+        values = _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
         if ref.storage.dtype == "bfloat16":
             values = (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
         return finite_float32(name, values)
@@ -157,6 +159,11 @@ def _check_dense(name: str, ref: TensorRef, count: int) -> None:
         expected *= extent
     if ref.offset:
         raise tensor_error(f"{name} begins at element {ref.offset} of its storage", "TENSOR_STORAGE_MISMATCH")
+
+
+def _aligned(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The array where wide loads may read it: torch crashes over the odd addresses that other writers' entries have."""
+    return flat.copy() if flat.ctypes.data % _ALIGNMENT else flat
 
 
 def _in_shape(flat: npt.NDArray[Any], ref: TensorRef) -> npt.NDArray[Any]:

@@ -14,7 +14,7 @@ EMPTY = "90"
 """Key of a storage without a byte."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Seeds:
     """A small checkpoint taken apart, the field file it becomes, and pickles of other kinds."""
 
