@@ -3,7 +3,7 @@
 Keys in use:
     fields/{sha256}/original               the upload, until its import has ended
     fields/{sha256}/field.safetensors      the safe field that workers open
-    fields/{sha256}/preview.png            a picture of it, when one could be made
+    fields/{sha256}/object-model-1.safetensors   what registrations know of it as an object, made by the first of them
     jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
     jobs/{id}/manifest.json                written last, atomically: the job's result is exactly what it lists
 """

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from regnf_core import __version__
@@ -16,12 +17,18 @@ from service.schemas.transforms import rows_of
 _ID_DIGITS = 32
 
 
-def canonical_request(question: Question, scene: str, object_: str) -> dict[str, Any]:
-    """What a worker reads from the job record: every default filled in, every spelling of a value made one."""
+def canonical_request(
+    question: Question, scene: str, object_: str | None, candidates: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """What a worker reads from the job record: every default filled in, every spelling of a value made one.
+
+    The order of candidates says nothing, so they are sorted.
+    """
     start, truth = question.initial_transform, question.ground_truth
     return {
         "scene": scene,
         "object": object_,
+        "candidates": None if candidates is None else sorted(candidates),
         "detection": question.detection.canonical(),
         "options": question.options.to_dict(),
         "seed": question.seed,

@@ -84,7 +84,12 @@ REASONS: dict[str, Reason] = {
     "INITIAL_TRANSFORM_UNSUPPORTED": Reason(
         422,
         "Initial transform unsupported",
-        "The preset `paper` makes its own first guess. Leave `initial_transform` out, or take the preset `robust`.",
+        "Only the preset `robust` starts from a given transform, and only with one `object`. Leave it out.",
+    ),
+    "LIBRARY_SEARCH_UNSUPPORTED": Reason(
+        422,
+        "Library search unsupported",
+        "The preset `paper` registers one object. Name it as `object`, or take the preset `robust`.",
     ),
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."

@@ -76,6 +76,8 @@ class FieldRecord:
     """Grows each time the import starts anew; fences off the writer of an older one."""
     requeues: int = 0
     """How often this upload was handed out again because its worker vanished."""
+    symmetry: dict[str, Any] | None = None
+    """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
 
 
 @dataclass(frozen=True)

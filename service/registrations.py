@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from service.boxes import boxes_overlap
@@ -21,29 +21,31 @@ def check_idempotency_key(key: str | None) -> None:
         raise Problem("INVALID_IDEMPOTENCY_KEY")
 
 
-def check_fields(services: Services, request: dict[str, Any], arriving: bool = False) -> None:
+def check_fields(services: Services, request: dict[str, Any], named: Mapping[str, str]) -> None:
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
-    ``arriving``: the fields' bytes are here and will be taken in next, so it is no fault that they are not held.
+    ``named`` are the fields that must be held, by where the request names them, a JSON Pointer.
     Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE.
     """
-    found = {name: services.records.get_field(request[name]) for name in ("scene", "object")}
-    if not arriving:
-        for name, record in found.items():
-            _require_usable(name, record)
-    bounds = _bounds(found["scene"])
+    _require_usable({pointer: services.records.get_field(sha256) for pointer, sha256 in named.items()})
+    bounds = _bounds(services.records.get_field(request["scene"]))
     box = request["detection"]
     if bounds is None or boxes_overlap(box["centre"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
         return
     raise Problem("DETECTION_OUTSIDE_SCENE", errors=[{"pointer": "/detection", "detail": "outside the scene's bounds"}])
 
 
-def _require_usable(name: str, record: FieldRecord | None) -> None:
-    if record is None:
-        raise Problem("FIELD_NOT_FOUND", errors=[{"pointer": f"/{name}", "detail": "no such field"}])
-    if record.state == "rejected":
-        why = str((record.error or {}).get("reason", "unknown"))
-        raise Problem("FIELD_REJECTED", errors=[{"pointer": f"/{name}", "detail": f"rejected: {why}"}])
+def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
+    missing = [{"pointer": pointer, "detail": "no such field"} for pointer, record in found.items() if record is None]
+    if missing:
+        raise Problem("FIELD_NOT_FOUND", errors=missing)
+    rejected = [
+        {"pointer": pointer, "detail": f"rejected: {(record.error or {}).get('reason', 'unknown')}"}
+        for pointer, record in found.items()
+        if record is not None and record.state == "rejected"
+    ]
+    if rejected:
+        raise Problem("FIELD_REJECTED", errors=rejected)
 
 
 def _bounds(scene: FieldRecord | None) -> tuple[Sequence[float], Sequence[float]] | None:
@@ -101,6 +103,7 @@ def _inputs(request: dict[str, Any]) -> dict[str, Any]:
     return {
         "scene": request["scene"],
         "object": request["object"],
+        "candidates": None if request["candidates"] is None else len(request["candidates"]),
         "detection": request["detection"],
         "seed": request["seed"],
         "initial_transform": request["initial_transform"],

@@ -12,7 +12,7 @@ _MOVES: dict[str, frozenset[str]] = {
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
 _CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker"})
-_CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes"})
+_CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes", "symmetry"})
 
 
 def _refuse_unknown(changes: dict[str, Any], allowed: frozenset[str]) -> None:
@@ -123,7 +123,9 @@ def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> 
 
 def uses_field(record: JobRecord, sha256: str) -> bool:
     """Whether the job reads this field."""
-    return sha256 in (record.request.get("scene"), record.request.get("object")) or sha256 in record.inputs.values()
+    request = record.request
+    named = (request.get("scene"), request.get("object"), *(request.get("candidates") or ()))
+    return sha256 in named or sha256 in record.inputs.values()
 
 
 def event_of(before: JobRecord | None, after: JobRecord) -> tuple[str, dict[str, object]] | None:

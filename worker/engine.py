@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -16,15 +16,52 @@ Importer = Callable[[Path, Path, dict[str, Any]], dict[str, Any]]
 """(upload, folder, description) -> report; writes folder/field.safetensors. Raises FieldFormatError."""
 
 
+Model = Any
+"""An object's model, of whatever kind the engine makes: only the engine looks inside."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One object of a search: its field's SHA-256, what opens the safe field file, and its model.
+
+    An object without a model is unusable, for ``fault``, a reason.
+    """
+
+    sha256: str
+    open: Callable[[], Path]
+    model: Model | None
+    fault: str | None = None
+
+
 class RegistrationEngine(Protocol):
-    """Registers two safe field files."""
+    """Registers safe field files. Everything may raise RegnfError."""
 
     def describe(self) -> dict[str, Any]:
         """Version and device, for the job's record."""
         ...
 
-    def register(self, scene: Path, object_: Path, request: dict[str, Any], report: Report, folder: Path) -> list[str]:
-        """Do what a canonical request asks for, artifacts into ``folder``; their names. Raises RegnfError."""
+    def register(
+        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        """Do what a canonical request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
+        ...
+
+    def search(
+        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        """The same for a request with candidates."""
+        ...
+
+    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+        """Write the model of a safe field as an object."""
+        ...
+
+    def read_model(self, path: Path) -> Model:
+        """A model that ``make_model`` wrote."""
+        ...
+
+    def symmetry(self, model: Model) -> dict[str, Any]:
+        """The object's symmetry as the contract shows it."""
         ...
 
 
@@ -44,7 +81,9 @@ class CoreEngine:
     def describe(self) -> dict[str, Any]:
         return {"version": __version__, "device": self.device}
 
-    def register(self, scene: Path, object_: Path, request: dict[str, Any], report: Report, folder: Path) -> list[str]:
+    def register(
+        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
         from regnf_core.box import OrientedBox
         from regnf_core.diagnostics import write_artifacts
         from regnf_core.fields.safe_format import open_field
@@ -60,11 +99,52 @@ class CoreEngine:
             request["seed"],
             report,
             Sim3.from_matrix(start) if start else None,
+            model,
         )
         report("exporting", 0.95)
         T_true = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
-        names: list[str] = write_artifacts(result, folder, truth=T_true)
+        names: list[str] = write_artifacts(result, folder, truth=T_true, object_name=request["object"])
         return names
+
+    def search(
+        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        from regnf_core.box import OrientedBox
+        from regnf_core.diagnostics import ranking_document, write_artifacts
+        from regnf_core.fields.safe_format import open_field
+        from regnf_core.library import LibraryObject, search_library
+
+        def opener(one: Candidate) -> Callable[[], Any]:
+            return lambda: open_field(one.open(), self.device)
+
+        unusable = {one.sha256: one.fault for one in candidates if one.fault is not None}
+        found = search_library(
+            open_field(scene, self.device),
+            OrientedBox.from_quaternion(**request["detection"]),
+            [LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None],
+            RegistrationOptions.from_dict(request["options"]),
+            request["seed"],
+            report,
+        )
+        report("exporting", 0.95)
+        winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
+        names: list[str] = write_artifacts(found.result, folder, object_name=winner, candidates=ranking)
+        return names
+
+    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+        from regnf_core.fields.safe_format import open_field
+        from regnf_core.library import model_object, write_object_model
+
+        robust = RegistrationOptions.from_dict(options).robust
+        write_object_model(target, model_object(open_field(field, self.device), robust))
+
+    def read_model(self, path: Path) -> Model:
+        from regnf_core.library import read_object_model
+
+        return read_object_model(path)
+
+    def symmetry(self, model: Model) -> dict[str, Any]:
+        return asdict(model.symmetry.group())
 
 
 def core_importer(limits: ImportLimits) -> Importer:

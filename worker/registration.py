@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from redis.exceptions import RedisError
 
-from regnf_core.errors import CancelledError, InvalidInputError, RegnfError
+from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts
 from worker.context import Context
-from worker.engine import RegistrationEngine
+from worker.engine import Candidate, RegistrationEngine
+from worker.fields import Fields, FieldsNotReadyError
+from worker.models import ObjectModels
 from worker.patience import patiently
 from worker.problems import fault, new_incident, problem
 from worker.pulse import Pulse
 
-_FIELD_POLL_S = 0.2
-_WAIT_BEFORE_GIVING_BACK_S = 20.0
 logger = logging.getLogger(__name__)
-
-
-class FieldsNotReadyError(Exception):
-    """A field is still being imported; whoever waits longer should let somebody else use the worker."""
 
 
 def run_attempt(
@@ -97,11 +92,13 @@ def _work(context: Context, record: JobRecord, make_engine: Callable[[], Registr
     """The job's result, standing. Raises whatever kept it from standing."""
     request = record.request
     with ExitStack() as stack:
-        scene, object_ = (stack.enter_context(_field(context, request[name], pulse)) for name in ("scene", "object"))
+        fields = Fields(context, pulse, stack)
+        scene = fields.ready(request["scene"])
+        objects = [fields.ready(sha256) for sha256 in request.get("candidates") or [request["object"]]]
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
         engine = make_engine()
         _update(context, record.id, record.attempt, engine=engine.describe())
-        names = engine.register(scene, object_, request, pulse.report, folder)
+        names = _register(context, engine, request, fields, scene, objects, pulse, folder)
         pulse.confirm()
         manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)
     pulse.confirm()
@@ -112,31 +109,37 @@ def _work(context: Context, record: JobRecord, make_engine: Callable[[], Registr
     return standing
 
 
-@contextmanager
-def _field(context: Context, sha256: str, pulse: Pulse) -> Iterator[Path]:
-    """The safe field file, once its import has ended.
+def _register(
+    context: Context,
+    engine: RegistrationEngine,
+    request: dict[str, Any],
+    fields: Fields,
+    scene: FieldRecord,
+    objects: Sequence[FieldRecord],
+    pulse: Pulse,
+    folder: Path,
+) -> list[str]:
+    """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
+    options, scene_file = request["options"], fields.file(scene.sha256)
+    if request.get("candidates"):
+        models = ObjectModels(context, engine, options, folder)
+        candidates = [_candidate(models, one, fields, pulse) for one in objects]
+        if all(one.model is None for one in candidates):
+            raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+        return engine.search(scene_file, candidates, request, pulse.report, folder)
+    (one,) = objects
+    object_file, model = fields.file(one.sha256), None
+    if options.get("preset") == "robust":
+        model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
+    return engine.register(scene_file, object_file, model, request, pulse.report, folder)
 
-    Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
-    """
-    deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
-    while (field := _usable(context, sha256)).state == "validating":
-        pulse.check()
-        if time.monotonic() > deadline:
-            raise FieldsNotReadyError(sha256)
-        time.sleep(_FIELD_POLL_S)
-    with context.blobs.local_copy(f"fields/{field.sha256}/field.safetensors") as path:
-        yield path
 
-
-def _usable(context: Context, sha256: str) -> FieldRecord:
-    field = context.records.get_field(sha256)
-    if field is None:
-        raise InvalidInputError(f"field {sha256} was deleted", reason="FIELD_NOT_FOUND")
-    if field.state == "rejected":
-        why = (field.error or {}).get("reason", "unknown")
-        raise InvalidInputError(f"field {sha256} was rejected: {why}", reason="FIELD_REJECTED")
-    settings = context.settings
-    longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
-    if field.state == "validating" and context.records.now() - field.updated > longest:
-        raise InvalidInputError(f"field {sha256} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
-    return field
+def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, pulse: Pulse) -> Candidate:
+    """One candidate with its model; one that is no object is unusable, not the end of the search."""
+    pulse.report("loading", 0.0)
+    sha256 = field.sha256
+    try:
+        model = models.of(field, lambda: fields.file(sha256))
+    except (NoSurfaceError, InvalidInputError) as error:
+        return Candidate(sha256, lambda: fields.file(sha256), None, error.reason)
+    return Candidate(sha256, lambda: fields.file(sha256), model)

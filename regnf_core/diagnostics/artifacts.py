@@ -30,9 +30,16 @@ _ALWAYS = (
 
 
 def write_artifacts(
-    result: RegistrationResult, directory: Path, truth: Sim3 | None = None, symmetries: Symmetries | None = None
+    result: RegistrationResult,
+    directory: Path,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    object_name: str | None = None,
+    candidates: list[dict[str, Any]] | None = None,
 ) -> list[str]:
     """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
+
+    ``truth``, ``symmetries``, ``object_name`` and ``candidates`` are for the result document.
 
     scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, coloured by
     source), context_points.ply (the scene round the detection, where the result has it), residuals.npz,
@@ -53,7 +60,9 @@ def write_artifacts(
     _write_json(directory / "trace.json", trace_document(result.trace))
     np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
     preview(result).save(directory / "preview.png")
-    _write_json(directory / "result.json", result_document(result, truth, symmetries, scene.points.device))
+    device = scene.points.device
+    document = result_document(result, truth, symmetries, device, object_name=object_name, candidates=candidates)
+    _write_json(directory / "result.json", document)
     return names
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,16 +18,23 @@ from regnf_core.sim3 import Sim3
 from regnf_core.symmetry import Symmetries
 from regnf_core.verdicts import VERDICT_REASONS
 
+if TYPE_CHECKING:
+    from regnf_core.library import Candidate
+
 
 def result_document(
     result: RegistrationResult,
     truth: Sim3 | None = None,
     symmetries: Symmetries | None = None,
     device: torch.device | str = "cpu",
+    *,
+    object_name: str | None = None,
+    candidates: list[dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
 
     ``symmetries`` are the object's: rotation error and MSSD are the least over them. ``device`` is where it ran.
+    ``object_name`` says whose pose it is, and ``candidates``, of :func:`ranking_document`, among which it was found.
     """
     metrics = dict(result.metrics)
     if truth is not None:
@@ -42,6 +50,8 @@ def result_document(
         **_covariance(result.covariance),
         "symmetry": None if result.symmetry is None else asdict(result.symmetry),
         "metrics": {name: _json_number(value) for name, value in metrics.items()},
+        "object": object_name,
+        "candidates": candidates,
         "seed": result.seed,
         "options": result.options,
         "engine": {
@@ -51,6 +61,23 @@ def result_document(
             "torch": torch.__version__,
         },
     }
+
+
+def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) -> list[dict[str, Any]]:
+    """A search's candidates as plain values, the likeliest first, then those ``unusable``: their names and reasons."""
+    ranked: list[dict[str, Any]] = [
+        {
+            "object": one.name,
+            "stage": one.stage,
+            "score": _json_number(one.score),
+            "verdict": one.verdict,
+            "verdict_reason": one.verdict_reason,
+            "T_object_scene": None if one.T_object_scene is None else one.T_object_scene.to_dict(),
+        }
+        for one in ranking
+    ]
+    nothing = {"stage": "unusable", "score": None, "verdict": None, "T_object_scene": None}
+    return ranked + [{"object": name, **nothing, "verdict_reason": reason} for name, reason in unusable.items()]
 
 
 def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:

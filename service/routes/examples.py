@@ -6,6 +6,7 @@ from typing import Any
 
 SCENE = "a3" * 32
 OBJECT = "7c" * 32
+OTHER = "e1" * 32
 
 REGISTER_EXAMPLES: dict[str, Any] = {
     "shortest": {
@@ -39,6 +40,14 @@ REGISTER_EXAMPLES: dict[str, Any] = {
             "object": OBJECT,
             "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
             "options": {"preset": "paper", "sampling": {"views": 8}, "optimisation": {"iterations": 300}},
+        },
+    },
+    "library search": {
+        "summary": "Which of these objects is it, and where?",
+        "value": {
+            "scene": SCENE,
+            "candidates": [OBJECT, OTHER],
+            "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
         },
     },
     "warm start": {

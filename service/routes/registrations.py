@@ -74,6 +74,7 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INVALID_OPTIONS",
             "INVALID_TRANSFORM",
             "INITIAL_TRANSFORM_UNSUPPORTED",
+            "LIBRARY_SEARCH_UNSUPPORTED",
             "FIELD_REJECTED",
             "DETECTION_OUTSIDE_SCENE",
             "IDEMPOTENCY_KEY_REUSED",
@@ -135,8 +136,12 @@ async def _by_reference(request: Request, services: Services) -> dict[str, Any]:
     settings = services.settings
     text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
     question = read_model(RegisterRequest, text)
-    asked = canonical_request(question, question.scene, question.object)
-    await off_loop(check_fields, services, asked)
+    asked = canonical_request(question, question.scene, question.object, question.candidates)
+    named = {"/scene": question.scene}
+    if question.object is not None:
+        named["/object"] = question.object
+    named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(question.candidates or ())}
+    await off_loop(check_fields, services, asked, named)
     return asked
 
 
@@ -155,7 +160,7 @@ async def _one_shot(request: Request, services: Services, keep: bool) -> dict[st
         question = read_model(Question, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
         asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
-        await off_loop(check_fields, services, asked, True)
+        await off_loop(check_fields, services, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():
                 await take_in(services, upload, received[name])

@@ -9,6 +9,7 @@ from pydantic import Field
 from regnf_core.importing.upload_description import UploadDescription
 from service.records import FieldRecord
 from service.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem, rfc3339
+from service.schemas.results import SymmetryDocument
 
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
@@ -25,6 +26,9 @@ class FieldDocument(Outgoing):
     label: str | None = None
     description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
     report: dict[str, Any] = Field({}, description="What the import found: family, bounds, parameters, plausibility.")
+    symmetry: SymmetryDocument | None = Field(
+        None, description="The object's own, found by the first job that registers the field as an object."
+    )
     error: ProblemDocument | None = Field(None, description="Why the field was rejected.")
     created_at: str
     updated_at: str
@@ -47,6 +51,7 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "label": record.label,
         "description": record.description,
         "report": record.report,
+        "symmetry": record.symmetry,
         "error": outgoing_problem(record.error),
         "created_at": rfc3339(record.created),
         "updated_at": rfc3339(record.updated),

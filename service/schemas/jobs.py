@@ -31,7 +31,8 @@ class JobDocument(Outgoing):
     finished_at: str | None = None
     expires_at: str | None = Field(None, description="When a finished job and its artifacts will be gone.")
     inputs: dict[str, Any] = Field(
-        description="scene, object, detection, seed, initial_transform, and the SHA-256 of the full options."
+        description="scene, object or the number of candidates, detection, seed, initial_transform, and the SHA-256 of "
+        "the full options."
     )
     engine: dict[str, Any] = Field({}, description="Version and device.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")

@@ -8,7 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from service.problems import Problem, json_pointer
 from service.schemas.detections import SPELLINGS as BOX_SPELLINGS
-from service.schemas.registrations import START_UNSUPPORTED
+from service.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
 from service.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
 from service.strict_json import parse_json
 
@@ -18,7 +18,10 @@ _REASONS = {
     "initial_transform": "INVALID_TRANSFORM",
     "ground_truth": "INVALID_TRANSFORM",
 }
-_REASONS_OF_FAULTS = {START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED"}
+_REASONS_OF_FAULTS = {
+    START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED",
+    SEARCH_UNSUPPORTED: "LIBRARY_SEARCH_UNSUPPORTED",
+}
 _SPELLINGS = BOX_SPELLINGS | TRANSFORM_SPELLINGS
 _Model = TypeVar("_Model")
 

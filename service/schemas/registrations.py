@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from regnf_core.options import RegistrationOptions
@@ -13,6 +21,8 @@ from service.schemas.detections import Detection
 from service.schemas.transforms import Similarity
 
 START_UNSUPPORTED = "initial_transform_unsupported"
+SEARCH_UNSUPPORTED = "library_search_unsupported"
+_MOST_CANDIDATES = 512
 
 
 class FieldReference(Incoming):
@@ -26,6 +36,23 @@ def _bare_reference(value: Any) -> Any:
 
 
 Reference = Annotated[Sha256, BeforeValidator(_bare_reference, json_schema_input_type=Sha256 | FieldReference)]
+
+
+def _given(value: Any) -> Any:
+    if value is None:
+        raise ValueError("leave it out, or name something")
+    return value
+
+
+def _distinct(names: list[str]) -> list[str]:
+    if len(set(names)) < len(names):
+        raise ValueError("a field is named twice")
+    return names
+
+
+Candidates = Annotated[
+    list[Reference], Field(min_length=1, max_length=_MOST_CANDIDATES, json_schema_extra={"uniqueItems": True})
+]
 
 
 class GroundTruth(Incoming):
@@ -56,11 +83,48 @@ class Question(Incoming):
         return start
 
 
+def _one_of_both(schema: dict[str, Any]) -> None:
+    schema["oneOf"] = [{"required": ["object"]}, {"required": ["candidates"]}]
+    for name in ("object", "candidates"):
+        schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
+
+
 class RegisterRequest(Question):
-    """One registration: which scene, where in it, and which object to lay onto it."""
+    """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
+
+    model_config = ConfigDict(json_schema_extra=_one_of_both)
 
     scene: Reference = Field(description="The scene's field.")
-    object: Reference = Field(description="The library object's field.")
+    object: Annotated[Reference | None, BeforeValidator(_given, json_schema_input_type=Sha256 | FieldReference)] = (
+        Field(None, description="The library object's field.")
+    )
+    candidates: Annotated[
+        Candidates | None, AfterValidator(_distinct), BeforeValidator(_given, json_schema_input_type=Candidates)
+    ] = Field(
+        None,
+        description="Instead of `object`: the fields of a library. The likeliest is found and registered by the preset "
+        "`robust`, and the result ranks them.",
+    )
+
+    @field_validator("candidates")
+    @classmethod
+    def _can_be_searched(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
+        if names is None:
+            return None
+        options = info.data.get("options")
+        if options is not None and options.preset != "robust":
+            raise PydanticCustomError(SEARCH_UNSUPPORTED, "only the preset `robust` searches a library")
+        if info.data.get("initial_transform") is not None:
+            raise PydanticCustomError(START_UNSUPPORTED, "a search of a library starts from no given transform")
+        if info.data.get("ground_truth") is not None:
+            raise ValueError("a ground truth is of one object, not of several candidates")
+        return names
+
+    @model_validator(mode="after")
+    def _asks_for_one_or_several(self) -> RegisterRequest:
+        if (self.object is None) == (self.candidates is None):
+            raise ValueError("exactly one of `object` and `candidates` must be given")
+        return self
 
 
 class DryRunDocument(Outgoing):

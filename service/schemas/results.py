@@ -48,6 +48,20 @@ class SymmetryDocument(Outgoing):
     continuous: bool = Field(description="Whether every turn about the axis is one.")
 
 
+class CandidateDocument(Outgoing):
+    """What a search found out about one object of a library."""
+
+    object: str = Field(description="SHA-256 of its field.")
+    stage: Literal["refined", "coarse", "signature", "unusable"] = Field(
+        description="How far it came: refined on its field and judged, searched coarsely, compared by signature alone; "
+        "or unusable as an object."
+    )
+    score: float | None = Field(description="0..1, smaller is better; to be compared within one stage.")
+    verdict: Verdict | None = Field(None, description="Of refined ones.")
+    verdict_reason: str | None = Field(None, description="Of refined and unusable ones.")
+    T_object_scene: TransformDocument | None = Field(None, description="Of refined ones.")
+
+
 class ArtifactEntry(Outgoing):
     """One file that the job wrote."""
 
@@ -78,6 +92,10 @@ class ResultDocument(Outgoing):
     uncertainty: UncertaintyDocument | None = None
     symmetry: SymmetryDocument | None = Field(None, description="The object's own; null from the preset `paper`.")
     metrics: dict[str, float | None] = Field({})
+    object: str | None = Field(None, description="SHA-256 of the object's field; of a search, of the likeliest's.")
+    candidates: list[CandidateDocument] | None = Field(
+        None, description="All candidates of a search, the likeliest first; null for one object."
+    )
     seed: int = 0
     options: dict[str, Any] = Field({}, description="Every option that was used, defaults included.")
     engine: dict[str, Any] = Field({}, description="Name, version, device.")

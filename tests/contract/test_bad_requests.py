@@ -178,6 +178,59 @@ def test_the_published_method_takes_no_initial_transform(world: World) -> None:
     assert [entry["pointer"] for entry in problem["errors"]] == ["/initial_transform"]
 
 
+def searching(world: World, **changes: Any) -> dict[str, Any]:
+    """A good search among one object, with changes; a member that is `...` is left out."""
+    request = world.valid_request()
+    body = {"scene": request["scene"], "detection": BOX, "candidates": [request["object"]]} | changes
+    return {name: value for name, value in body.items() if value is not ...}
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer"),
+    [
+        ({"candidates": ...}, ""),
+        ({"object": "7c" * 32}, ""),
+        ({"candidates": []}, "/candidates"),
+        ({"candidates": None}, "/candidates"),
+        ({"candidates": "a3" * 32}, "/candidates"),
+        ({"candidates": ["a3" * 32, "A" * 64]}, "/candidates/1"),
+        ({"candidates": ["a3" * 32, None]}, "/candidates/1"),
+        ({"candidates": [["a3" * 32]]}, "/candidates/0"),
+        ({"candidates": ["a3" * 32, "7c" * 32, "a3" * 32]}, "/candidates"),
+        ({"candidates": ["a3" * 32, {"field": "a3" * 32}]}, "/candidates"),
+        ({"candidates": [f"{number:064x}" for number in range(513)]}, "/candidates"),
+        ({"ground_truth": matrix()}, "/candidates"),
+    ],
+)
+def test_candidates(world: World, change: dict[str, Any], pointer: str) -> None:
+    problem = assert_refused(post(world, searching(world, **change)), 422, "INVALID_REQUEST")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+def test_candidates_that_are_not_there_are_named_by_their_place(world: World) -> None:
+    known = world.valid_request()["object"]
+    names = ["a3" * 32, known, "7c" * 32]
+    problem = assert_refused(post(world, searching(world, candidates=names)), 404, "FIELD_NOT_FOUND")
+    assert [entry["pointer"] for entry in problem["errors"]] == ["/candidates/0", "/candidates/2"]
+    assert_refused(post(world, searching(world, candidates=[known], scene="a3" * 32)), 404, "FIELD_NOT_FOUND")
+
+
+def test_a_rejected_candidate_is_refused(world: World) -> None:
+    rejected = world.rejected_field("broken")
+    names = [world.valid_request()["object"], rejected]
+    problem = assert_refused(post(world, searching(world, candidates=names)), 422, "FIELD_REJECTED")
+    assert [entry["pointer"] for entry in problem["errors"]] == ["/candidates/1"]
+
+
+def test_the_published_method_searches_no_library(world: World) -> None:
+    body = searching(world, options={"preset": "paper"})
+    assert_refused(post(world, body), 422, "LIBRARY_SEARCH_UNSUPPORTED")
+
+
+def test_a_search_starts_from_no_given_transform(world: World) -> None:
+    assert_refused(post(world, searching(world, initial_transform=IDENTITY)), 422, "INITIAL_TRANSFORM_UNSUPPORTED")
+
+
 def test_of_an_unusable_preset_and_an_initial_transform_the_preset_is_refused(world: World) -> None:
     body = world.valid_request() | {"initial_transform": IDENTITY, "options": {"preset": "fastest"}}
     assert_refused(post(world, body), 422, "INVALID_OPTIONS")

@@ -116,6 +116,34 @@ def test_the_usual_preset_over_the_wire_and_a_second_look_from_its_result(
     assert again["T_object_scene"]["scale"] == pytest.approx(result["T_object_scene"]["scale"], rel=0.01)
 
 
+def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learnt(
+    client: httpx.Client, fields: dict[str, str], live: Live
+) -> None:
+    data = (DATA / "dining-chair.safetensors").read_bytes()
+    client.put(f"/fields/{sha256(data)}", content=data)
+    names = [fields["object"], sha256(data)]
+    body = {"scene": fields["scene"], "detection": json.loads((DATA / "detection.json").read_text())}
+    answer = client.post("/register", json=body | {"candidates": names})
+    assert answer.status_code == 202, answer.text
+    job = finished(client, answer.json()["id"])
+    assert job["status"] == "successful", job
+    result = client.get(job["links"]["result"]).json()
+    validator("ResultDocument").validate(result)
+    assert (result["verdict"], result["object"]) == ("registered", fields["object"])
+    assert sorted(one["object"] for one in result["candidates"]) == sorted(names)
+    first = result["candidates"][0]
+    assert (first["stage"], first["T_object_scene"]) == ("refined", result["T_object_scene"])
+    for name in names:
+        field = client.get(f"/fields/{name}").json()
+        validator("FieldDocument").validate(field)
+        assert field["symmetry"]["order"] == 1
+        assert f"fields/{name}/object-model-1.safetensors" in live.files()
+    alone = finished(client, submit(client, fields, options={}, seed=5).json()["id"])
+    assert client.get(alone["links"]["result"]).json()["object"] == fields["object"]
+    assert client.delete(f"/fields/{sha256(data)}").status_code == 204
+    assert not any(sha256(data) in path for path in live.files())
+
+
 def test_a_box_in_empty_space_fails_with_its_own_problem(client: httpx.Client, fields: dict[str, str]) -> None:
     upper = client.get(f"/fields/{fields['scene']}").json()["report"]["bounds"][1]
     corner = {"min": [high - 0.02 for high in upper], "max": [high - 0.01 for high in upper]}

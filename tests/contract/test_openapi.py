@@ -16,7 +16,7 @@ from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 from regnf_core.options import RobustOptions
 from regnf_core.verdicts import VERDICT_REASONS
 from service.reasons import REASONS
-from service.routes.examples import OBJECT, REGISTER_EXAMPLES, SCENE
+from service.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, SCENE
 from tests.contract.world import World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,7 +102,7 @@ def register_example_fields(world: World) -> None:
     from service.records import FieldRecord
 
     now = world.records.now()
-    for sha in (SCENE, OBJECT):
+    for sha in (SCENE, OBJECT, OTHER):
         world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
         world.records.update_field(sha, attempt=1, state="ready", report={"bounds": [[-1, -1, -1], [1, 1, 1]]})
 
@@ -152,9 +152,14 @@ def test_bad_requests_are_bad_by_the_contract_too() -> None:
         {"scene": "x"},
         {"detection": {}},
         {"options": {"unknown": 1}},
+        {"candidates": [OTHER]},
+        {"object": None},
     ]
     for change in changes:
         assert list(validator("RegisterRequest").iter_errors(good | change)), change
+    for members in ({}, {"candidates": [OBJECT, OBJECT]}, {"candidates": []}, {"candidates": None}):
+        search = {"scene": SCENE, "detection": good["detection"], **members}
+        assert list(validator("RegisterRequest").iter_errors(search)), members
 
 
 def test_the_documents_list_every_reason_and_address() -> None:

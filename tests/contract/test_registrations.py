@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from service.records import FieldRecord
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 
 
@@ -38,14 +39,8 @@ def test_the_record_holds_the_canonical_request(world: World) -> None:
     assert record.request["options"]["optimisation"]["iterations"] == 200
     assert (record.request["seed"], record.request["ground_truth"]) == (0, None)
     assert set(record.request) == {
-        "scene",
-        "object",
-        "detection",
-        "options",
-        "seed",
-        "initial_transform",
-        "ground_truth",
-    }
+        "scene", "object", "candidates", "detection", "options", "seed", "initial_transform", "ground_truth",
+    }  # fmt: skip
 
 
 def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
@@ -92,6 +87,65 @@ def test_a_results_own_transform_is_a_start_and_a_truth(world: World) -> None:
 
 def test_no_start_is_the_same_as_none(world: World) -> None:
     assert post(world).json()["id"] == post(world, initial_transform=None).json()["id"]
+
+
+def library(world: World, *names: str) -> dict[str, Any]:
+    """A search among these objects, uploading them the first time."""
+    request = world.valid_request()
+    del request["object"]
+    for name in names:
+        if world.records.get_field(sha256(field_bytes(name))) is None:
+            world.ready_field(name)
+    return request | {"candidates": [sha256(field_bytes(name)) for name in names]}
+
+
+def test_a_search_is_a_job_like_any_other(world: World) -> None:
+    answer = world.client.post("/register", json=library(world, "chair", "table"))
+    assert answer.status_code == 202, answer.text
+    job = answer.json()
+    assert (job["inputs"]["object"], job["inputs"]["candidates"]) == (None, 2)
+    record = world.records.get_job(job["id"])
+    assert record is not None
+    assert record.request["object"] is None
+    assert record.request["candidates"] == sorted(sha256(field_bytes(name)) for name in ("chair", "table"))
+
+
+def test_the_order_of_candidates_and_their_spelling_say_nothing(world: World) -> None:
+    request = library(world, "chair", "table", "can")
+    spelled = [{"field": sha} for sha in reversed(request["candidates"])]
+    ids = [
+        world.client.post("/register", json=request | {"candidates": names}).json()["id"]
+        for names in (request["candidates"], spelled)
+    ]
+    assert ids[0] == ids[1]
+    fewer = request | {"candidates": request["candidates"][:2]}
+    assert world.client.post("/register", json=fewer).json()["id"] != ids[0]
+
+
+def test_a_search_among_one_is_not_its_registration(world: World) -> None:
+    request = library(world, "chair")
+    alone = {name: value for name, value in request.items() if name != "candidates"}
+    alone["object"] = request["candidates"][0]
+    ids = {world.client.post("/register", json=body).json()["id"] for body in (request, alone)}
+    assert len(ids) == 2
+
+
+def test_as_many_candidates_as_are_allowed(world: World) -> None:
+    now = world.records.now()
+    names = [f"{number:064x}" for number in range(512)]
+    for sha in names:
+        world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
+    assert world.client.post("/register", json=library(world) | {"candidates": names}).status_code == 202
+
+
+def test_candidates_are_in_use_while_the_job_is_active(world: World) -> None:
+    request = library(world, "chair", "table")
+    job_id = world.client.post("/register", json=request).json()["id"]
+    for sha in request["candidates"]:
+        assert_refused(world.client.delete(f"/fields/{sha}"), 409, "FIELD_IN_USE")
+    world.client.post(f"/jobs/{job_id}/cancel")
+    for sha in request["candidates"]:
+        assert world.client.delete(f"/fields/{sha}").status_code == 204
 
 
 def test_what_differs_in_anything_is_another_job(world: World) -> None:

@@ -13,9 +13,10 @@ import torch
 import trimesh
 from PIL import Image
 
-from regnf_core.diagnostics import result_document, write_artifacts
+from regnf_core.diagnostics import ranking_document, result_document, write_artifacts
 from regnf_core.diagnostics.preview import residual_colours
 from regnf_core.diagnostics.splats import Surfels, View, render
+from regnf_core.library import Candidate
 from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.sim3 import Sim3
 from regnf_core.verdicts import VERDICT_REASONS
@@ -60,6 +61,8 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
         "uncertainty",
         "symmetry",
         "metrics",
+        "object",
+        "candidates",
         "seed",
         "options",
         "engine",
@@ -102,6 +105,22 @@ def test_what_is_no_variance_has_no_deviation(chair_run: ChairRun) -> None:
     assert document["uncertainty"]["translation"] == [None, 1.0, 1.0]
     assert document["uncertainty"]["scale_percent"] is None
     assert document["covariance"][1][1] is None
+
+
+def test_a_ranking_is_told_with_what_is_unusable_last() -> None:
+    ranking = [
+        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity()),
+        Candidate("stool", "coarse", math.inf),
+    ]
+    chair, stool, air = json.loads(json.dumps(ranking_document(ranking, {"air": "NO_SURFACE_IN_OBJECT"})))
+    assert chair["T_object_scene"]["matrix"] == np.eye(4).tolist()
+    assert (chair["object"], chair["verdict"], chair["verdict_reason"]) == ("chair", "registered", "SURFACES_AGREE")
+    assert stool == {
+        "object": "stool", "stage": "coarse", "score": None, "verdict": None, "verdict_reason": None,
+        "T_object_scene": None,
+    }  # fmt: skip
+    assert (air["object"], air["stage"], air["verdict_reason"]) == ("air", "unusable", "NO_SURFACE_IN_OBJECT")
+    assert set(air) == set(stool)
 
 
 def test_the_objects_symmetry_is_told(chair_run: ChairRun) -> None:

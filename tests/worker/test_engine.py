@@ -15,6 +15,7 @@ REQUEST: dict[str, Any] = {
     "detection": {"centre": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 1]},
     "options": RegistrationOptions().to_dict(),
     "seed": 3,
+    "object": "b" * 64,
 }
 
 
@@ -23,11 +24,12 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
-    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, truth: ["result.json"])
+    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, **said: ["result.json"])
     request = REQUEST | {"initial_transform": start, "ground_truth": None}
-    names = CoreEngine("cpu").register(Path("scene"), Path("object"), request, lambda phase, share: None, tmp_path)
-    ((scene, obj, box, options, seed, _, given),) = calls
-    assert (scene, obj, seed, names) == ("scene", "object", 3, ["result.json"])
+    files = Path("scene"), Path("object")
+    names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path)
+    ((scene, obj, box, options, seed, _, given, model),) = calls
+    assert (scene, obj, seed, model, names) == ("scene", "object", 3, "the model", ["result.json"])
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
     assert (None if given is None else given.matrix().tolist()) == start
@@ -36,5 +38,5 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
 def test_requests_recorded_before_there_were_starts_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: None)
-    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, truth: [])
-    assert CoreEngine("cpu").register(Path("s"), Path("o"), REQUEST, lambda phase, share: None, tmp_path) == []
+    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, **said: [])
+    assert CoreEngine("cpu").register(Path("s"), Path("o"), None, REQUEST, lambda phase, share: None, tmp_path) == []

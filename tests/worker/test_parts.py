@@ -128,7 +128,7 @@ def test_fields_that_are_still_imported_send_the_job_back(context: Context, monk
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    monkeypatch.setattr("worker.registration._WAIT_BEFORE_GIVING_BACK_S", 0.0)
+    monkeypatch.setattr("worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
     assert isinstance(context.queue, InMemoryJobQueue)

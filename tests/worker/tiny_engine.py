@@ -25,7 +25,9 @@ class TinyEngine:
     def describe(self) -> dict[str, Any]:
         return {"version": "tiny", "device": "none"}
 
-    def register(self, scene: Path, object_: Path, request: dict[str, Any], report: Report, folder: Path) -> list[str]:
+    def register(
+        self, scene: Path, object_: Path, model: Any, request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
         report("sampling", 0.1)
         (folder / "half-written").write_bytes(b".")
         getattr(self, request["options"]["do"])(report)
@@ -33,6 +35,14 @@ class TinyEngine:
         (folder / "result.json").write_text(json.dumps({"pid": os.getpid()}))
         (folder / "aligned.ply").write_bytes(scene.read_bytes() + object_.read_bytes())
         return ["result.json", "aligned.ply"]
+
+    def search(self, *_: Any) -> list[str]:
+        raise AssertionError("no job here has candidates")
+
+    def make_model(self, *_: Any) -> None:
+        raise AssertionError("no job here names a preset")
+
+    read_model = symmetry = make_model
 
     def succeed(self, report: Report) -> None:
         report("optimising", 0.5)
