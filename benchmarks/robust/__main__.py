@@ -15,7 +15,19 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch loads
 
-from benchmarks.robust import boxes, covariance, one_view, orientations, pairs, scales, symmetry, wrong_objects
+from benchmarks.robust import (
+    boxes,
+    covariance,
+    evaluator,
+    library,
+    one_view,
+    orientations,
+    pairs,
+    scales,
+    speed,
+    symmetry,
+    wrong_objects,
+)
 from benchmarks.robust.report import write
 from benchmarks.robust.runs import Context
 
@@ -30,6 +42,9 @@ TABLES = {
         wrong_objects,
         symmetry,
         covariance,
+        speed,
+        evaluator,
+        library,
     )
 }
 

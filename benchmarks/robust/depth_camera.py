@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from benchmarks.robust.one_view_field import Array, DepthImage, directions
 
-PIXELS = 360
+PIXELS = 320
 REACH = float(np.tan(np.radians(35.0)))
 _NOISE_PIXELS = 2.0
 

@@ -17,6 +17,8 @@ DEFINITION = (
     "Success: `registered` with MSSD (least over the object's true symmetries) at most 5 % of the object's diameter, "
     "or `ambiguous` with such a pose among those listed."
 )
+_POINTS = 2000
+"""Surface points, about, that the errors are taken over."""
 _ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale_error_share", "add_s_share")
 _METRICS = (
     "score",
@@ -36,6 +38,7 @@ def judge(result: RegistrationResult, truth: Sim3 | None, symmetries: Symmetries
     errors: dict[str, float] = {}
     if truth is not None:
         points = result.object_samples.points
+        points = points[:: max(1, len(points) // _POINTS)]
         all_errors = [errors_against_truth(pose, truth, points, symmetries) for pose in poses]
         best = min(all_errors, key=lambda one: one["mssd_share"])
         errors = {name: best[name] for name in _ERRORS}

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Array = NDArray[np.float64]
+_LONGEST = 0.04
+"""Longest edge of a triangle, shares of the greatest depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,8 @@ class OneViewField:
     def __init__(self, image: DepthImage, bounds: Tensor) -> None:
         self.image = image
         self.bounds = bounds
-        self.vertices, self.faces = triangles(image)
+        # A search tree is slow over the long slivers along the lines of sight.
+        self.vertices, self.faces = with_short_edges(*triangles(image), _LONGEST * float(image.depth.max()))
         self._tree = igl.AABB()
         self._tree.init(self.vertices, self.faces)
 
@@ -108,6 +111,22 @@ def triangles(image: DepthImage) -> tuple[Array, NDArray[np.int64]]:
     faces.append(np.stack([camera, np.roll(border, -1), border], axis=-1))
     vertices = np.concatenate([image.points().reshape(-1, 3), image.position[None]])
     return vertices, np.concatenate(faces).astype(np.int64)
+
+
+def with_short_edges(vertices: Array, faces: NDArray[np.int64], longest: float) -> tuple[Array, NDArray[np.int64]]:
+    """The same surface, triangles halved across their longest edge until none is longer than ``longest``."""
+    while True:
+        corners = vertices[faces]  # (F, 3, 3)
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
+        edge = lengths.argmax(axis=-1)
+        long = lengths.max(axis=-1) > longest
+        if not long.any():
+            return vertices, faces
+        a, b, c = (np.take_along_axis(faces[long], (edge[long] + k)[:, None] % 3, axis=1)[:, 0] for k in range(3))
+        middle = len(vertices) + np.arange(len(a))
+        vertices = np.concatenate([vertices, (vertices[a] + vertices[b]) / 2])
+        halves = [np.stack([a, middle, c], axis=-1), np.stack([middle, b, c], axis=-1)]
+        faces = np.concatenate([faces[~long], *halves])
 
 
 def _as_float32(values: NDArray[Any]) -> Tensor:
