@@ -66,5 +66,6 @@ def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
     A, B = problem.A, problem.B
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
     r = residuals(problem.scene_field, problem.object_field, A, B, batch)
-    cov = covariance(r, fitting_width(r, LAST.widths[-1]))
+    places = torch.cat([T_work.apply(A.points.double()), B.points.double()])
+    cov = covariance(r, fitting_width(r, LAST.widths[-1]), places)
     return in_object_units(cov, T_work, problem.view.frame, problem.model.frame)
