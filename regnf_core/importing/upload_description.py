@@ -65,6 +65,8 @@ class UploadDescription:
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
+    truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
+    """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
     label: Annotated[str, MaxLen(200)] | None = None
     hash: GridDescription = field(default_factory=GridDescription)
 

@@ -9,6 +9,7 @@ from regnf_core.fields.kinds.kind import FieldDescription
 from regnf_core.fields.kinds.mesh import MeshDescription
 from regnf_core.fields.kinds.mlp import MlpDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
+from regnf_core.fields.kinds.voxel_blocks import VoxelBlocksDescription
 from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 
 KINDS: dict[str, type[FieldDescription]] = {
@@ -16,5 +17,6 @@ KINDS: dict[str, type[FieldDescription]] = {
     "mlp": MlpDescription,
     "mesh": MeshDescription,
     "voxel_grid": VoxelGridDescription,
+    "voxel_blocks": VoxelBlocksDescription,
 }
 """By the description's ``family``."""

@@ -1,0 +1,160 @@
+"""Open3D's VoxelBlockGrid: files as its ``save`` lays them out, the truncation, voxels that nobody saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from regnf_core.fields.safe_format import open_field
+from regnf_core.importing.convert import FIELD_NAME, convert_file
+from regnf_core.importing.report import ImportLimits
+from tests.core.fields.grids import slow_trilinear
+from tests.core.importing.archives import assert_refused
+from tests.devdata import dev_data
+
+EDGE, SIZE, RADIUS = 8, 0.05, 0.6
+CENTRE = np.array([0.1, -0.2, 0.05])
+
+
+def true_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.linalg.norm(points - CENTRE, axis=-1) - RADIUS)
+
+
+def ball(voxels: float = 4.0, **changes: Any) -> dict[str, Any]:
+    """The arrays of a map of a ball, cut off at ``voxels`` voxels; what lies deeper than that was never seen."""
+    keys = np.stack(np.meshgrid(*[np.arange(-3, 3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    z, y, x = np.meshgrid(*[np.arange(EDGE)] * 3, indexing="ij")  # the file has x last
+    distance = true_distance(SIZE * (EDGE * keys[:, None, None, None] + np.stack((x, y, z), axis=-1)))
+    cut = voxels * SIZE
+    kept = (np.abs(distance) < SIZE).any(axis=(1, 2, 3))
+    distance, keys = distance[kept], keys[kept]
+    seen = distance > -cut
+    arrays = {
+        "value_000": np.where(seen, np.minimum(distance / cut, 1.0), 0.0)[..., None].astype(np.float32),
+        "value_001": seen[..., None].astype(np.float32),
+        "value_002": np.zeros((*distance.shape, 3), np.float32),
+        "key": keys.astype(np.int32),
+        "attr_name_tsdf": np.array([0], np.int32),
+        "attr_name_weight": np.array([1], np.int32),
+        "attr_name_color": np.array([2], np.int32),
+        "block_resolution": np.array([EDGE], np.int64),
+        "voxel_size": np.array([SIZE], np.float32),
+        "CPU:0": np.uint8(0),
+    }
+    arrays |= changes
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def converted(folder: Path, arrays: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+    np.savez(folder / "map.npz", **arrays)
+    return convert_file(folder / "map.npz", folder, wanted, ImportLimits())
+
+
+def near_surface(count: int) -> NDArray[np.float64]:
+    """Points within a voxel of the ball's surface."""
+    rng = np.random.default_rng(8)
+    direction = rng.normal(size=(count, 3))
+    reach = RADIUS + SIZE * rng.uniform(-1, 1, (count, 1))
+    points: NDArray[np.float64] = CENTRE + reach * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return points
+
+
+@pytest.mark.parametrize("voxels", [4.0, 8.0])
+def test_the_truncation_is_told_by_the_slope_and_voxels_lie_where_they_should(tmp_path: Path, voxels: float) -> None:
+    report = converted(tmp_path, ball(voxels))
+    assert report["family"] == "open3d_voxel_block_grid"
+    assert report["warnings"] == []
+    assert f"truncation of {voxels:g} voxels" in " ".join(report["why"])
+    points = near_surface(100)
+    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(torch.from_numpy(points))
+    size = float(np.float32(SIZE))
+    expected = [
+        slow_trilinear(lambda node: float(true_distance(SIZE * np.array(node))), point / size) for point in points
+    ]
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5)
+    outward = (points - CENTRE) / np.linalg.norm(points - CENTRE, axis=1, keepdims=True)
+    assert np.abs(gradient.numpy() - outward).max() < 0.1
+
+
+def test_the_attributes_arrays_are_told_by_name(tmp_path: Path) -> None:
+    arrays = ball()
+    arrays |= {"value_000": arrays["value_001"].astype(np.uint16), "value_001": arrays["value_000"]}
+    arrays |= {"attr_name_tsdf": np.array([1]), "attr_name_weight": np.array([0])}
+    assert converted(tmp_path, arrays)["warnings"] == []
+
+
+def test_unseen_voxels_count_as_free_space_behind_what_was_seen(tmp_path: Path) -> None:
+    """A block whose lower half was seen, 0.1 to 0.25 deep: from there on distances rise again."""
+    tsdf = np.zeros((1, 4, 4, 4, 1), np.float32)
+    weight = np.zeros_like(tsdf)
+    tsdf[:, :2] = np.array([0.5, -0.5], np.float32).reshape(1, 2, 1, 1, 1)  # z is the first axis of a block
+    weight[:, :2] = 1.0
+    arrays = ball(value_000=tsdf, value_001=weight, value_002=None, attr_name_color=None, key=np.array([[-1, 2, 0]]))
+    report = converted(tmp_path, arrays | {"block_resolution": np.array([4])}, {"truncation": 0.1})
+    np.testing.assert_allclose(report["bounds"], [[-0.2, 0.4, 0.0], [-0.05, 0.55, 0.05]], rtol=0, atol=1e-6)
+    points = torch.tensor([[-0.1, 0.5, z] for z in (0.0, 0.05, 0.1, 0.15, 0.25)])
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(points)
+    torch.testing.assert_close(distance, torch.tensor([0.05, -0.05, 0.0, 0.05, 0.15]), rtol=0, atol=1e-5)
+
+
+def test_the_uploader_may_tell_the_truncation(tmp_path: Path) -> None:
+    converted(tmp_path, ball(4.0), {"truncation": 0.1, "world_scale": 10.0})
+    surface = torch.from_numpy(10.0 * (CENTRE + np.array([RADIUS + 0.05, 0.0, 0.0])))[None]
+    assert float(open_field(tmp_path / FIELD_NAME).signed_distance(surface)) == pytest.approx(0.25, abs=0.02)
+
+
+def test_a_doubtful_truncation_is_warned_of(tmp_path: Path) -> None:
+    report = converted(tmp_path, ball(40.0))
+    assert "TRUNCATION_ASSUMED" in [warning.split(":")[0] for warning in report["warnings"]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"value_000": None}, "TENSOR_MISSING"),
+        ({"key": np.zeros((5, 3), np.int32)}, "TENSOR_SHAPE"),
+        ({"key": np.zeros((5, 2), np.int32)}, "TENSOR_SHAPE"),
+        ({"key": np.zeros((0, 3), np.int32)}, "TENSOR_SHAPE"),
+        ({"key": np.zeros((5, 3), np.float32)}, "TENSOR_DTYPE"),
+        ({"block_resolution": np.array([0])}, "TENSOR_SHAPE"),
+        ({"block_resolution": np.array([8, 8])}, "TENSOR_SHAPE"),
+        ({"block_resolution": np.array([1 << 40])}, "TENSOR_SHAPE"),
+        ({"voxel_size": np.array([-0.05])}, "TENSOR_SHAPE"),
+        ({"voxel_size": np.array([np.nan])}, "TENSOR_NOT_FINITE"),
+        ({"attr_name_tsdf": np.array([-1])}, "TENSOR_SHAPE"),
+        ({"attr_name_tsdf": np.array([2])}, "TENSOR_SHAPE"),
+        ({"attr_name_tsdf": np.array([7])}, "TENSOR_MISSING"),
+        ({"attr_name_tsdf": None}, "FIELD_NOT_RECOGNISED"),
+    ],
+)
+def test_faulty_maps_are_refused(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
+    assert_refused(lambda: converted(tmp_path, ball(**changes)), reason)
+
+
+def test_a_block_that_occurs_twice_and_a_map_of_nothing_are_refused(tmp_path: Path) -> None:
+    arrays = ball()
+    twice = arrays["key"].copy()
+    twice[1] = twice[0]
+    assert_refused(lambda: converted(tmp_path, arrays | {"key": twice}), "FIELD_INDEX_INVALID")
+    unseen = np.zeros_like(arrays["value_001"])
+    assert_refused(lambda: converted(tmp_path, arrays | {"value_001": unseen}), "TENSOR_SHAPE")
+
+
+def test_the_reference_file_is_reproduced(tmp_path: Path) -> None:
+    folder = dev_data("formats", "open3d_voxel_block_grid")
+    report = convert_file(folder / "vbg_torus.npz", tmp_path, None, ImportLimits())
+    assert report["warnings"] == []
+    field = open_field(tmp_path / FIELD_NAME)
+    distance, gradient = field.signed_distance_and_gradient(torch.from_numpy(np.load(folder / "points.npy")))
+    expected = np.load(folder / "sdf.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+    np.testing.assert_allclose(gradient.numpy(), np.load(folder / "gradient.npy"), rtol=0, atol=1e-3)
+    seen = np.load(folder / "voxel_weight.npy").reshape(-1) > 0
+    at_voxels = field.signed_distance(torch.from_numpy(np.load(folder / "voxel_points.npy"))).numpy()
+    stored = np.load(folder / "voxel_sdf.npy").reshape(-1)
+    np.testing.assert_allclose(at_voxels[seen], stored[seen], rtol=0, atol=1e-5 * np.ptp(expected))
