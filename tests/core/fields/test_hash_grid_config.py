@@ -52,7 +52,18 @@ def test_a_table_of_no_possible_size_is_refused() -> None:
     assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
 
 
-def test_one_resolution_a_level() -> None:
+@pytest.mark.parametrize("name", ["resolutions", "strides"])
+def test_one_resolution_a_level(name: str) -> None:
     with pytest.raises(FieldFormatError) as caught:
-        HashGridConfig(levels=3, resolutions=(16, 20))
+        HashGridConfig(levels=3, **{name: (16, 20)})
     assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
+
+
+def test_only_dense_levels_with_room_are_indexed_otherwise() -> None:
+    """16 -> 512 doubles every third level. A table laid out for 33 and 65 nodes holds 32 and 64; not the other way."""
+    exact = HashGridConfig.from_top_resolution(512)
+    assert list(exact.stride_variants()) == []
+    above = exact.with_entry_count(5_246_024 + (35_944 - 32_768) + (274_632 - 262_144))
+    levels = [(config.level_strides()[3], config.level_strides()[6]) for config in above.stride_variants()]
+    assert levels == [(32, 65), (33, 64), (32, 64)]
+    assert {config.entries for config in above.stride_variants()} == {above.entries}
