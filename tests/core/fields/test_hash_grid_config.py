@@ -61,9 +61,10 @@ def test_one_resolution_a_level(name: str) -> None:
 
 def test_only_dense_levels_with_room_are_indexed_otherwise() -> None:
     """16 -> 512 doubles every third level. A table laid out for 33 and 65 nodes holds 32 and 64; not the other way."""
-    exact = HashGridConfig.from_top_resolution(512)
+    config = HashGridConfig.from_top_resolution(512)
+    exact = config.with_entry_count(5_246_024)
     assert list(exact.stride_variants()) == []
-    above = exact.with_entry_count(5_246_024 + (35_944 - 32_768) + (274_632 - 262_144))
-    levels = [(config.level_strides()[3], config.level_strides()[6]) for config in above.stride_variants()]
+    above = config.with_entry_count(5_246_024 + (35_944 - 32_768) + (274_632 - 262_144))
+    levels = [(variant.level_strides()[3], variant.level_strides()[6]) for variant in above.stride_variants()]
     assert levels == [(32, 65), (33, 64), (32, 64)]
-    assert {config.entries for config in above.stride_variants()} == {above.entries}
+    assert {variant.entries for variant in above.stride_variants()} == {above.entries}
