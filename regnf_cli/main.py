@@ -16,6 +16,7 @@ from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
 from regnf_cli.fit import fit
 from regnf_cli.inspect import inspect
 from regnf_cli.register import register
+from regnf_cli.search import search
 from regnf_cli.serve import serve
 from regnf_cli.worker import worker
 from regnf_core import __version__
@@ -40,7 +41,7 @@ def root(
         raise typer.Exit
 
 
-for command in (register, serve, worker, inspect, fit):
+for command in (register, search, serve, worker, inspect, fit):
     app.command(command.__name__)(command)
 
 

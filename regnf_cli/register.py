@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 
 from regnf_cli.console import out, phase_progress
 from regnf_cli.extras import require
+from regnf_cli.output import prepare, write_into
 from regnf_cli.report import exit_code, show_result
 from regnf_cli.request_files import parse_detection, read_object, read_options, read_transform
 from regnf_core.errors import InvalidInputError
@@ -82,7 +82,7 @@ def register(
 
 
 def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: Path | None) -> dict[str, Any]:
-    from regnf_core.diagnostics import result_document, write_artifacts
+    from regnf_core.diagnostics import result_document
     from regnf_core.loading import load_field
     from regnf_core.registration import register as run
     from regnf_core.sim3 import Sim3
@@ -91,8 +91,7 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
     box = parse_detection(request["detection"])
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
-    if output is not None:
-        output.mkdir(parents=True, exist_ok=True)  # before the work, which would be lost
+    prepare(output)
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
         fields = load_field(scene), load_field(object_)
@@ -105,9 +104,6 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
             start,
         )
         bar.update(task, description="exporting", completed=1.0)
-    if output is not None:
-        with tempfile.TemporaryDirectory(dir=output) as folder:
-            for name in write_artifacts(result, Path(folder), truth=truth):
-                (Path(folder) / name).replace(output / name)
-    document: dict[str, Any] = result_document(result, truth=truth)
+    write_into(output, result, truth=truth, object_name=str(object_))
+    document: dict[str, Any] = result_document(result, truth=truth, object_name=str(object_))
     return document

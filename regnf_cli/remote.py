@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +132,43 @@ def register_remotely(
 
     Raises ServiceError, NoWorkerError; leaves with exit code 3 when the service cannot be reached.
     """
+
+    def upload(report: Report) -> dict[str, Any]:
+        return {"scene": service.upload_field(scene, report), "object": service.upload_field(object_, report)}
+
+    return _exchange(service, upload, request, output)
+
+
+def search_remotely(
+    service: RemoteService, scene: Path, objects: Sequence[Path], request: dict[str, Any], output: Path | None
+) -> dict[str, Any]:
+    """The same for a search among ``objects``, which the document then names by their files."""
+    files: dict[str, Path] = {}
+
+    def upload(report: Report) -> dict[str, Any]:
+        sent = {"scene": service.upload_field(scene, report)}
+        for path in objects:
+            files.setdefault(service.send(path, report), path)
+        for sha256, path in files.items():
+            try:
+                service.wait_until_ready(sha256)
+            except ServiceError as error:
+                raise ServiceError(f"{path}: {error}", reason=error.reason) from error
+        return {**sent, "candidates": list(files)}
+
+    document = _exchange(service, upload, request, output)
+    for place in (document, *document["candidates"]):
+        place["object"] = str(files[place["object"]])
+    return document
+
+
+def _exchange(
+    service: RemoteService,
+    upload: Callable[[Report], dict[str, Any]],
+    request: dict[str, Any],
+    output: Path | None,
+) -> dict[str, Any]:
+    """Upload, post, follow, fetch."""
     try:
         with service, phase_progress() as bar:
             task = bar.add_task("uploading", total=1.0)
@@ -139,9 +176,9 @@ def register_remotely(
             def report(phase: str, share: float) -> None:
                 bar.update(task, description=phase, completed=share)
 
-            fields = {"scene": service.upload_field(scene, report), "object": service.upload_field(object_, report)}
+            named = upload(report)
             body = {name: value for name, value in request.items() if value is not None}
-            job = service.follow(service.submit({**fields, **body})["id"], report)
+            job = service.follow(service.submit({**named, **body})["id"], report)
             document = service.result(job["id"])
             if output is not None:
                 output.mkdir(parents=True, exist_ok=True)

@@ -40,6 +40,21 @@ def show_result(document: dict[str, Any]) -> None:
         _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
+def show_ranking(document: dict[str, Any], top: int) -> None:
+    """Print the ``top`` likeliest candidates of a search, and what cannot be an object at all."""
+    table = Table("", "object", "score", "verdict", title="candidates", title_justify="left", box=None)
+    ranked = [one for one in document["candidates"] if one["stage"] != "unusable"]
+    for number, one in enumerate(ranked[:top], 1):
+        score = "-" if one["score"] is None else f"{one['score']:.4f}"
+        verdict = f"{one['verdict']} ({one['verdict_reason']})" if one["verdict"] else f"not refined ({one['stage']})"
+        table.add_row(str(number), escape(one["object"]), score, escape(verdict))
+    out.print(table)
+    if len(ranked) > top:
+        _line("", f"and {len(ranked) - top} more")
+    for one in document["candidates"][len(ranked) :]:
+        _line("", f"no object: {one['object']} ({one['verdict_reason']})")
+
+
 def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     """An object's symmetry as a result document has it: order, axis, continuous."""
     order, axis = symmetry["order"], symmetry["axis"]
@@ -47,7 +62,7 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     about = "" if axis is None else f" about ({numbers}) of the object"
     if symmetry["continuous"]:
         return f"any turn{about}" + (", and either end up" if order > 1 else "")
-    return "none" if order == 1 else f"{order} turns{about} look alike, the identity included"
+    return "none found" if order == 1 else f"{order} turns{about} look alike, the identity included"
 
 
 def _show_uncertainty(sigmas: dict[str, Any] | None) -> None:

@@ -1,11 +1,14 @@
-"""Runs the command in this process."""
+"""Runs the command in this process, against pretended services too."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +27,9 @@ class Outcome:
 
 
 Run = Callable[..., Outcome]
+Answer = tuple[int, str]
+Answers = Callable[[str, str], Answer]
+Serve = Callable[[Answers], str]
 
 
 @pytest.fixture
@@ -47,3 +53,33 @@ def demo() -> list[object]:
     """The arguments of a registration with the demo's fields."""
     fields = [DATA / "mix-room.safetensors", DATA / "armchair.safetensors"]
     return ["register", *fields, "--detection", DATA / "detection.json"]
+
+
+@pytest.fixture
+def serve() -> Iterator[Serve]:
+    """``serve(answers)``: a server's address; ``answers(method, path)`` gives status and body."""
+    servers: list[ThreadingHTTPServer] = []
+
+    def start(answers: Answers) -> str:
+        class Handler(BaseHTTPRequestHandler):
+            def answer(self) -> None:
+                self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                status, body = answers(self.command, self.path.partition("?")[0])
+                self.send_response(status)
+                self.send_header("Content-Length", str(len(body.encode())))
+                self.end_headers()
+                self.wfile.write(body.encode())
+
+            do_GET = do_PUT = do_POST = answer  # noqa: N815 (the names that http.server calls)
+
+            def log_message(self, *_: Any) -> None:
+                """Say nothing."""
+
+        servers.append(ThreadingHTTPServer(("127.0.0.1", 0), Handler))
+        threading.Thread(target=servers[-1].serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
+        return f"http://127.0.0.1:{servers[-1].server_address[1]}"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()

@@ -4,50 +4,12 @@ from __future__ import annotations
 
 import json
 import socket
-import threading
-from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from regnf_cli.worker_watch import NoWorkerError, WorkerWatch
-from tests.cli.conftest import Run
-
-Answer = tuple[int, str]
-Answers = Callable[[str, str], Answer]
-Serve = Callable[[Answers], str]
-
-
-@pytest.fixture
-def serve() -> Iterator[Serve]:
-    """``serve(answers)``: a server's address; ``answers(method, path)`` gives status and body."""
-    servers: list[ThreadingHTTPServer] = []
-
-    def start(answers: Answers) -> str:
-        class Handler(BaseHTTPRequestHandler):
-            def answer(self) -> None:
-                self.rfile.read(int(self.headers.get("Content-Length", 0)))
-                status, body = answers(self.command, self.path.partition("?")[0])
-                self.send_response(status)
-                self.send_header("Content-Length", str(len(body.encode())))
-                self.end_headers()
-                self.wfile.write(body.encode())
-
-            do_GET = do_PUT = do_POST = answer  # noqa: N815 (the names that http.server calls)
-
-            def log_message(self, *_: Any) -> None:
-                """Say nothing."""
-
-        servers.append(ThreadingHTTPServer(("127.0.0.1", 0), Handler))
-        threading.Thread(target=servers[-1].serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
-        return f"http://127.0.0.1:{servers[-1].server_address[1]}"
-
-    yield start
-    for server in servers:
-        server.shutdown()
-        server.server_close()
+from tests.cli.conftest import Answer, Answers, Run, Serve
 
 
 def service(verdict: str, artifact: str = "result.json") -> Answers:

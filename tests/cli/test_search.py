@@ -1,0 +1,155 @@
+"""`regnf search`: which files are a library, what is printed of a ranking, and what is kept for the next time."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from regnf_cli.object_models import object_model
+from regnf_cli.report import show_ranking
+from regnf_cli.search import library_files
+from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_core.options import RobustOptions
+from tests.cli.conftest import DATA, Answer, Run, Serve
+
+CHAIRS = [DATA / "dining-chair.safetensors", DATA / "armchair.safetensors"]
+DEMO: list[object] = ["search", DATA / "mix-room.safetensors", *CHAIRS, "--detection", DATA / "detection.json"]
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def test_the_right_chair_comes_first(run: Run, tmp_path: Path) -> None:
+    outcome = run(*DEMO, "--json", "--output", tmp_path / "out")
+    assert outcome.code == 0, outcome.stderr
+    document = json.loads(outcome.stdout)
+    assert (document["object"], document["verdict"]) == (str(CHAIRS[1]), "registered")
+    assert [one["object"] for one in document["candidates"]] == [str(CHAIRS[1]), str(CHAIRS[0])]
+    assert document["candidates"][0]["T_object_scene"] == document["T_object_scene"]
+    assert document["T_object_scene"]["scale"] == pytest.approx(1.25, rel=0.01)
+    written = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert (written["object"], len(written["candidates"])) == (document["object"], 2)
+    assert len(list((tmp_path / "cache" / "regnf" / "object-models").iterdir())) == 2
+
+
+def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) -> None:
+    first = object_model(CHAIRS[0], RobustOptions())
+    (kept,) = (tmp_path / "cache" / "regnf" / "object-models").iterdir()
+    again = object_model(CHAIRS[0], RobustOptions())
+    assert first.samples.points.equal(again.samples.points)
+    half = kept.read_bytes()[:100]
+    kept.unlink()  # rather than shortened in place: what was read from it is mapped
+    kept.write_bytes(half)
+    assert object_model(CHAIRS[0], RobustOptions()).samples.points.equal(first.samples.points)
+    assert kept.stat().st_size > 100
+    few = object_model(CHAIRS[0], RobustOptions(object_samples=300))
+    assert len(few.samples) < len(first.samples)
+    assert list(kept.parent.iterdir()) == [kept]
+
+
+def test_a_file_that_is_no_field_is_named(tmp_path: Path) -> None:
+    (tmp_path / "chair.safetensors").write_bytes(b"\x10\0\0\0\0\0\0\0{")
+    with pytest.raises(FieldFormatError, match=r"chair\.safetensors: "):
+        object_model(tmp_path / "chair.safetensors", RobustOptions())
+
+
+def test_a_library_is_the_fields_of_its_folders_each_once(tmp_path: Path) -> None:
+    for name in ("armchair", "dining-chair"):
+        shutil.copy(DATA / f"{name}.safetensors", tmp_path)
+    (tmp_path / "README.md").write_text("chairs")
+    (tmp_path / "empty.safetensors").touch()
+    (tmp_path / "more").mkdir()
+    arm, dining = tmp_path / "armchair.safetensors", tmp_path / "dining-chair.safetensors"
+    assert library_files([tmp_path]) == [arm, dining]
+    assert library_files([dining, tmp_path, tmp_path / "more" / ".." / arm.name]) == [dining, arm]
+    with pytest.raises(InvalidInputError) as caught:
+        library_files([tmp_path / "more"])
+    assert caught.value.reason == "LIBRARY_EMPTY"
+
+
+def test_a_library_has_its_limit(tmp_path: Path) -> None:
+    head = (DATA / "armchair.safetensors").read_bytes()[:600]
+    for number in range(513):
+        (tmp_path / f"{number}.safetensors").write_bytes(head)
+    with pytest.raises(InvalidInputError) as caught:
+        library_files([tmp_path])
+    assert caught.value.reason == "LIBRARY_TOO_LARGE"
+
+
+def test_the_published_method_searches_nothing(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "options.json").write_text('{"preset": "paper"}')
+    outcome = run(*DEMO, "--options", tmp_path / "options.json")
+    assert outcome.code == 2
+    assert outcome.stderr.startswith("LIBRARY_SEARCH_UNSUPPORTED ")
+
+
+def candidate(name: str, stage: str, score: float | None, verdict: str | None = None) -> dict[str, Any]:
+    reason = "NO_SURFACE_IN_OBJECT" if stage == "unusable" else "BECAUSE" if verdict else None
+    return {"object": name, "stage": stage, "score": score, "verdict": verdict, "verdict_reason": reason}
+
+
+def test_a_ranking_is_printed_as_far_as_asked(capfd: pytest.CaptureFixture[str]) -> None:
+    ranking = [
+        candidate("[a]", "refined", 0.01, "registered"),
+        candidate("b", "coarse", 0.2),
+        candidate("c", "signature", None),
+        candidate("air", "unusable", None),
+    ]
+    show_ranking({"candidates": ranking}, 2)
+    lines = [line.split() for line in capfd.readouterr().out.splitlines()]
+    assert lines[2:] == [
+        ["1", "[a]", "0.0100", "registered", "(BECAUSE)"],
+        ["2", "b", "0.2000", "not", "refined", "(coarse)"],
+        ["and", "1", "more"],
+        ["no", "object:", "air", "(NO_SURFACE_IN_OBJECT)"],
+    ]
+
+
+def searching(state_of: dict[str, str]) -> Any:
+    """A service whose search puts the armchair first; fields are in these states, by name."""
+    shas = {path.stem: hashlib.sha256(path.read_bytes()).hexdigest() for path in CHAIRS}
+    ranking = [
+        candidate(shas["armchair"], "refined", 0.02, "ambiguous"),
+        candidate(shas["dining-chair"], "coarse", 0.4),
+    ]
+    result = {
+        "verdict": "ambiguous",
+        "verdict_reason": "SEVERAL_POSES_AGREE",
+        "T_object_scene": {"matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "scale": 1.0},
+        "object": shas["armchair"],
+        "candidates": ranking,
+        "metrics": {},
+        "artifacts": [],
+    }
+
+    def answers(method: str, path: str) -> Answer:
+        if path.startswith("/fields/"):
+            name = next((name for name, sha in shas.items() if sha in path), "")
+            problem = {"reason": "TENSOR_NOT_FINITE", "detail": "not finite"}
+            return 200, json.dumps({"state": state_of.get(name, "ready"), "error": problem})
+        if path == "/register":
+            return 202, json.dumps({"id": "j"})
+        return 200, json.dumps(result if path == "/jobs/j/result" else {"id": "j", "status": "successful"})
+
+    return answers
+
+
+def test_a_search_on_a_server_names_the_files(run: Run, serve: Serve) -> None:
+    outcome = run(*DEMO, "--server", serve(searching({})), "--json")
+    assert outcome.code == 4, outcome.stderr
+    document = json.loads(outcome.stdout)
+    assert document["object"] == str(CHAIRS[1])
+    assert [one["object"] for one in document["candidates"]] == [str(CHAIRS[1]), str(CHAIRS[0])]
+
+
+def test_a_field_that_the_server_rejects_is_named(run: Run, serve: Serve) -> None:
+    outcome = run(*DEMO, "--server", serve(searching({"armchair": "rejected"})))
+    assert outcome.code == 2
+    assert f"TENSOR_NOT_FINITE {CHAIRS[1]}: not finite" in outcome.stderr
