@@ -91,6 +91,10 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
         return convert_arrays(ArraySource(data, tensor_bytes), wanted)
     if kind == "safetensors":
         return convert_safe_field(upload, data, tensor_bytes, wanted)
+    if kind == "onnx":
+        from regnf_core.importing.families.onnx import convert_onnx
+
+        return convert_onnx(data, tensor_bytes, wanted)
     if kind in MESH_FORMATS:
         from regnf_core.importing.families.mesh import convert_mesh
 

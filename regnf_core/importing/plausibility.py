@@ -11,6 +11,9 @@ from regnf_core.fields.base import SdfField
 SAMPLES = 16_384
 _NEAREST_SHARE = 16
 _STEPS = 8
+_ASKED_AGAIN = 64
+_SAME = 1e-3
+"""Sums in another order give other last digits: by less than this share of the largest distance."""
 _SURFACE_SHARE = 1e-3
 """A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
 _GRADIENT_RANGE = (0.5, 2.0)
@@ -24,13 +27,15 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
 
     ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
     along the gradient.
-    Raises FieldFormatError: FIELD_NOT_FINITE, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
+    Raises FieldFormatError: FIELD_NOT_FINITE, FIELD_NOT_A_FUNCTION when a point's distance depends on which others are
+    asked for, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
     """
     lower, upper = field.bounds[0].float(), field.bounds[1].float()
     generator = torch.Generator().manual_seed(seed)
     points = lower + (upper - lower) * torch.rand(samples, 3, generator=generator)  # (N, 3)
     distance = field.signed_distance(points)
     _require_finite(distance)
+    _require_function(field, points, distance)
     nearest = points[distance.abs().argsort()[: samples // _NEAREST_SHARE]]
     norms, signs = _walk_to_surface(field, nearest, (lower, upper))
     inside = distance < 0
@@ -47,6 +52,15 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
         "gradient_p90": high,
     }
     return figures, _warnings(figures)
+
+
+def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None:
+    """A few of the points once more, in another order and without the rest."""
+    again = field.signed_distance(points[:_ASKED_AGAIN].flip(0)).flip(0)
+    _require_finite(again)
+    if (again - distance[:_ASKED_AGAIN]).abs().max() > _SAME * distance.abs().max():
+        message = "a point's distance depends on which others are asked for"
+        raise FieldFormatError(message, reason="FIELD_NOT_A_FUNCTION")
 
 
 def _share_inside_at_bounds(

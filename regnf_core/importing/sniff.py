@@ -12,11 +12,15 @@ _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
     b"data.pkl data .data version byteorder .format_version .storage_alignment constants.pkl code".split()
 )
+_ONNX_VERSIONS, _ONNX_NEXT = (
+    tuple(bytes([n]) for n in range(3, 32)),
+    (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
+)
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 
 
 def sniff_format(head: bytes) -> str | None:
-    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, a mesh's format, or None for what the gate does not take.
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"onnx"``, a mesh's format; None: not taken.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
@@ -29,7 +33,7 @@ def sniff_format(head: bytes) -> str | None:
         return "npz"
     if head[8:9] == b"{":
         return "safetensors"
-    return sniff_mesh(head)
+    return "onnx" if _may_be_onnx(head) else sniff_mesh(head)
 
 
 def explain_refusal(head: bytes) -> tuple[str, str]:
@@ -44,7 +48,15 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
-    return "FORMAT_NOT_RECOGNISED", "none of the formats that are taken: torch.save archives, safetensors, meshes"
+    return (
+        "FORMAT_NOT_RECOGNISED",
+        "none of the formats that are taken: torch.save archives, safetensors, npz, ONNX, meshes",
+    )
+
+
+def _may_be_onnx(head: bytes) -> bool:
+    """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
+    return head[:1] == b"\x08" and head[1:2] in _ONNX_VERSIONS and head[2:3] in _ONNX_NEXT
 
 
 def _first_name(head: bytes) -> bytes:

@@ -8,7 +8,9 @@ from __future__ import annotations
 from regnf_core.fields.kinds.kind import FieldDescription
 from regnf_core.fields.kinds.mesh import MeshDescription
 from regnf_core.fields.kinds.mlp import MlpDescription
+from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
+from regnf_core.fields.kinds.onnx import OnnxDescription
 from regnf_core.fields.kinds.voxel_blocks import VoxelBlocksDescription
 from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 
@@ -16,6 +18,8 @@ KINDS: dict[str, type[FieldDescription]] = {
     "neus_facto": NeusFactoDescription,
     "mlp": MlpDescription,
     "mesh": MeshDescription,
+    "onnx": OnnxDescription,
+    "neural_points": NeuralPointsDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,
 }

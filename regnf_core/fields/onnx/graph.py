@@ -1,0 +1,150 @@
+"""A graph of ONNX's operators as a function of points, with the gradient by automatic differentiation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.function_field import FunctionField
+from regnf_core.fields.onnx.elementwise import ELEMENTWISE, Operator
+from regnf_core.fields.onnx.linear import LINEAR
+from regnf_core.fields.onnx.shaping import SHAPING
+
+if TYPE_CHECKING:
+    from regnf_core.fields.kinds.onnx import OnnxDescription
+
+OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
+_MAX_ELEMENTS = 1 << 24
+"""Elements that any value of the graph may have, for one batch."""
+_TYPES = {"float32": torch.float32, "int64": torch.int64, "bool": torch.bool}
+_FAULTS = (ArithmeticError, AssertionError, IndexError, KeyError, RuntimeError, TypeError, ValueError)
+_NO_MEMORY = "allocate memory"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operation of the graph, ready to run."""
+
+    where: str
+    function: Operator
+    attributes: dict[str, Any]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class OnnxFunction:
+    """Evaluates ``steps`` on batches of exactly ``batch`` points: so every value has one shape, that of the first run.
+
+    ``known``: whatever does not depend on the points. Real numbers are float32 and whole ones int64 throughout,
+    whatever the model says. Raises FieldFormatError (ONNX_GRAPH_INVALID) where the graph contradicts itself.
+    """
+
+    steps: tuple[Step, ...]
+    known: dict[str, Tensor]
+    input: str
+    output: str
+    batch: int
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights live."""
+        floats = (value for value in self.known.values() if value.is_floating_point())
+        return next(floats, torch.zeros(0)).device
+
+    def to(self, device: torch.device | str) -> OnnxFunction:
+        """The same function with its weights on another device; whole numbers that say shapes stay where they are."""
+        moved = {
+            name: value.to(device) if value.is_floating_point() or value.numel() > 64 else value
+            for name, value in self.known.items()
+        }
+        return OnnxFunction(self.steps, moved, self.input, self.output, self.batch)
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) at points (N, 3)."""
+        parts = [self._run(part)[: len(part)] for part in torch.split(points, self.batch) if len(part)]
+        return torch.cat([points.new_zeros(0), *parts])
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them."""
+        distances, gradients = [points.new_zeros(0)], [points.new_zeros(0, 3)]
+        for part in torch.split(points, self.batch) if len(points) else ():
+            with torch.enable_grad():
+                leaf = part.detach().clone().requires_grad_()
+                distance = self._run(leaf)[: len(part)]
+                gradient = self._slope(distance, leaf)
+            distances.append(distance.detach())
+            gradients.append(gradient)
+        return torch.cat(distances), torch.cat(gradients)
+
+    @staticmethod
+    def _slope(distance: Tensor, leaf: Tensor) -> Tensor:
+        if not distance.requires_grad:  # constant, or made of steps alone
+            return torch.zeros_like(leaf)
+        (gradient,) = torch.autograd.grad(distance.sum(), leaf, allow_unused=True)
+        return torch.zeros_like(leaf) if gradient is None else gradient
+
+    def _run(self, points: Tensor) -> Tensor:
+        """Distances (batch,) of at most ``batch`` points; the missing ones are copies of the first."""
+        missing = self.batch - len(points)
+        filled = torch.cat((points, points[:1].detach().expand(missing, 3))) if missing else points
+        values: dict[str, Tensor | None] = {**self.known, self.input: filled, "": None}
+        for step in self.steps:
+            values |= run_step(step, values)
+        result = values[self.output]
+        if result is None or result.shape not in ((self.batch,), (self.batch, 1)):
+            shape = None if result is None else tuple(result.shape)
+            message = f"for {self.batch} points the graph gives {shape}, not one distance each"
+            raise FieldFormatError(message, reason="ONNX_GRAPH_INVALID")
+        return result.reshape(self.batch).float()
+
+
+def run_step(step: Step, values: Mapping[str, Tensor | None]) -> dict[str, Tensor | None]:
+    """The outputs of one operation. Raises FieldFormatError (ONNX_GRAPH_INVALID), MemoryError."""
+    try:
+        found = step.function(step.attributes, [values[name] for name in step.inputs])
+    except _FAULTS as error:
+        if _NO_MEMORY in str(error):
+            raise MemoryError(str(error)) from error
+        raise FieldFormatError(f"{step.where}: {str(error)[:200]}", reason="ONNX_GRAPH_INVALID") from error
+    outputs = found if isinstance(found, tuple) else (found,)
+    if len(outputs) < len(step.outputs) or any(value.numel() > _MAX_ELEMENTS for value in outputs):
+        message = f"{step.where}: fewer outputs than named, or more than {_MAX_ELEMENTS} numbers"
+        raise FieldFormatError(message, reason="ONNX_GRAPH_INVALID")
+    return dict(zip(step.outputs, outputs, strict=False))
+
+
+def build_onnx(description: OnnxDescription, tensors: Mapping[str, Tensor]) -> FunctionField[OnnxFunction]:
+    """The field of ``description`` with its weights in ``tensors``. What no point changes is computed here, once."""
+    known: dict[str, Tensor | None] = {name: _in_our_type(tensor) for name, tensor in tensors.items()}
+    for name, constant in description.constants.items():
+        if math.prod(constant.shape) != len(constant.values):
+            raise FieldFormatError(
+                f"the constant {name} has another size than its shape", reason="FIELD_SHAPES_MISMATCH"
+            )
+        known[name] = torch.tensor(constant.values, dtype=_TYPES[constant.type]).reshape(constant.shape)
+    steps = []
+    shapes_known = {**known, "": None}
+    for number, node in enumerate(description.nodes):
+        attributes = {**node.attributes, "outputs": len(node.outputs)}
+        where = f"node {number} ({node.op})"
+        step = Step(where, OPERATOR_FUNCTIONS[node.op], attributes, node.inputs, node.outputs)
+        if all(name in shapes_known for name in node.inputs):
+            shapes_known |= run_step(step, shapes_known)
+        else:
+            steps.append(step)
+    kept = {name for step in steps for name in step.inputs} | {description.output}
+    settled = {name: value for name, value in shapes_known.items() if name in kept and value is not None}
+    function = OnnxFunction(tuple(steps), settled, description.input, description.output, description.batch)
+    bounds = torch.tensor(description.function_bounds, dtype=torch.float64)
+    return FunctionField(function, bounds, chunk=max(description.batch, 1 << 12))
+
+
+def _in_our_type(tensor: Tensor) -> Tensor:
+    return tensor.float() if tensor.is_floating_point() else tensor.long()

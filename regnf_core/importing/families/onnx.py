@@ -1,0 +1,160 @@
+"""A network of any trainer as ONNX: (N, 3) points to N distances. Its graph becomes data of the kind ``onnx``."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.kinds.onnx import MAX_BATCH, MAX_NUMBERS
+from regnf_core.fields.kinds.onnx_operators import OPERATORS
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.onnx.model import Attribute, Model, Node, Port, read_model, unsupported
+from regnf_core.importing.onnx.tensor import Array
+from regnf_core.importing.tensors import StoredArray
+from regnf_core.importing.upload_description import UploadDescription
+
+_BATCH = 1024
+_LEAST_FIXED_BATCH = 64
+_REAL_TYPES = (1, 10, 11)
+_SMALL = 64
+_MAX_TENSORS = 1_000
+_INT32 = np.iinfo(np.int32)
+
+
+def convert_onnx(data: memoryview, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
+    """The field of the ONNX model in ``data``.
+
+    Raises FieldFormatError: ONNX_MALFORMED, ONNX_NOT_SUPPORTED, ONNX_EXTERNAL_DATA, TENSOR_DTYPE, TENSOR_NOT_FINITE,
+    TENSOR_TOO_LARGE, and what ``wanted`` is refused for.
+    """
+    require_family(wanted, "onnx")
+    refuse_other_entries(wanted, "onnx")
+    model = read_model(data)
+    parts = _Parts(model, tensor_bytes)
+    batch, told = _batch(model.input, model.output)
+    description = {
+        "family": "onnx",
+        "source": {"family": "onnx"},
+        **shared_entries(wanted, UNIT_CUBE),
+        "nodes": parts.nodes,
+        "constants": parts.constants,
+        "input": parts.names[model.input.name],
+        "output": parts.names[model.output.name],
+        "batch": batch,
+        "opset": model.opset,
+    }
+    why = (f"an ONNX model: {len(model.nodes)} nodes, operator set {model.opset}", told)
+    warnings = () if wanted.bounds else ("BOUNDS_ASSUMED: [-1, 1]^3; say bounds if the field's region is another",)
+    return ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
+
+
+def _batch(given: Port, made: Port) -> tuple[int, str]:
+    """How many points to evaluate at once, and why."""
+    for port, shapes in ((given, ((None, 3),)), (made, ((None,), (None, 1)))):
+        if port.element_type not in _REAL_TYPES:
+            raise unsupported(f"{port.name[:40]} does not hold real numbers")
+        if port.shape is not None and not any(_fits(port.shape, shape) for shape in shapes):
+            raise unsupported(f"the model maps {_shown(given)} to {_shown(made)}: (N, 3) to (N,) or (N, 1) is needed")
+    fixed = given.shape[0] if given.shape is not None else None
+    if fixed is None:
+        return _BATCH, f"any number of points; evaluated {_BATCH} at a time"
+    if _LEAST_FIXED_BATCH <= fixed <= MAX_BATCH:
+        return fixed, f"exactly {fixed} points at a time"
+    return _BATCH, f"made for {fixed} points, evaluated for {_BATCH} at a time: export with an open number of points"
+
+
+def _fits(shape: tuple[int | None, ...], wanted: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(wanted) and all(
+        have is None or want is None or have == want for have, want in zip(shape, wanted, strict=True)
+    )
+
+
+def _shown(port: Port) -> str:
+    return f"({', '.join('N' if extent is None else str(extent) for extent in port.shape or ())})"
+
+
+class _Parts:
+    """A model's nodes, constants and weights under names of our own, as the safe format has them."""
+
+    def __init__(self, model: Model, tensor_bytes: int) -> None:
+        self.names: dict[str, str] = {"": ""}
+        self.constants: dict[str, Any] = {}
+        self.tensors: dict[str, StoredArray] = {}
+        self.nodes: list[dict[str, Any]] = []
+        self._budget = tensor_bytes
+        self._numbers = 0
+        self._add_name(model.input.name)
+        for name, values in model.weights.items():
+            self._keep(name, values)
+        for number, node in enumerate(model.nodes):
+            self._add_node(number, node)
+        if model.output.name not in self.names:
+            raise unsupported("the model's output is made by no node")
+
+    def _add_name(self, name: str) -> str:
+        if name in self.names:
+            raise unsupported("a value of the model is made twice, or has no name")
+        self.names[name] = f"v{len(self.names)}"
+        return self.names[name]
+
+    def _add_node(self, number: int, node: Node) -> None:
+        if node.op not in OPERATORS:
+            raise unsupported(f"the operator {node.op} is not taken; docs/families.md lists those that are")
+        attributes = dict(node.attributes)
+        value = attributes.pop("value", None) if node.op in ("Constant", "ConstantOfShape") else None
+        inputs = list(node.inputs)
+        if isinstance(value, np.ndarray):
+            if node.op == "Constant":
+                self._keep(node.outputs[0] if node.outputs else "", value)
+                return
+            inputs.append(f"value of node {number}")
+            self._keep(inputs[-1], value)
+        unknown = [name for name in inputs if name not in self.names]
+        if unknown:
+            raise unsupported(f"node {number} ({node.op}) needs {unknown[0][:40]}, which nothing before it makes")
+        outputs = list(node.outputs)
+        while outputs and outputs[-1] == "":
+            outputs.pop()
+        self.nodes.append(
+            {
+                "op": node.op,
+                "inputs": [self.names[name] for name in inputs],
+                "outputs": [self._add_name(name) for name in outputs],
+                "attributes": {name: _plain(node.op, name, given) for name, given in attributes.items()},
+            }
+        )
+
+    def _keep(self, name: str, values: Array) -> None:
+        """A small array as a constant of the description, a large one as a tensor."""
+        ours = self._add_name(name)
+        self._budget -= 4 * values.size
+        if self._budget < 0:
+            raise FieldFormatError("the model's weights exceed the limit", reason="TENSOR_TOO_LARGE")
+        if values.dtype.kind == "f" and values.size > 1 and len(self.tensors) < _MAX_TENSORS:
+            self.tensors[ours] = values
+            return
+        if values.dtype.kind == "i" and values.size > _SMALL and _fits_32_bits(values):
+            self.tensors[ours] = values.astype(np.int32)
+            return
+        self._numbers += values.size
+        if self._numbers > MAX_NUMBERS:
+            raise unsupported("the model has too many whole numbers that exceed 32 bits")
+        kind = {"f": "float32", "i": "int64", "b": "bool"}[values.dtype.kind]
+        self.constants[ours] = {"type": kind, "shape": list(values.shape), "values": values.reshape(-1).tolist()}
+
+
+def _fits_32_bits(values: Array) -> bool:
+    return bool(_INT32.min <= values.min() and values.max() <= _INT32.max)
+
+
+def _plain(op: str, name: str, value: Attribute) -> Any:
+    if isinstance(value, np.ndarray) or (isinstance(value, list) and len(value) > _SMALL):
+        raise unsupported(f"the operator {op} with the attribute {name} of so many numbers")
+    numbers = [] if isinstance(value, str) else value if isinstance(value, list) else [value]
+    if not all(math.isfinite(number) for number in numbers):
+        raise unsupported(f"the operator {op} with the attribute {name} that is no finite number")
+    return value

@@ -1,0 +1,150 @@
+"""The graph of an ONNX model: nodes, weights, one input, one output. Whatever else a model may hold is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.onnx import wire
+from regnf_core.importing.onnx.tensor import Array, read_tensor
+
+MAX_NODES = 2_000
+_MAX_TENSORS = 1_000
+_MAX_NAMES = 64
+_OPSETS = range(13, 27)
+
+_OPSET_IMPORT, _GRAPH, _TRAINING, _FUNCTIONS = 8, 7, 20, 25
+_NODES, _INITIALISERS, _INPUTS, _OUTPUTS, _QUANTISATION, _SPARSE = 1, 5, 11, 12, 14, 15
+_NODE_IN, _NODE_OUT, _OP_TYPE, _ATTRIBUTES, _DOMAIN = 1, 2, 4, 5, 7
+_ATTRIBUTE_NAME, _FLOAT, _INT, _STRING, _TENSOR, _FLOAT_LIST, _INT_LIST, _ATTRIBUTE_TYPE = 1, 2, 3, 4, 5, 7, 8, 20
+_PLAIN_DOMAINS = ("", "ai.onnx")
+
+Attribute = int | float | str | list[int] | list[float] | Array
+
+
+@dataclass(frozen=True)
+class Node:
+    """One operation; inputs that are left out are ""."""
+
+    op: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    attributes: dict[str, Attribute]
+
+
+@dataclass(frozen=True)
+class Port:
+    """A graph's input or output; an extent that is left open is None, a shape that is left open too."""
+
+    name: str
+    element_type: int
+    shape: tuple[int | None, ...] | None
+
+
+@dataclass(frozen=True)
+class Model:
+    """A graph in the order of its evaluation."""
+
+    opset: int
+    nodes: tuple[Node, ...]
+    weights: dict[str, Array]
+    input: Port
+    output: Port
+
+
+def unsupported(message: str) -> FieldFormatError:
+    """The error for a sound model that is more than a function of points."""
+    return FieldFormatError(message, reason="ONNX_NOT_SUPPORTED")
+
+
+def read_model(data: memoryview) -> Model:
+    """The model in ``data``, the whole file.
+
+    Raises FieldFormatError: ONNX_MALFORMED, ONNX_NOT_SUPPORTED, ONNX_EXTERNAL_DATA, TENSOR_DTYPE, TENSOR_NOT_FINITE.
+    """
+    message = wire.read_message(data)
+    graphs = wire.messages(message, _GRAPH)
+    if len(graphs) != 1:
+        raise wire.malformed("no ONNX model, or one without a graph")
+    if message.get(_TRAINING) or message.get(_FUNCTIONS):
+        raise unsupported("the model holds functions of its own or training steps: export it with them inlined")
+    opset = _opset(message)
+    graph = wire.read_message(graphs[0])
+    if graph.get(_QUANTISATION) or graph.get(_SPARSE):
+        raise unsupported("the model is quantised or sparse")
+    nodes = wire.messages(graph, _NODES)
+    initialisers = wire.messages(graph, _INITIALISERS)
+    if len(nodes) > MAX_NODES or len(initialisers) > _MAX_TENSORS:
+        raise unsupported(f"the model has {len(nodes)} nodes and {len(initialisers)} weights")
+    weights = dict(map(read_tensor, initialisers))
+    if len(weights) != len(initialisers):
+        raise wire.malformed("two weights of one name")
+    ports = [_port(data) for data in wire.messages(graph, _INPUTS)]
+    inputs = [port for port in ports if port.name not in weights]  # old models list their weights among the inputs
+    outputs = [_port(data) for data in wire.messages(graph, _OUTPUTS)]
+    if len(inputs) != 1 or len(outputs) != 1:
+        text = f"the model has {len(inputs)} inputs and {len(outputs)} outputs: export points to distances alone"
+        raise unsupported(text)
+    return Model(opset, tuple(map(_node, nodes)), weights, inputs[0], outputs[0])
+
+
+def _opset(message: wire.Message) -> int:
+    versions = [wire.read_message(data) for data in wire.messages(message, _OPSET_IMPORT)]
+    plain = [wire.integer(version, 2) for version in versions if wire.text(version, 1) in _PLAIN_DOMAINS]
+    if len(plain) != 1 or plain[0] not in _OPSETS:
+        raise unsupported(f"operator set {plain}: {_OPSETS.start} to {_OPSETS.stop - 1} are taken")
+    return plain[0]
+
+
+def _node(data: memoryview) -> Node:
+    message = wire.read_message(data)
+    op, domain = wire.text(message, _OP_TYPE), wire.text(message, _DOMAIN)
+    if domain not in _PLAIN_DOMAINS:
+        raise unsupported(f"the operator {op[:40]} of {domain[:40]} is none of ONNX's own")
+    inputs = tuple(map(wire.decoded, wire.messages(message, _NODE_IN)))
+    outputs = tuple(map(wire.decoded, wire.messages(message, _NODE_OUT)))
+    attributes = wire.messages(message, _ATTRIBUTES)
+    if max(len(inputs), len(outputs), len(attributes)) > _MAX_NAMES or not op.isalnum() or len(op) > 40:
+        raise wire.malformed("a node with more ends than any operator")
+    return Node(op, inputs, outputs, dict(_attribute(op, data) for data in attributes))
+
+
+def _attribute(op: str, data: memoryview) -> tuple[str, Attribute]:
+    message = wire.read_message(data)
+    name = wire.text(message, _ATTRIBUTE_NAME)
+    if len(name) > 40 or not name.isidentifier():
+        raise wire.malformed("an attribute without a name")
+    readers: dict[int, Any] = {
+        1: lambda: wire.floats(message, _FLOAT)[-1],
+        2: lambda: wire.integer(message, _INT),
+        3: lambda: wire.text(message, _STRING),
+        4: lambda: read_tensor(wire.messages(message, _TENSOR)[-1])[1],
+        6: lambda: wire.floats(message, _FLOAT_LIST),
+        7: lambda: wire.integers(message, _INT_LIST),
+    }
+    reader = readers.get(wire.integer(message, _ATTRIBUTE_TYPE))
+    if reader is None:
+        raise unsupported(f"the operator {op} with the attribute {name}: control flow and strings are not taken")
+    try:
+        value: Attribute = reader()
+    except IndexError as error:
+        raise wire.malformed(f"the attribute {name} holds nothing") from error
+    return name, value
+
+
+def _port(data: memoryview) -> Port:
+    message = wire.read_message(data)
+    name = wire.text(message, 1)
+    types = [wire.read_message(part) for part in wire.messages(message, 2)]
+    tensors = [wire.read_message(part) for type_ in types for part in wire.messages(type_, 1)]
+    if len(tensors) != 1:
+        raise unsupported(f"{name[:40]} is no tensor")
+    shapes = wire.messages(tensors[0], 2)
+    shape = tuple(_extent(part) for part in wire.messages(wire.read_message(shapes[-1]), 1)) if shapes else None
+    return Port(name, wire.integer(tensors[0], 1), shape)
+
+
+def _extent(data: memoryview) -> int | None:
+    message = wire.read_message(data)
+    return wire.integer(message, 1) if 1 in message else None
