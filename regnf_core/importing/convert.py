@@ -10,6 +10,7 @@ import errno
 import json
 import mmap
 import os
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,7 +105,14 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
 
 
 def _require_text(description: dict[str, Any]) -> None:
-    """JSON can spell lone surrogates, which no file can hold. Raises FieldFormatError (SAFE_FORMAT_INVALID)."""
+    """JSON can spell lone surrogates, which no file can hold, and labels that hide what stands beside them.
+
+    Raises FieldFormatError (SAFE_FORMAT_INVALID).
+    """
+    from regnf_core.importing.upload_description import LABEL_PATTERN
+
+    if not re.fullmatch(LABEL_PATTERN, description.get("label") or ""):
+        raise FieldFormatError("the field's label has control characters", reason="SAFE_FORMAT_INVALID")
     try:
         json.dumps(description, ensure_ascii=False).encode("utf-8")
     except UnicodeEncodeError as error:

@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
-from pydantic import AfterValidator, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import AfterValidator, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
+LABEL_PATTERN = r"^[^\x00-\x1f\x7f\u202a-\u202e\u2066-\u2069]*$"
+"""Labels are shown as they are: no control characters, and none that turn the text around them."""
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
 
 
@@ -67,7 +69,7 @@ class UploadDescription:
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
     """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
-    label: Annotated[str, MaxLen(200)] | None = None
+    label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None
     hash: GridDescription = field(default_factory=GridDescription)
 
     def said(self) -> dict[str, Any]:

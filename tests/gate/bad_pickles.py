@@ -14,7 +14,7 @@ CANARY = Path("regnf-canary")
 """A file in the current folder that appears if anything runs."""
 _TOUCH = text(f"touch {CANARY}") + b"\x85R"
 WEIGHT = "_model.field.glin1.bias"
-UNSAFE = "rejected UNSAFE_GLOBAL_INWEIGHTS"
+UNSAFE = "rejected UNSAFE_GLOBAL_IN_WEIGHTS"
 
 
 def state(seeds: Seeds, weight: bytes | None = None) -> bytes:

@@ -115,13 +115,13 @@ def test_weights_that_are_not_finite_are_refused(field_file: Path, tmp_path: Pat
     assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "FIELD_NOT_FINITE")
 
 
-def test_a_label_that_is_no_unicode_text_is_refused(field_file: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("label", ["\ud800", "a\0b", "a\r\nX-Bad: 1", "a\n", "a\u202eb"])
+def test_labels_that_no_file_can_hold_or_no_page_show_are_refused(field_file: Path, tmp_path: Path, label: str) -> None:
     """JSON can spell half a surrogate pair; UTF-8 cannot."""
     data = field_file.read_bytes()
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
-    description = json.loads(header["__metadata__"]["field"]) | {"label": "\ud800"}
-    header["__metadata__"]["field"] = json.dumps(description)
+    header["__metadata__"]["field"] = json.dumps(json.loads(header["__metadata__"]["field"]) | {"label": label})
     path = saved(tmp_path, layout(header, data[8 + length :]))
     assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
 
