@@ -4,7 +4,7 @@
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
 (live without an event stream), locked (wants a token), bare (a result with little in it), roomy (with the scene round
-the detection) or broken (damaged clouds).
+the detection), broken (damaged clouds) or searched (the best of a library).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from tests.ui.synthetic import JOB_ID, Synthetic, synthetic
-from tests.ui.verdicts import ambiguous_result
+from tests.ui.verdicts import ambiguous_result, searched_result
 
 WEB = Path(__file__).resolve().parents[2] / "service" / "web"
 CONTENT_SECURITY_POLICY = "default-src 'self'"
@@ -37,6 +37,7 @@ STORIES = (
     "bare",
     "roomy",
     "broken",
+    "searched",
 )
 STEPS: tuple[dict[str, Any], ...] = (
     {"status": "accepted", "queue_position": 3},
@@ -109,6 +110,8 @@ class Stage:
             return {k: self.data.result[k] for k in ("verdict", "verdict_reason", "T_object_scene", "metrics")}
         if story == "roomy":
             return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
+        if story == "searched":
+            return searched_result(self.data)
         if story != "ambiguous":
             return self.data.result
         return ambiguous_result(self.data)

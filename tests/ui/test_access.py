@@ -100,7 +100,7 @@ def phone(context_options: dict[str, Any]) -> None:
 
 
 @pytest.mark.usefixtures("phone")
-@pytest.mark.parametrize("story", ["done", "ambiguous", "failed", "locked"])
+@pytest.mark.parametrize("story", ["done", "ambiguous", "searched", "failed", "locked"])
 def test_nothing_overflows_on_a_phone(visit: Visit, story: str) -> None:
     page = visit.open(story)
     assert page.evaluate("document.documentElement.scrollWidth") <= 360

@@ -104,9 +104,25 @@ def test_the_options_that_were_used_are_shown(visit: Visit) -> None:
     ]
 
 
+def test_a_search_shows_its_ranking(visit: Visit) -> None:
+    page = visit.open("searched")
+    assert page.locator("#ranking-note").inner_text() == "12 candidates"
+    shown = [text.split("\n") for text in page.locator("#ranking-list li").all_inner_texts()]
+    assert shown[:3] == [
+        ["a0a0a0a0a0a0", "Registered", "0.021"],
+        ["a1a1a1a1a1a1", "Rejected", "0.34"],
+        ["b0b0b0b0b0b0", "searched coarsely", "0.4"],
+    ]
+    assert len(shown) == 8
+    page.locator("#ranking-more summary").click()
+    rest = [text.split("\n") for text in page.locator("#ranking-rest li").all_inner_texts()]
+    assert [len(rest), rest[-1]] == [4, ["d0d0d0d0d0d0", "no object", "–"]]
+    assert "a0" * 32 in page.locator("#job-facts").inner_text()
+
+
 def test_results_that_know_nothing_of_all_this_are_shown_without(visit: Visit) -> None:
     page = visit.open("done")
-    for card in ("poses", "certainty", "options"):
+    for card in ("ranking", "poses", "certainty", "options"):
         expect(page.locator(f"#{card}")).to_be_hidden()
     assert "Surfaces agree" in page.locator("#verdict-reason").inner_text()
 

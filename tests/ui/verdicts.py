@@ -43,6 +43,24 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
     }
 
 
+def searched_result(data: Synthetic) -> dict[str, Any]:
+    """The made-up result as the best of a search among twelve objects."""
+
+    def candidate(number: int, stage: str, score: float | None, verdict: str | None = None) -> dict[str, Any]:
+        reason = "NO_SURFACE_IN_OBJECT" if stage == "unusable" else None
+        return {"object": f"{number:02x}" * 32, "stage": stage, "score": score, "verdict": verdict,
+                "verdict_reason": reason, "T_object_scene": None}  # fmt: skip
+
+    ranking = [
+        candidate(0xA0, "refined", 0.021, "registered"),
+        candidate(0xA1, "refined", 0.34, "rejected"),
+        *(candidate(0xB0 + k, "coarse", 0.4 + k / 100) for k in range(6)),
+        *(candidate(0xC0 + k, "signature", 0.2) for k in range(3)),
+        candidate(0xD0, "unusable", None),
+    ]
+    return data.result | {"object": ranking[0]["object"], "candidates": ranking}
+
+
 def _alternative(data: Synthetic, axis: list[float], angle: float, score: float, relation: str) -> dict[str, Any]:
     turned = similarity(1.0, rotation(axis, angle), [0, 0, 0]) @ data.T_object_scene
     return {"T_object_scene": sim3_document(turned), "score": score, "relation": relation}

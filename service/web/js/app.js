@@ -12,6 +12,7 @@ import {
 } from './panel.js';
 import { Playback } from './playback.js';
 import { LossPlot } from './plot.js';
+import { showRanking } from './ranking.js';
 import { inverse, readSim3 } from './sim3.js';
 import { Stage } from './stage.js';
 import {
@@ -50,6 +51,7 @@ async function showResult(job, result) {
   const frames = framesOf(result, trace);
   showBadge(result.verdict ?? job.status, job.id);
   if (result.verdict) showVerdict(result);
+  showRanking(result.candidates);
   showCertainty(result);
   showOptions(result.options);
   if (frames.length) showTransform(frames.at(-1).pose);

@@ -112,7 +112,8 @@ export function showFiles(api, artifacts) {
 
 export function showJob(job, result) {
   const engine = result?.engine ?? job.engine ?? {};
-  const inputs = Object.entries(job.inputs ?? {}).filter(([, value]) => typeof value === 'string' && value !== '');
+  const named = result?.candidates && result.object ? { 'object found': result.object } : {};
+  const inputs = Object.entries({ ...job.inputs, ...named }).filter(([, value]) => typeof value === 'string' && value !== '');
   fillFacts(byId('job-facts'), [
     ['Id', mono(job.id ?? '')],
     ['Kind', job.kind],

@@ -1,0 +1,27 @@
+// The ranking of a search through a library: which object it most likely is, and what became of the others.
+
+import { byId, el, show } from './dom.js';
+import { number, words } from './format.js';
+
+const SHOWN = 8;
+const STAGES = {
+  refined: 'refined', coarse: 'searched coarsely', signature: 'by signature', unusable: 'no object',
+};
+
+/** candidates as the result has them, the likeliest first; the rest folds away. */
+export function showRanking(candidates) {
+  const rows = (candidates ?? []).map((one, i) => row(one, i));
+  byId('ranking-note').textContent = rows.length ? `${rows.length} candidates` : '';
+  byId('ranking-list').replaceChildren(...rows.slice(0, SHOWN));
+  byId('ranking-rest').replaceChildren(...rows.slice(SHOWN));
+  show(byId('ranking-more'), rows.length > SHOWN);
+  show(byId('ranking'), rows.length > 0);
+}
+
+function row({ object, stage, score, verdict, verdict_reason: reason }, i) {
+  const name = el('code', { title: object }, object.slice(0, 12));
+  const end = verdict ? words(verdict) : STAGES[stage] ?? stage;
+  return el('li', { 'data-verdict': verdict ?? '', className: i === 0 ? 'first' : '' }, name,
+    el('span', { title: reason ?? '' }, end),
+    el('span', { className: 'mono' }, Number.isFinite(score) ? number(score, 3) : '–'));
+}
