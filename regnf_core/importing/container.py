@@ -9,10 +9,8 @@ from __future__ import annotations
 import zlib
 from dataclasses import dataclass
 
-from regnf_core.importing.zip_members import MAX_ENTRIES, Member, read_members
+from regnf_core.importing.zip_members import Member, read_members
 from regnf_core.importing.zip_records import malformed
-
-__all__ = ["MAX_ENTRIES", "MAX_PICKLE_BYTES", "Entry", "TorchArchive", "read_archive"]
 
 MAX_PICKLE_BYTES = 32 * 1024 * 1024
 _CRC_CHUNK = 1 << 24

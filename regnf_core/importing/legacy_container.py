@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.container import MAX_ENTRIES, MAX_PICKLE_BYTES, Entry
+from regnf_core.importing.container import MAX_PICKLE_BYTES, Entry
 from regnf_core.importing.pickle_reader import LeadingPickle, PickleLimits, read_leading_pickle
 from regnf_core.importing.pickle_values import StorageRef
+from regnf_core.importing.zip_members import MAX_ENTRIES
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.importing.container import MAX_ENTRIES, TorchArchive, read_archive
+from regnf_core.importing.container import TorchArchive, read_archive
+from regnf_core.importing.zip_members import MAX_ENTRIES
 from tests.core.importing.archives import (
     PICKLE_OF_NOTHING,
     assert_refused,
