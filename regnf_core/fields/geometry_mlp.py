@@ -8,26 +8,40 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from regnf_core.fields.activations import softplus, softplus_slope
+from regnf_core.fields.activations import ACTIVATIONS
 
 
 class GeometryMlp:
-    """Linear layers with softplus(100) between; where there are more than ``skip_at``, that one sees the input again.
+    """Linear layers with an activation between; where there are more than ``skip_at``, that one sees the input again.
 
     weights[i]: (out_i, in_i), biases[i]: (out_i,), weight normalisation already folded in. Of the last layer only the
-    first row is evaluated: the signed distance. The skip connection feeds [h, input] / sqrt 2.
+    first row is evaluated: the signed distance. The skip connection feeds [h, input] / sqrt 2; skip_at None: there is
+    none. activation: "softplus" (of 100 a, over 100), "relu" or "sine".
     """
 
-    def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], skip_at: int = 4) -> None:
+    def __init__(
+        self,
+        weights: Sequence[Tensor],
+        biases: Sequence[Tensor],
+        skip_at: int | None = 4,
+        activation: str = "softplus",
+    ) -> None:
         self.weights = [*weights[:-1], weights[-1][:1]]
         self.biases = [*biases[:-1], biases[-1][:1]]
-        self.skip_at = skip_at if len(self.weights) > skip_at else None
+        self.skip_at = skip_at if skip_at is not None and len(self.weights) > skip_at else None
+        self.activation = activation
+        self._function = ACTIVATIONS[activation]
+
+    def to(self, device: torch.device | str) -> GeometryMlp:
+        """The same network on another device."""
+        weights, biases = ([t.to(device) for t in tensors] for tensors in (self.weights, self.biases))
+        return GeometryMlp(weights, biases, self.skip_at, self.activation)
 
     def __call__(self, features: Tensor) -> Tensor:
         """Signed distance (N,) of features (N, in)."""
         h = features
         for layer in range(len(self.weights) - 1):
-            h = softplus(self._linear(layer, h, features))
+            h = self._function.value(self._linear(layer, h, features))
         return self._linear(len(self.weights) - 1, h, features).squeeze(-1)
 
     def with_gradient(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -35,8 +49,8 @@ class GeometryMlp:
         h, slopes = features, []
         for layer in range(len(self.weights) - 1):
             a = self._linear(layer, h, features)
-            slopes.append(softplus_slope(a))
-            h = softplus(a)
+            slopes.append(self._function.slope(a))
+            h = self._function.value(a)
         distance = self._linear(len(self.weights) - 1, h, features).squeeze(-1)
         gradient = self.weights[-1].expand(features.shape[0], -1)
         skipped = None

@@ -41,11 +41,10 @@ class NeusFactoFunction:
 
     def to(self, device: torch.device | str) -> NeusFactoFunction:
         """The same function with its parameters on another device."""
-        weights, biases = ([t.to(device) for t in tensors] for tensors in (self.mlp.weights, self.mlp.biases))
         grid = self.hash_encoding
         if grid is not None:
             grid = HashEncoding(grid.config, grid.table.to(device), grid.active_levels)
-        return replace(self, mlp=GeometryMlp(weights, biases, self.mlp.skip_at or SKIP_LAYER), hash_encoding=grid)
+        return replace(self, mlp=self.mlp.to(device), hash_encoding=grid)
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (N,) at points (N, 3)."""

@@ -212,10 +212,13 @@ class _Machine:
         self.push(Placeholder(kind.full_name))
 
     def build(self) -> None:
-        """State for the object below. A state dict's own attributes (its metadata) are of no use; the rest is inert."""
-        self.pop()
-        if not isinstance(self.top(), (dict, Placeholder, NumpyType)):
+        """State for the object below: kept beside a placeholder. A state dict's own (its metadata) is of no use."""
+        state = self.pop()
+        target = self.top()
+        if not isinstance(target, (dict, Placeholder, NumpyType)):
             raise pickle_error("state for something that takes none")
+        if isinstance(target, Placeholder):
+            target.state = state
 
     def persistent(self) -> None:
         storage = pickle_globals.storage(self.pop())

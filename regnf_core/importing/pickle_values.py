@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 DTYPES: dict[str, str] = {
     "FloatStorage": "float32",
@@ -31,11 +32,13 @@ class GlobalRef:
         return f"{self.module}.{self.name}"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(eq=False, slots=True)
 class Placeholder:
     """Stands for an object the reader does not make. ``full_name`` is the global that would have made it."""
 
     full_name: str
+    state: Any = None
+    """What the object would have been given as its state, usually its attributes by name. Nothing was done with it."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

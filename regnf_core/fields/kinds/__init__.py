@@ -11,6 +11,7 @@ from regnf_core.fields.kinds.mlp import MlpDescription
 from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
 from regnf_core.fields.kinds.onnx import OnnxDescription
+from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
 from regnf_core.fields.kinds.voxel_blocks import VoxelBlocksDescription
 from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 
@@ -19,6 +20,7 @@ KINDS: dict[str, type[FieldDescription]] = {
     "mlp": MlpDescription,
     "mesh": MeshDescription,
     "onnx": OnnxDescription,
+    "neural_points": NeuralPointsDescription,
     "neural_points": NeuralPointsDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,

@@ -6,7 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.families import deepsdf, instant_nsr_pl, neuralangelo, neus, sdfstudio, siren, unsupported
+from regnf_core.importing.families import (
+    deepsdf,
+    instant_nsr_pl,
+    neuralangelo,
+    neus,
+    pin_slam,
+    sdfstudio,
+    siren,
+    unsupported,
+)
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.tensors import TensorSource
@@ -23,6 +32,7 @@ FAMILIES: tuple[Family, ...] = (
     neuralangelo.convert,
     deepsdf.convert,
     siren.convert,
+    pin_slam.convert,
     unsupported.refuse,
 )
 

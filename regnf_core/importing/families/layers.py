@@ -34,36 +34,48 @@ class Layers:
         pairs = zip(self.weights, self.weights[1:], strict=False)
         return (0, *(int(after.shape[1] - before.shape[0]) for before, after in pairs))
 
+    def times(self, factor: float) -> Layers:
+        """The network whose result is ``factor`` times this one's."""
+        last = np.float32(factor)
+        return Layers(
+            (*self.weights[:-1], np.asarray(last * self.weights[-1], dtype=np.float32)),
+            (*self.biases[:-1], np.asarray(last * self.biases[-1], dtype=np.float32)),
+        )
+
     def tensors(self) -> dict[str, Float32Array]:
         """The layers under the names of the safe field file."""
         named = {f"layers.{i}.weight": weight for i, weight in enumerate(self.weights)}
         return named | {f"layers.{i}.bias": bias for i, bias in enumerate(self.biases)}
 
 
-def numbered(state: Mapping[str, Any], prefix: str) -> list[str]:
+def numbered(state: Mapping[str, Any], prefix: str, least: int = 2) -> list[str]:
     """The names ``<prefix>0``, ``<prefix>1`` ... of the layers in ``state``.
 
-    Raises FieldFormatError: TENSOR_MISSING (a gap in the numbers) or FAMILY_NOT_SUPPORTED (fewer than two layers).
+    Raises FieldFormatError: TENSOR_MISSING (a gap in the numbers) or FAMILY_NOT_SUPPORTED (fewer than ``least``).
     """
     numbers = {key.removeprefix(prefix).split(".")[0] for key in state if key.startswith(prefix)}
     layers = len(numbers)
     if layers > MAX_LAYERS or numbers != {str(i) for i in range(layers)}:
         raise FieldFormatError("the geometry network's layers are not numbered from 0 on", reason="TENSOR_MISSING")
-    if layers < 2:
-        raise FieldFormatError("a geometry network of one layer", reason="FAMILY_NOT_SUPPORTED")
+    if layers < least:
+        raise FieldFormatError(f"a geometry network of {layers} layers", reason="FAMILY_NOT_SUPPORTED")
     return [f"{prefix}{i}" for i in range(layers)]
 
 
-def read_layers(state: Mapping[str, Any], names: Sequence[str], source: TensorSource) -> Layers:
-    """The layers of these names, in order.
+def read_layers(
+    state: Mapping[str, Any], names: Sequence[str], source: TensorSource, has_biases: bool = True
+) -> Layers:
+    """The layers of these names, in order. has_biases: False where the network has none; they are zero then.
 
     Raises FieldFormatError: TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
     """
     weights, biases = [], []
     for name in names:
         weight = folded_weight(state, name, source)
-        bias = source.array(f"{name}.bias", lookup(state, f"{name}.bias"))
-        require_shape(f"{name}.bias", bias, (weight.shape[0],))
+        bias = np.zeros(weight.shape[0], dtype=np.float32)
+        if has_biases:
+            bias = source.array(f"{name}.bias", lookup(state, f"{name}.bias"))
+            require_shape(f"{name}.bias", bias, (weight.shape[0],))
         rows = slice(0, 1) if name == names[-1] else slice(None)
         weights.append(weight[rows])
         biases.append(bias[rows])

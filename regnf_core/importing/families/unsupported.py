@@ -13,9 +13,7 @@ from regnf_core.importing.upload_description import UploadDescription
 
 def refuse(checkpoint: dict[Any, Any], _source: TensorSource, _description: UploadDescription) -> ConvertedField | None:
     """None for a checkpoint of no known family. Raises FieldFormatError (FAMILY_NOT_SUPPORTED) naming a known one."""
-    if "neural_points" in checkpoint:
-        name = "PIN-SLAM"
-    elif below(checkpoint.get("model"), "encoder."):
+    if below(checkpoint.get("model"), "encoder."):
         name = "torch-ngp"
     elif below(checkpoint.get("model_state_dict"), "in_layer."):
         name = "iSDF"

@@ -98,13 +98,6 @@ def test_the_trainers_configuration_is_never_opened(tmp_path: Path) -> None:
     assert not [name for name in _opened if name.endswith((".yml", ".yaml"))]
 
 
-def test_other_families_are_refused_by_name(tmp_path: Path) -> None:
-    checkpoint = only_file(dev_data("formats", "pin_slam"), CHECKPOINTS)
-    with pytest.raises(FieldFormatError, match="PIN-SLAM") as caught:
-        convert_file(checkpoint, tmp_path, None, ImportLimits())
-    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
-
-
 def deepsdf_run() -> tuple[Path, dict[str, Path]]:
     """The reference folder, and the files of its training run: the network, all codes, the code of one shape."""
     folder = dev_data("formats", "deepsdf")
