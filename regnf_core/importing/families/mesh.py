@@ -6,7 +6,6 @@ import igl
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes import MESH_READERS
@@ -24,20 +23,24 @@ _FAR = 1e4
 def convert_mesh(format_: str, data: memoryview, wanted: UploadDescription) -> ConvertedField:
     """The exact distance to the mesh in ``data``, a file of the format that ``sniff_format`` named.
 
-    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED, and what
-    ``wanted`` is refused for.
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
+    POINT_CLOUD_WITHOUT_NORMALS, and what ``wanted`` is refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
         geometry = MESH_READERS[format_](data)
-    if len(geometry.faces) == 0:
-        raise FieldFormatError(f"the {format_} file holds no triangles", reason="MESH_INVALID")
-    return mesh_field(geometry, f"a {format_} file", wanted)
+    if len(geometry.faces) > 0:
+        return mesh_field(geometry, f"a {format_} file", wanted)
+    if format_ != "ply" or len(geometry.vertices) == 0:
+        raise malformed(f"the {format_} file holds no triangles")
+    from regnf_core.importing.families.point_cloud import convert_cloud
+
+    return convert_cloud(geometry, f"a {format_} file", wanted)
 
 
-def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription) -> ConvertedField:
-    """The exact distance to checked triangles. ``origin``: what they come from, for the report."""
-    require_family(wanted, "mesh")
-    refuse_other_entries(wanted, "mesh")
+def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, family: str = "mesh") -> ConvertedField:
+    """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
+    require_family(wanted, family)
+    refuse_other_entries(wanted, family)
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
     inside_out = _is_inside_out(vertices, faces)
@@ -53,9 +56,9 @@ def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription) -> Co
         *(f"passed over: {what}" for what in geometry.left_out),
     )
     return ConvertedField(
-        "mesh",
+        family,
         why,
-        {"family": "mesh", "source": {"family": "mesh"}, **shared_entries(wanted, bounds)},
+        {"family": "mesh", "source": {"family": family}, **shared_entries(wanted, bounds)},
         {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
         _warnings(inside_out, max(np.abs(low).max(), np.abs(high).max()) / diagonal),
     )
