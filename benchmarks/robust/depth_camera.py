@@ -9,8 +9,8 @@ from scipy import ndimage
 
 from benchmarks.robust.one_view_field import Array, DepthImage, directions
 
-PIXELS = 320
-REACH = float(np.tan(np.radians(35.0)))
+PIXELS = 400
+REACH = float(np.tan(np.radians(30.0)))
 _NOISE_PIXELS = 2.0
 
 

@@ -65,9 +65,9 @@ def table(context: Context) -> Table:
         failures_of(right) + [run for run in wrong if run["category"] != REJECTED],
         notes=[
             f"The camera stands {EYE_M:g} m above the floor, {DISTANCE_M:g} m from the object or as far as the walls "
-            "allow, and sees 70 degrees across. Everything behind what it sees is solid: the exact distance to the "
-            "surface of triangles between neighbouring pixels. Noise is alike in neighbouring pixels. The objects are "
-            "fitted fields."
+            "allow, and sees 60 degrees across in 400 pixels. Everything behind what it sees is solid: the exact "
+            "distance to the surface of triangles between neighbouring pixels. Noise is alike in neighbouring pixels. "
+            "The objects are fitted fields."
         ],
     )
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import igl
 import numpy as np
+import open3d
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 Array = NDArray[np.float64]
-_LONGEST = 0.04
+_LONGEST = 0.1
 """Longest edge of a triangle, shares of the greatest depth."""
 
 
@@ -51,10 +51,13 @@ class OneViewField:
     def __init__(self, image: DepthImage, bounds: Tensor) -> None:
         self.image = image
         self.bounds = bounds
-        # A search tree is slow over the long slivers along the lines of sight.
+        # A search tree is slow, and float32 less exact, over the long slivers along the lines of sight.
         self.vertices, self.faces = with_short_edges(*triangles(image), _LONGEST * float(image.depth.max()))
-        self._tree = igl.AABB()
-        self._tree.init(self.vertices, self.faces)
+        self._surface = open3d.t.geometry.RaycastingScene()
+        as_tensor = open3d.core.Tensor.from_numpy
+        self._surface.add_triangles(
+            as_tensor(self.vertices.astype(np.float32)), as_tensor(self.faces.astype(np.uint32))
+        )
 
     @property
     def device(self) -> torch.device:
@@ -73,10 +76,12 @@ class OneViewField:
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) float32 at points (N, 3) and its gradient (N, 3)."""
         queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64)
-        squared, _, closest = self._tree.squared_distance(self.vertices, self.faces, queries)
+        asked = open3d.core.Tensor.from_numpy(queries.astype(np.float32))
+        found = self._surface.compute_closest_points(asked, nthreads=torch.get_num_threads())
+        away = queries - found["points"].numpy()
         sign = np.where(self.sees(queries), 1.0, -1.0)
-        distance = np.sqrt(squared)
-        gradient = (queries - closest) * (sign / np.maximum(distance, 1e-12))[:, None]
+        distance = np.linalg.norm(away, axis=-1)
+        gradient = away * (sign / np.maximum(distance, 1e-12))[:, None]
         return _as_float32(sign * distance), _as_float32(gradient)
 
     def sees(self, points: Array) -> NDArray[np.bool_]:
