@@ -75,6 +75,7 @@ def truth() -> dict[str, Any]:
 def show(result: dict[str, Any]) -> bool:
     """Print the transform and its errors; whether they are within the demo's bounds."""
     console.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
+    console.print(f"             {result['verdict_detail']}")
     console.print("T_object_scene, from the scene's coordinates to the library object's:")
     for row in result["T_object_scene"]["matrix"]:
         console.print("   " + " ".join(f"{value:10.6f}" for value in row))
@@ -84,6 +85,10 @@ def show(result: dict[str, Any]) -> bool:
         ("translation", 100 * metrics["translation_error_share"], 100 * MAX_TRANSLATION_SHARE, "% of the diameter"),
         ("scale", 100 * metrics["scale_error_share"], 100 * MAX_SCALE_SHARE, "%"),
     ]
+    sigma = result["uncertainty"]
+    console.print(
+        f"sure to      {max(sigma['rotation_deg']):.2g} degrees, {sigma['scale_percent']:.2g} % in scale (1 sigma)"
+    )
     console.print("error against the truth")
     for name, value, bound, unit in errors:
         colour = "green" if value <= bound else "red"
