@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.contract.bad_input import nothing_of_a_request_stays, nothing_of_an_upload_stays
 from tests.contract.world import World, make_world
+
+__all__ = ["nothing_of_a_request_stays", "nothing_of_an_upload_stays", "world"]
 
 
 @pytest.fixture

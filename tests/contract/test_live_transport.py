@@ -99,16 +99,6 @@ def test_polls_are_answered_during_an_upload(live: Live) -> None:
     assert answers[0].status_code == 201
 
 
-def test_two_hundred_aborted_uploads_leave_nothing(live: Live) -> None:
-    data = field_bytes("aborted", 100_000)
-    for _ in range(200):
-        with live.connect() as connection:
-            connection.sendall(head_of("PUT", f"/fields/{sha256(data)}", Content_Length=len(data)) + data[:50_000])
-    eventually(lambda: live.files() == set(), "an empty store")
-    with live.client() as client:
-        assert client.put(f"/fields/{sha256(data)}", content=data).status_code == 201
-
-
 def test_a_body_shorter_than_declared(live: Live) -> None:
     data = field_bytes("short")
     with live.connect() as connection:

@@ -1,0 +1,84 @@
+"""Detections that are refused: the reason, the pointer, nothing left behind, and the next one works."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.contract.bad_input import post
+from tests.contract.world import BOX, World, assert_refused
+
+pytestmark = pytest.mark.usefixtures("nothing_of_a_request_stays")
+UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
+
+
+@pytest.mark.parametrize(
+    ("box", "pointer"),
+    [
+        pytest.param(None, "/detection", id="none"),
+        pytest.param([], "/detection", id="an empty list"),
+        pytest.param([BOX, BOX], "/detection", id="too many"),
+        pytest.param({}, "/detection/centre", id="empty"),
+        pytest.param("the chair", "/detection", id="a word"),
+        pytest.param(UNIT | {"centre": [float("nan"), 0, 0]}, "/detection/centre/0", id="NaN"),
+        pytest.param(UNIT | {"centre": [0, float("inf"), 0]}, "/detection/centre/1", id="Inf"),
+        pytest.param(UNIT | {"centre": [0, 0, float("-inf")]}, "/detection/centre/2", id="-Inf"),
+        pytest.param(UNIT | {"centre": [1e308, 0, 0]}, "/detection/centre/0", id="1e308"),
+        pytest.param(UNIT | {"centre": [10**400, 0, 0]}, "/detection/centre/0", id="10^400"),
+        pytest.param(UNIT | {"centre": ["0", 0, 0]}, "/detection/centre/0", id="a string for a number"),
+        pytest.param(UNIT | {"centre": [True, 0, 0]}, "/detection/centre/0", id="a boolean for a number"),
+        pytest.param(UNIT | {"centre": [None, 0, 0]}, "/detection/centre/0", id="null for a number"),
+        pytest.param(UNIT | {"centre": [0, 0]}, "/detection/centre", id="two coordinates"),
+        pytest.param(UNIT | {"centre": [0, 0, 0, 0]}, "/detection/centre", id="four coordinates"),
+        pytest.param(UNIT | {"size": [1, 0, 1]}, "/detection/size/1", id="zero extent"),
+        pytest.param(UNIT | {"size": [1, -1, 1]}, "/detection/size/1", id="negative extent"),
+        pytest.param(UNIT | {"size": [1, 1, float("nan")]}, "/detection/size/2", id="NaN extent"),
+        pytest.param(UNIT | {"rotation_quaternion_xyzw": [0, 0, 0, 0]}, "/detection", id="zero quaternion"),
+        pytest.param(
+            UNIT | {"rotation_quaternion_xyzw": [0, 0, 1]},
+            "/detection/rotation_quaternion_xyzw",
+            id="three parts of a quaternion",
+        ),
+        pytest.param(
+            UNIT | {"rotation_quaternion_xyzw": [0, 0, 0, 1e308]},
+            "/detection/rotation_quaternion_xyzw/3",
+            id="a quaternion of 1e308",
+        ),
+        pytest.param(
+            UNIT | {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]},
+            "/detection/rotation",
+            id="a matrix of determinant -1",
+        ),
+        pytest.param(UNIT | {"score": 1.5}, "/detection/score", id="score above 1"),
+        pytest.param(UNIT | {"score": -0.1}, "/detection/score", id="score below 0"),
+        pytest.param(UNIT | {"score": True}, "/detection/score", id="score a boolean"),
+        pytest.param(UNIT | {"score": float("nan")}, "/detection/score", id="score NaN"),
+        pytest.param(UNIT | {"label": ""}, "/detection/label", id="empty label"),
+        pytest.param(UNIT | {"label": "a" * 201}, "/detection/label", id="label of 201"),
+        pytest.param(UNIT | {"label": "a\r\nX-Bad: 1"}, "/detection/label", id="label with CR/LF"),
+        pytest.param(UNIT | {"label": "a\u202eb"}, "/detection/label", id="label with RTL"),
+        pytest.param(UNIT | {"label": "a\0b"}, "/detection/label", id="label with NUL"),
+        pytest.param(UNIT | {"id": 1}, "/detection/id", id="an id"),
+        pytest.param({"min": [0, 0, 0], "max": [1, -1, 1]}, "/detection", id="min above max"),
+        pytest.param({"min": [0, 0, 0], "max": [1, 0, 1]}, "/detection", id="min equal to max"),
+        pytest.param({"min": [0, 0, 0]}, "/detection/max", id="min alone"),
+        pytest.param(UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, "/detection/centre", id="both spellings"),
+    ],
+)
+def test_boxes(world: World, box: Any, pointer: str) -> None:
+    problem = assert_refused(post(world, world.valid_request() | {"detection": box}), 422, "INVALID_DETECTION")
+    assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        {"min": [1.1, 0, 0], "max": [1.2, 1, 1]},
+        {"centre": [150.0, 50.0, 200.0], "size": [500.0, 20.0, 40.0]} | {"centre": [-1500.0, 50.0, 200.0]},
+        # its corner points at the scene's corner, but stays short of it: only a slanted axis tells
+        {"centre": [1.8, 1.8, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0.38268343, 0.92387953]},
+    ],
+)
+def test_a_box_wholly_outside_the_scene(world: World, box: dict[str, Any]) -> None:
+    assert_refused(post(world, world.valid_request() | {"detection": box}), 422, "DETECTION_OUTSIDE_SCENE")

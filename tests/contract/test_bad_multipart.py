@@ -1,0 +1,101 @@
+"""Multipart bodies that are refused: a stable reason, nothing left behind, and the next good upload works."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.contract.bad_input import GOOD, PNG, TOO_LARGE, announced
+from tests.contract.world import World, assert_refused, make_world
+
+pytestmark = pytest.mark.usefixtures("nothing_of_an_upload_stays")
+
+
+def part(name: str, data: bytes, file: bool = False) -> bytes:
+    kind = f'form-data; name="{name}"' + ('; filename="f"' if file else "")
+    return f"--x\r\nContent-Disposition: {kind}\r\n\r\n".encode() + data + b"\r\n"
+
+
+FILE = part("file", GOOD, file=True)
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "reason"),
+    [
+        pytest.param(b"".join(part(f"p{i}", b"") for i in range(100)), 400, "UNKNOWN_PART", id="a hundred parts"),
+        pytest.param(FILE + FILE, 400, "DUPLICATE_PART", id="two files"),
+        pytest.param(FILE + part("description", b"{}") * 2, 400, "DUPLICATE_PART", id="duplicate names"),
+        pytest.param(part("description", b" " * 20_000) + FILE, 413, "REQUEST_TOO_LARGE", id="a huge text field"),
+        pytest.param(part("description", b"{}"), 400, "MISSING_PART", id="no file"),
+        pytest.param(part("file", b"", file=True), 400, "UPLOAD_EMPTY", id="an empty file"),
+        pytest.param(part("file", TOO_LARGE, file=True), 413, "UPLOAD_TOO_LARGE", id="a file too large"),
+        pytest.param(part("file", PNG, file=True), 415, "FIELD_NOT_RECOGNISED", id="a PNG"),
+        pytest.param(
+            FILE + part("description", b'{"label": 5}'), 422, "INVALID_DESCRIPTION", id="a label that is no text"
+        ),
+        pytest.param(FILE + part("description", b'{"unknown": 5}'), 422, "INVALID_DESCRIPTION", id="unknown member"),
+        pytest.param(
+            FILE + part("description", b'{"level_mask": true}'), 422, "INVALID_DESCRIPTION", id="boolean for a number"
+        ),
+        pytest.param(FILE + part("description", b"{"), 400, "MALFORMED_JSON", id="bad JSON"),
+        pytest.param(
+            FILE + part("description", json.dumps({"label": "\ud800"}).encode()),
+            400,
+            "MALFORMED_JSON",
+            id="half a surrogate pair",
+        ),
+        pytest.param(
+            b"--x\r\nContent-Disposition: form-data\r\n\r\nx\r\n", 400, "UNKNOWN_PART", id="a part without a name"
+        ),
+        pytest.param(b"--x\r\n" + b"X: y\r\n" * 20 + b"\r\nx\r\n", 400, "MALFORMED_MULTIPART", id="twenty headers"),
+        pytest.param(b"--x\r\nX: " + b"y" * 9000 + b"\r\n\r\nx\r\n", 400, "MALFORMED_MULTIPART", id="a huge header"),
+        pytest.param(
+            b'--x\r\nContent-Disposition: form-data; name="file"\r\nContent-Transfer-Encoding: base64\r\n\r\nAA\r\n',
+            400,
+            "MALFORMED_MULTIPART",
+            id="base64",
+        ),
+    ],
+)
+def test_multipart_refused(world: World, body: bytes, status: int, reason: str) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    assert_refused(world.client.post("/fields", content=body + b"--x--\r\n", headers=headers), status, reason)
+
+
+def test_a_digest_of_a_multipart_body_is_compared_with_all_of_it(world: World) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x", "Content-Digest": announced(GOOD)}
+    whole = FILE + b"--x--\r\n"
+    assert_refused(world.client.post("/fields", content=whole, headers=headers), 400, "DIGEST_MISMATCH")
+    assert list(world.blobs.list("")) == []
+    headers["Content-Digest"] = announced(whole)
+    taken = world.client.post("/fields", content=whole, headers=headers)
+    assert taken.status_code == 201
+    assert world.client.delete(taken.json()["links"]["self"]).status_code == 204
+
+
+@pytest.mark.parametrize("reason", ["UNKNOWN_PART", "DUPLICATE_PART"])
+def test_a_thousand_parts_are_refused_at_the_first_odd_one(tmp_path: Any, reason: str) -> None:
+    world = make_world(tmp_path, max_upload_bytes=1 << 20)
+    name = "p" if reason == "UNKNOWN_PART" else "description"
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    body = part(name, b"{}") * 1001 + b"--x--\r\n"
+    assert_refused(world.client.post("/fields", content=body, headers=headers), 400, reason)
+    world.client.close()
+
+
+def test_multipart_that_breaks_off_is_refused(world: World) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    assert_refused(world.client.post("/fields", content=FILE, headers=headers), 400, "MALFORMED_MULTIPART")
+
+
+def test_a_boundary_continued_beyond_all_counting_is_refused(world: World) -> None:
+    headers = {"Content-Type": f"multipart/form-data; boundary*{'9' * 5000}=x"}
+    assert_refused(world.client.post("/fields", content=b"x", headers=headers), 400, "MALFORMED_MULTIPART")
+
+
+@pytest.mark.parametrize("boundary", ["y" * 71, "", '"'])
+def test_boundaries_that_cannot_be_used_are_refused(world: World, boundary: str) -> None:
+    headers = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
+    assert_refused(world.client.post("/fields", content=FILE, headers=headers), 400, "MALFORMED_MULTIPART")
