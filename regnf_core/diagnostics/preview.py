@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
@@ -32,7 +34,7 @@ def preview(result: RegistrationResult) -> Image.Image:
     scene = _surfels(result.scene_samples, SCENE_COLOUR)
     start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOUR)
     end = _placed(result.object_samples, result.T_object_scene, OBJECT_COLOUR)
-    up = axis_vector(str(result.options["sampling"]["up_axis"])).numpy()
+    up = axis_vector(_up_axis(result.options)).numpy()
     direction = _best_direction(scene, up)
     edge = _PANEL * _OVERSAMPLING
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
@@ -44,6 +46,12 @@ def preview(result: RegistrationResult) -> Image.Image:
         sheet.paste(panel, (number * _PANEL, _CAPTION))
     _captions(sheet, result)
     return sheet
+
+
+def _up_axis(options: dict[str, Any]) -> str:
+    """The scene's vertical axis as far as the options say it."""
+    robust = options["robust"]["up_axis"] if options["preset"] == "robust" else None
+    return str(robust or options["sampling"]["up_axis"])
 
 
 def residual_colours(shares: Floats) -> Floats:

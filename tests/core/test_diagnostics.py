@@ -14,9 +14,10 @@ import trimesh
 from PIL import Image
 
 from regnf_core.diagnostics import ranking_document, result_document, write_artifacts
-from regnf_core.diagnostics.preview import residual_colours
+from regnf_core.diagnostics.preview import _up_axis, residual_colours
 from regnf_core.diagnostics.splats import Surfels, View, render
 from regnf_core.library import Candidate
+from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.sim3 import Sim3
 from regnf_core.verdicts import VERDICT_REASONS
@@ -195,3 +196,16 @@ def test_the_ramp_runs_from_dark_to_yellow_and_clips() -> None:
     np.testing.assert_allclose(colours[0], [0.18, 0.20, 0.46])
     np.testing.assert_allclose(colours[1], [0.98, 0.88, 0.18])
     np.testing.assert_allclose(colours[2], colours[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "up"),
+    [
+        ({}, "z"),
+        ({"robust": {"up_axis": "y"}}, "y"),
+        ({"sampling": {"up_axis": "x"}}, "x"),
+        ({"preset": "paper", "sampling": {"up_axis": "x"}, "robust": {"up_axis": "y"}}, "x"),
+    ],
+)
+def test_the_picture_stands_on_the_axis_that_the_preset_was_told(options: dict[str, object], up: str) -> None:
+    assert _up_axis(RegistrationOptions.from_dict(options).to_dict()) == up

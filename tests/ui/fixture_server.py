@@ -4,7 +4,7 @@
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
 (live without an event stream), locked (wants a token), bare (a result with little in it), roomy (with the scene round
-the detection), broken (damaged clouds) or searched (the best of a library).
+the detection), broken (damaged clouds), searched (the best of a library) or tipped (y is up).
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ STORIES = (
     "roomy",
     "broken",
     "searched",
+    "tipped",
 )
 STEPS: tuple[dict[str, Any], ...] = (
     {"status": "accepted", "queue_position": 3},
@@ -112,6 +113,8 @@ class Stage:
             return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
         if story == "searched":
             return searched_result(self.data)
+        if story == "tipped":
+            return self.data.result | {"options": {"preset": "robust", "robust": {"up_axis": "y"}}}
         if story != "ambiguous":
             return self.data.result
         return ambiguous_result(self.data)

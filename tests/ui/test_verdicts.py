@@ -120,6 +120,14 @@ def test_a_search_shows_its_ranking(visit: Visit) -> None:
     assert "a0" * 32 in page.locator("#job-facts").inner_text()
 
 
+def test_the_axis_that_the_options_name_points_up(visit: Visit) -> None:
+    page = visit.open("tipped")
+    assert page.locator("#up").input_value() == "y"
+    tipped = canvas_pixels(page)
+    page.locator("#up").select_option("z")
+    assert changed_share(tipped, canvas_pixels(page)) > 0.2
+
+
 def test_results_that_know_nothing_of_all_this_are_shown_without(visit: Visit) -> None:
     page = visit.open("done")
     for card in ("ranking", "poses", "certainty", "options"):

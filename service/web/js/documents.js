@@ -23,6 +23,12 @@ export function detectionOf(job, result) {
   return { centre: box.centre, size: box.size, quaternion: isVector(turn, 4) ? turn : [0, 0, 0, 1] };
 }
 
+/** The axis of the scene that points up, as far as the options say. */
+export function upAxisOf(options) {
+  const said = (options?.preset === 'robust' && options.robust?.up_axis) || options?.sampling?.up_axis;
+  return ['x', 'y', 'z'].includes(said) ? said : 'z';
+}
+
 /** The artifacts as [{ name, bytes }], whether they are listed as names, as objects or as a mapping. */
 export function artifactsOf(result) {
   const listed = result?.artifacts;

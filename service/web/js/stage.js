@@ -2,7 +2,7 @@
 
 import { Cloud, geometryFromPly, isColourful } from './cloud.js';
 import { wireBox } from './box.js';
-import { detectionOf } from './documents.js';
+import { detectionOf, upAxisOf } from './documents.js';
 import { byId, el, show } from './dom.js';
 import { residualHistogram } from './plot.js';
 import { readResiduals } from './residuals.js';
@@ -27,6 +27,8 @@ export class Stage {
     this.plain.after = new Cloud(geometryFromPly(object), { nearer: 0.6 });
     show(byId('canvas'));
     this.viewer = new Viewer(byId('canvas'), byId('gizmo'));
+    byId('up').value = upAxisOf(result.options);
+    this.viewer.setUp(byId('up').value);
     show(byId('gizmo'));
     this.poses = frames.map((frame) => inverse(frame.pose));
     this.addCloud('scene', this.plain.scene, 'cloud-scene');
