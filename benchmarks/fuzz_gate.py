@@ -2,10 +2,10 @@
 
     python -m benchmarks.fuzz_gate --cases 200000 --seed 1 [--output benchmarks/results/fuzz_gate.md] [--keep FOLDER]
 
-A case fails if a stage raises anything but FieldFormatError, takes longer than five seconds, needs more than 2 GiB of
-address space, leaves a file, or brings about an import, a program, a socket or the opening of a file; through the
-whole gate also if the process crashes or is stopped. Failing cases are written to FOLDER. Ends with status 1 if there
-are any.
+A case fails if a stage raises anything but FieldFormatError, takes five seconds of processor time, needs more
+than 2 GiB of address space, leaves a file, or brings about an import, a program, a socket or the opening of a file;
+through the whole gate also if the process crashes or is stopped. Failing cases are written to FOLDER. Ends with status
+1 if there are any.
 """
 
 from __future__ import annotations
@@ -181,9 +181,9 @@ def report(tally: Tally, arguments: argparse.Namespace, seconds: float) -> str:
             "",
             table(tally),
             "",
-            f"Slowest case in its stage: {slowest:.2f} s ({where}), of {CASE_S:.0f} s allowed; slowest through the "
-            f"whole gate: {tally.slowest_gate:.1f} s. Largest resident size of the process that runs the stages: "
-            f"{tally.peak_bytes / 1e6:.0f} MB, of {MEMORY_BYTES / 1e6:.0f} MB of address space allowed.",
+            f"Slowest case in its stage: {slowest:.2f} s of processor time ({where}), of {CASE_S:.0f} s allowed; "
+            f"through the whole gate: {tally.slowest_gate:.1f} s. Largest resident size of the process that runs the "
+            f"stages: {tally.peak_bytes / 1e6:.0f} MB, of {MEMORY_BYTES / 1e6:.0f} MB of address space allowed.",
             f"Feedback: half of the cases are traced line by line; {tally.lines} lines of the gate's own modules were "
             f"reached, and {tally.finds} cases kept because they took a new step, for later ones to build upon.",
         ]

@@ -30,6 +30,7 @@ from tests.core.importing.archives import torch_zip
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.fuzzing.cases import STAGES, make_case
 from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
+from tests.core.importing.fuzzing.stages import run_stage
 
 ROOT = Path(__file__).resolve().parents[3]
 CASES = 3_000
@@ -189,6 +190,12 @@ def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
     assert all(any(key.endswith(reason) for key in outcomes) for reason in deep)
     assert len({key.split()[1] for key in outcomes}) > 40
     assert fuzzed["finds"] > 50
+
+
+def test_every_sound_file_is_taken(seeds: Seeds, tmp_path: Path) -> None:
+    """What is refused undamaged would never get deeper damaged."""
+    files = {"checkpoint": seeds.archive, "field file": seeds.field_file, **seeds.others}
+    assert {kind: run_stage("file", data, tmp_path) for kind, data in files.items()} == dict.fromkeys(files, "taken")
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -12,6 +12,7 @@ from typing import Any
 from regnf_core import importing
 
 _FOLDER = str(next(iter(importing.__path__)))
+_FAMILIES = os.path.join(_FOLDER, "families")
 _Local = Callable[[FrameType, str, Any], Any]
 
 
@@ -42,7 +43,9 @@ class Coverage:
         code = frame.f_code
         ours = self._ours.get(code)
         if ours is None:
-            ours = self._ours[code] = os.path.dirname(code.co_filename) == _FOLDER
+            ours = self._ours[code] = code.co_filename.startswith(_FOLDER) and not code.co_filename.startswith(
+                _FAMILIES
+            )
         return self._tracer(code) if ours else None
 
     def _tracer(self, code: CodeType) -> _Local:

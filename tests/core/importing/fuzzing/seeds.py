@@ -9,6 +9,7 @@ from pathlib import Path
 
 from regnf_core.importing.container import read_archive
 from tests.core.importing.fuzzing.archive_model import Record, archive_bytes
+from tests.core.importing.fuzzing.other_files import make_others
 
 EMPTY = "90"
 """Key of a storage without a byte."""
@@ -23,6 +24,8 @@ class Seeds:
     tensors: tuple[tuple[str, str, tuple[int, ...]], ...]
     """Name, storage key and shape of each tensor of the checkpoint's field."""
     field_file: bytes
+    others: dict[str, bytes]
+    """Sound files of other kinds."""
 
     @property
     def archive(self) -> bytes:
@@ -70,7 +73,7 @@ def make_seeds(folder: Path) -> Seeds:
     }
     odd |= {"s": np.float64(2.0), "i": np.int32(3), "set": {1, 2}, "f": frozenset("ab"), "big": 1 << 70, "path": folder}
     pickles = [bytes(archive.read("data.pkl")), *(pickle.dumps(odd, protocol) for protocol in (2, 4, 5))]
-    seeds = Seeds(records, tuple(pickles), _tensors_of(pickles[0]), (folder / FIELD_NAME).read_bytes())
+    seeds = Seeds(records, tuple(pickles), _tensors_of(pickles[0]), (folder / FIELD_NAME).read_bytes(), make_others())
     upload.unlink()
     (folder / FIELD_NAME).unlink()
     return seeds

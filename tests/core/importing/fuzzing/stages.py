@@ -42,7 +42,7 @@ class Watch:
     @contextmanager
     def over(self, stage: str) -> Iterator[None]:
         """Watch one case."""
-        self._armed, self._files = True, stage == "file"
+        self._armed, self._files = True, stage in ("file", "other")
         try:
             yield
         finally:
@@ -50,7 +50,7 @@ class Watch:
 
 
 def run_stage(stage: str, data: bytes, folder: Path) -> str:
-    """The reason of the refusal, or "taken". Any other exception passes through. ``folder`` is for the stage "file"."""
+    """The reason of the refusal, or "taken". Any other exception passes through. ``folder`` is for whole files."""
     try:
         match stage:
             case "container":
@@ -61,7 +61,7 @@ def run_stage(stage: str, data: bytes, folder: Path) -> str:
                 _tensors(data)
             case "header":
                 read_header(memoryview(data))
-            case "file":
+            case "file" | "other":
                 _file(data, folder)
     except FieldFormatError as error:
         return error.reason

@@ -33,7 +33,7 @@ _TRACED_SHARE = 0.5
 
 
 class TimeLimitError(BaseException):
-    """A case took too long. No stage may catch it."""
+    """A case took too much processor time. No stage may catch it."""
 
 
 def _late(*_: object) -> None:
@@ -55,7 +55,7 @@ class Fuzzer:
 
     def _warm_up(self) -> None:
         """Have every module loaded that sound files need."""
-        for data in (self.seeds.archive, self.seeds.field_file, b""):
+        for data in (self.seeds.archive, self.seeds.field_file, b"", *self.seeds.others.values()):
             for stage in STAGES:
                 run_stage(stage, data, self.scratch)
         run_stage("pickle", self.seeds.pickles[1], self.scratch)
@@ -68,9 +68,9 @@ class Fuzzer:
         for index in range(first, first + count):
             stage = STAGES[index % len(STAGES)]
             data = make_case(Random(f"{self.seed} {index}"), stage, self.seeds, self.finds[stage])
-            begun = time.perf_counter()
+            begun = time.process_time()
             outcome, fault = self.run_case(stage, data, Random(index).random() < _TRACED_SHARE)
-            seconds = time.perf_counter() - begun
+            seconds = time.process_time() - begun
             if seconds > slowest:
                 slowest, slowest_at = seconds, f"{stage} {index}"
             outcomes[f"{stage} {outcome}"] += 1
@@ -93,14 +93,14 @@ class Fuzzer:
         self._write_down(stage, data)
         known, before = len(sys.modules), len(self.coverage.steps)
         try:
-            signal.setitimer(signal.ITIMER_REAL, CASE_S)
+            signal.setitimer(signal.ITIMER_PROF, CASE_S)
             with self.watch.over(stage), self.coverage.over() if traced else nullcontext():
                 outcome = run_stage(stage, data, self.scratch)
             fault = ""
         except (TimeLimitError, Exception) as error:  # noqa: BLE001 (whatever it is, it is the find)
             outcome, fault = type(error).__name__, f"{error!r:.300}"
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         if len(self.coverage.steps) > before and len(self.finds[stage]) < _MOST_FINDS:
             self.finds[stage].append(data)
         return outcome, fault or self._traces(known)
@@ -132,7 +132,7 @@ def _peak_bytes() -> int:
 def main(arguments: list[str]) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGALRM, _late)
+    signal.signal(signal.SIGPROF, _late)
     fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2])
     if "torch" in sys.modules:
         raise RuntimeError("the stages loaded torch")
