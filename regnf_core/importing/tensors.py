@@ -24,6 +24,7 @@ _STORED: dict[str, np.dtype[Any]] = {
     "float16": np.dtype("<f2"),
     "bfloat16": np.dtype("<u2"),
 }
+_STORED_WHOLE: dict[str, np.dtype[Any]] = {"int64": np.dtype("<i8"), "int32": np.dtype("<i4")}
 _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
 _FINITE_CHUNK = 1 << 20
 _ALIGNMENT = 16
@@ -68,15 +69,22 @@ class TensorSource:
         TENSOR_NOT_FINITE or ARCHIVE_CRC_MISMATCH.
         """
         ref = as_tensor(name, value)
-        stored = _stored_type(name, ref)
+        values = self._values(name, ref, _stored_type(name, ref, _STORED, "real"))
+        if ref.storage.dtype == "bfloat16":
+            values = (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
+        return finite_float32(name, values)
+
+    def integers(self, name: str, value: object) -> npt.NDArray[np.int64]:
+        """The tensor called ``name``, of whole numbers, as a contiguous array. Raises what :meth:`array` raises."""
+        ref = as_tensor(name, value)
+        return np.ascontiguousarray(self._values(name, ref, _stored_type(name, ref, _STORED_WHOLE, "whole")), np.int64)
+
+    def _values(self, name: str, ref: TensorRef, stored: np.dtype[Any]) -> npt.NDArray[Any]:
         count = math.prod(ref.shape)
         self._spend(name, 4 * count)
         raw = self._storage(name, ref.storage, stored, count)
         _check_dense(name, ref, count)
-        values = _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
-        if ref.storage.dtype == "bfloat16":
-            values = (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
-        return finite_float32(name, values)
+        return _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
 
     def _spend(self, name: str, size: int) -> None:
         self._budget -= size
@@ -137,11 +145,11 @@ def lookup(values: Mapping[Any, Any], name: str) -> object:
     return values[name]
 
 
-def _stored_type(name: str, ref: TensorRef) -> np.dtype[Any]:
+def _stored_type(name: str, ref: TensorRef, types: Mapping[str, np.dtype[Any]], sort: str) -> np.dtype[Any]:
     storage = ref.storage
-    stored = _STORED.get(storage.dtype or "")
+    stored = types.get(storage.dtype or "")
     if stored is None:
-        raise tensor_error(f"{name} is stored as {storage.type_name}; real numbers are needed", "TENSOR_DTYPE")
+        raise tensor_error(f"{name} is stored as {storage.type_name}; {sort} numbers are needed", "TENSOR_DTYPE")
     if not _DEVICE.fullmatch(storage.device):
         raise tensor_error(f"{name} has no data of its own (device {storage.device!r})", "TENSOR_DEVICE")
     if not ref.plain:

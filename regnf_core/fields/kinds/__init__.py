@@ -5,13 +5,13 @@ docs/families.md tells how to add one.
 
 from __future__ import annotations
 
+from regnf_core.fields.kinds.grid_mlp import GridMlpDescription
 from regnf_core.fields.kinds.kind import FieldDescription
 from regnf_core.fields.kinds.mesh import MeshDescription
 from regnf_core.fields.kinds.mlp import MlpDescription
 from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
 from regnf_core.fields.kinds.neus_facto import NeusFactoDescription
 from regnf_core.fields.kinds.onnx import OnnxDescription
-from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
 from regnf_core.fields.kinds.voxel_blocks import VoxelBlocksDescription
 from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 
@@ -21,7 +21,7 @@ KINDS: dict[str, type[FieldDescription]] = {
     "mesh": MeshDescription,
     "onnx": OnnxDescription,
     "neural_points": NeuralPointsDescription,
-    "neural_points": NeuralPointsDescription,
+    "grid_mlp": GridMlpDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,
 }

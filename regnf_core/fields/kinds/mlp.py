@@ -70,6 +70,20 @@ class MlpDescription(FieldDescription):
         return build_mlp(self, tensors)
 
 
+def check_plain_layers(tensors: Mapping[str, TensorSpec], width: int) -> None:
+    """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the layers take ``width`` columns and follow one another.
+
+    The tensors' names must have been checked.
+    """
+    layers = count_layers(tensors)
+    require(1 <= layers <= MAX_LAYERS, f"the field has {layers} layers, expected 1 to {MAX_LAYERS}")
+    for layer in range(layers):
+        rows = count_rows(tensors, f"layers.{layer}.weight")
+        require_shape(tensors, f"layers.{layer}.weight", (rows, width))
+        require_shape(tensors, f"layers.{layer}.bias", (rows,))
+        width = rows
+
+
 def count_layers(names: Mapping[str, object]) -> int:
     """How many layers' weights there are."""
     return sum(name.startswith("layers.") and name.endswith(".weight") for name in names)

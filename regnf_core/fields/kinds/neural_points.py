@@ -9,12 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from annotated_types import Ge, Le
 
 from regnf_core.fields.kinds.kind import FieldDescription
-from regnf_core.fields.kinds.mlp import count_layers
-from regnf_core.fields.kinds.neus_facto import MAX_LAYERS
+from regnf_core.fields.kinds.mlp import check_plain_layers, count_layers
 from regnf_core.fields.kinds.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
 from regnf_core.fields.kinds.voxel_grid import Length
-
-__all__ = ["NeuralPointsDescription", "count_layers"]
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -46,7 +43,6 @@ class NeuralPointsDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
-        require(1 <= layers <= MAX_LAYERS, f"the field has {layers} layers, expected 1 to {MAX_LAYERS}")
         names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
         require_names(tensors, names | {"points", "features"} | ({"orientations"} if self.oriented else set()))
         points = count_rows(tensors, "points")
@@ -56,12 +52,7 @@ class NeuralPointsDescription(FieldDescription):
         require_shape(tensors, "features", (points, shape[1]))
         if self.oriented:
             require_shape(tensors, "orientations", (points, 4))
-        width = shape[1] + 3
-        for layer in range(layers):
-            rows = count_rows(tensors, f"layers.{layer}.weight")
-            require_shape(tensors, f"layers.{layer}.weight", (rows, width))
-            require_shape(tensors, f"layers.{layer}.bias", (rows,))
-            width = rows
+        check_plain_layers(tensors, shape[1] + 3)
 
     def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[NeuralPointsFunction]:
         """The points as a field."""

@@ -14,6 +14,7 @@ from regnf_core.importing.families import (
     pin_slam,
     sdfstudio,
     siren,
+    torch_ngp,
     unsupported,
 )
 from regnf_core.importing.families.converted import ConvertedField
@@ -33,6 +34,7 @@ FAMILIES: tuple[Family, ...] = (
     deepsdf.convert,
     siren.convert,
     pin_slam.convert,
+    torch_ngp.convert,
     unsupported.refuse,
 )
 

@@ -14,7 +14,7 @@ from regnf_core.importing.upload_description import UploadDescription
 def refuse(checkpoint: dict[Any, Any], _source: TensorSource, _description: UploadDescription) -> ConvertedField | None:
     """None for a checkpoint of no known family. Raises FieldFormatError (FAMILY_NOT_SUPPORTED) naming a known one."""
     if below(checkpoint.get("model"), "encoder."):
-        name = "torch-ngp"
+        name = "torch-ngp radiance field"
     elif below(checkpoint.get("model_state_dict"), "in_layer."):
         name = "iSDF"
     else:
