@@ -5,6 +5,7 @@ docs/families.md tells how to add one.
 
 from __future__ import annotations
 
+from regnf_core.fields.kinds.feature_volumes import FeatureVolumesDescription
 from regnf_core.fields.kinds.grid_mlp import GridMlpDescription
 from regnf_core.fields.kinds.kind import FieldDescription
 from regnf_core.fields.kinds.mesh import MeshDescription
@@ -22,6 +23,7 @@ KINDS: dict[str, type[FieldDescription]] = {
     "onnx": OnnxDescription,
     "neural_points": NeuralPointsDescription,
     "grid_mlp": GridMlpDescription,
+    "feature_volumes": FeatureVolumesDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,
 }

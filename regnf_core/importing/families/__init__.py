@@ -11,6 +11,7 @@ from regnf_core.importing.families import (
     instant_nsr_pl,
     neuralangelo,
     neus,
+    nglod,
     pin_slam,
     sdfstudio,
     siren,
@@ -35,6 +36,7 @@ FAMILIES: tuple[Family, ...] = (
     siren.convert,
     pin_slam.convert,
     torch_ngp.convert,
+    nglod.convert,
     unsupported.refuse,
 )
 
