@@ -14,6 +14,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 _LONGEST = 0.1
 """Longest edge of a triangle, shares of the greatest depth."""
+_ON_SURFACE = 1e-4  # shares of the greatest depth: nearer, float32 does not tell the way to the surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,10 @@ class OneViewField:
         sign = np.where(self.sees(queries), 1.0, -1.0)
         distance = np.linalg.norm(away, axis=-1)
         gradient = away * (sign / np.maximum(distance, 1e-12))[:, None]
+        # On the surface itself the way to the nearest point is rounding error: the normal of the triangle is meant,
+        # which winds away from the camera.
+        on_surface = distance < _ON_SURFACE * float(self.image.depth.max())
+        gradient[on_surface] = -found["primitive_normals"].numpy()[on_surface]
         return _as_float32(sign * distance), _as_float32(gradient)
 
     def sees(self, points: Array) -> NDArray[np.bool_]:

@@ -56,6 +56,7 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     metrics = {
         **evidence.of(winner),
         "object_diameter": diameter,
+        "shadow_share_scene": problem.view.shadow_share,
         "iterations": float(len(outcome.finalists.trail.steps)),
         "finalists": float(evidence.scores.numel()),
     }

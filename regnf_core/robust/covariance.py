@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.frame import WorkingFrame
-from regnf_core.robust.levenberg import geman_mcclure_weights
+from regnf_core.robust.levenberg import geman_mcclure_weights, kernel_widths
 from regnf_core.robust.residuals import Residuals
 from regnf_core.sim3 import Sim3
 from regnf_core.sim3_tangent import skew
@@ -74,13 +74,15 @@ def _witnesses(r: Residuals, width: float, points: Tensor) -> _Witnesses:
     # Where the scene lies outside the object, the object lies inside the scene: the same error, the other sign.
     sign = torch.cat([torch.ones(n), -torch.ones(total - n)]).double()
     values = r.values[0].double() * sign
-    weights = geman_mcclure_weights(values, width)
+    widths = kernel_widths(r, width)
+    widths = widths[0].double() if isinstance(widths, Tensor) else widths
+    weights = geman_mcclure_weights(values, widths)
     agreeing = (weights > _LEAST_WEIGHT).nonzero().squeeze(-1)
     if len(agreeing) < 2 * r.jacobian.shape[-1]:  # a pose without support: all that there is
         agreeing = torch.arange(total)
     generator = torch.Generator().manual_seed(_SEED)
     some = agreeing[torch.randperm(len(agreeing), generator=generator)[:_PROPAGATED]]
-    squares = (values / width).square()
+    squares = (values / widths).square()
     curvatures = weights * share * (1.0 - 3.0 * squares) / (1.0 + squares)
     J = r.jacobian[0].double() * sign[:, None]
     return _Witnesses(points[some].double(), J[some], values[some], (weights * share)[some], curvatures[some])

@@ -110,6 +110,4 @@ def run_stage(
     scores = disagreement(refined.residuals, stage.score_width)
     kept = distinct(refined.T, scores, extremes, _APART, stage.keep)
     kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]
-    r = refined.residuals
-    chosen = Residuals(r.values[kept], r.jacobian[kept], r.cosines[kept], r.scene_count)
-    return Finalists(select(refined.T, kept), scores[kept], chosen, trail.keep(kept))
+    return Finalists(select(refined.T, kept), scores[kept], refined.residuals.of(kept), trail.keep(kept))

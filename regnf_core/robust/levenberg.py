@@ -12,6 +12,7 @@ from regnf_core.robust.poses import perturb
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, residuals
 from regnf_core.sim3 import Sim3
 
+_UNSEEN_WIDTH = 0.3  # of the others' kernel
 _DAMPING_START = 1e-2
 _DAMPING_RANGE = (1e-7, 1e4)
 _SPREAD_QUANTILE, _SPREAD_FACTOR = 0.3, 6.7
@@ -44,9 +45,22 @@ def fitting_width(r: Residuals, least: float) -> Tensor:
     return (_SPREAD_FACTOR * spread).clamp(least, max(least, _WIDEST))
 
 
+def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
+    """Kernel widths of all residuals: narrower for object samples that a partial scene does not show.
+
+    The nearest surface to them is the border of the unseen, and would draw them there.
+    """
+    unseen = r.unseen()
+    return width if unseen is None else torch.where(unseen, _UNSEEN_WIDTH * width, width)
+
+
 def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
-    """(H,): mean over each direction of the Geman-McClure loss scaled to 0..1, the two directions averaged."""
-    loss = r.values.square() / (r.values.square() + width**2)
+    """(H,): mean over each direction of the Geman-McClure loss scaled to 0..1, the two directions averaged.
+
+    A narrower kernel bends the loss alike at zero, and so saturates lower.
+    """
+    widths = kernel_widths(r, width)
+    loss = r.values.square() / (r.values.square() + widths**2) * (widths / width) ** 2
     return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
 
 
@@ -86,7 +100,7 @@ def minimise(
 def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tensor]:
     """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64; each direction has the same total influence."""
     n, m = r.scene_count, r.values.shape[1] - r.scene_count
-    weights = geman_mcclure_weights(r.values, width)
+    weights = geman_mcclure_weights(r.values, kernel_widths(r, width))
     weights = torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
     weighted = (r.jacobian * weights[..., None]).mT.double()
     return weighted @ r.jacobian.double(), (weighted @ r.values.double()[..., None]).squeeze(-1)
@@ -118,4 +132,5 @@ def _choose_residuals(better: Tensor, first: Residuals, second: Residuals) -> Re
         torch.where(better[:, None, None], first.jacobian, second.jacobian),
         torch.where(better[:, None], first.cosines, second.cosines),
         first.scene_count,
+        first.partial,
     )

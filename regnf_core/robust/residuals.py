@@ -27,17 +27,21 @@ class DistanceModel(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU."""
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
+
+    partial: the surface was seen from one side, and what lies behind it is not known.
+    """
 
     points: Tensor
     values: Tensor
     normals: Tensor
+    partial: bool = False
 
     def __len__(self) -> int:
         return int(self.points.shape[0])
 
     def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.points[index], self.values[index], self.normals[index])
+        return Samples(self.points[index], self.values[index], self.normals[index], self.partial)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) carried onto the surface along their normals."""
@@ -49,12 +53,26 @@ class Residuals:
     """Residuals (H, N + M) of H poses, scene samples first; Jacobian (H, N + M, 7); agreement of the normals.
 
     ``cosines`` (H, N + M): cosine between a sample's normal and the other field's gradient where the pose carries it.
+    partial: the scene was seen from one side.
     """
 
     values: Tensor
     jacobian: Tensor
     cosines: Tensor
     scene_count: int
+    partial: bool = False
+
+    def unseen(self) -> Tensor | None:
+        """(H, N + M) bool: object samples within a partial scene's matter, where nobody looked; None: all was seen."""
+        if not self.partial:
+            return None
+        inside = self.values < 0
+        inside[:, : self.scene_count] = False
+        return inside
+
+    def of(self, poses: Tensor) -> Residuals:
+        """Those of some poses."""
+        return Residuals(self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, self.partial)
 
 
 def residuals(scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3) -> Residuals:
@@ -64,7 +82,11 @@ def residuals(scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, 
     forth, J_forth, cos_forth = _scene_to_object(obj, A, s, R, t)
     back, J_back, cos_back = _object_to_scene(scene, B, s, R, t)
     return Residuals(
-        torch.cat([forth, back], 1), torch.cat([J_forth, J_back], 1), torch.cat([cos_forth, cos_back], 1), len(A)
+        torch.cat([forth, back], 1),
+        torch.cat([J_forth, J_back], 1),
+        torch.cat([cos_forth, cos_back], 1),
+        len(A),
+        A.partial,
     )
 
 

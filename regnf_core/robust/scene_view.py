@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -14,6 +14,7 @@ from regnf_core.robust.frame import WorkingField, WorkingFrame
 from regnf_core.robust.proxy import ProxyField, proxy_of
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.samples import sample_scene_surface
+from regnf_core.robust.shadow import shadow_walls
 from regnf_core.robust.support import support
 
 _FEWEST = 30  # samples in front of the supports; with fewer, the supports are kept after all
@@ -23,14 +24,15 @@ _FEWEST = 30  # samples in front of the supports; with fewer, the supports are k
 class SceneView:
     """The surface in the detection box. Working frame: the box's centre at 0, its diagonal 1.
 
-    foreground: the samples that stand in front of floors and walls · spacing: between samples · evaluations: of the
-    scene's field, that it took to make this.
+    foreground: the samples that stand in front of floors and walls · spacing: between samples · shadow_share: of the
+    samples, set aside as the walls of shadows · evaluations: of the scene's field, that it took to make this.
     """
 
     frame: WorkingFrame
     detection: OrientedBox
     foreground: Samples
     spacing: float
+    shadow_share: float
     evaluations: int
 
     def field(self, scene: SdfField) -> WorkingField:
@@ -44,15 +46,19 @@ class SceneView:
 
 
 def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions, seed: int) -> SceneView:
-    """Sample the scene's surface in the box and set floors and walls aside. Deterministic for ``seed``.
+    """Sample the scene's surface in the box; set floors, walls and the borders of shadows aside.
 
-    Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
-    InvalidInputError (FIELD_NOT_FINITE).
+    Deterministic for ``seed``. Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError
+    (NO_SURFACE_IN_DETECTION), InvalidInputError (FIELD_NOT_FINITE).
     """
     generator = torch.Generator().manual_seed(seed)
     counted = CountingField(scene)
     sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
-    foreground = sampled.samples[~support(sampled.samples, generator)]
+    walls = shadow_walls(sampled.samples, generator)
+    seen = replace(sampled.samples[~walls], partial=bool(walls.any()))
+    foreground = seen[~support(seen, generator)]
     if len(foreground) < _FEWEST:
-        foreground = sampled.samples
-    return SceneView(sampled.frame, detection, foreground, sampled.spacing, counted.evaluations)
+        foreground = seen if len(seen) >= _FEWEST else sampled.samples
+    return SceneView(
+        sampled.frame, detection, foreground, sampled.spacing, float(walls.float().mean()), counted.evaluations
+    )

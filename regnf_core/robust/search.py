@@ -13,6 +13,7 @@ from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, resid
 from regnf_core.robust.samples import some
 from regnf_core.sim3 import Sim3
 
+_UNSEEN_LOSS = 0.6  # of object samples that a partial scene does not show
 _CHUNK = 512  # poses at once: bounds memory, and the working set stays in the cache
 
 
@@ -39,10 +40,14 @@ ROUNDS = (
 def disagreement(r: Residuals, width: float) -> Tensor:
     """(H,) scores in 0..1, smaller is better: Geman-McClure losses, made worse where the normals disagree.
 
-    Each direction counts half, however many samples it has.
+    Each direction counts half, however many samples it has. Object samples that a partial scene does not
+    show count in between.
     """
     agreement = width**2 / (r.values.square() + width**2) * r.cosines.clamp(0.0, 1.0)
     loss = 1.0 - agreement
+    unseen = r.unseen()
+    if unseen is not None:
+        loss = torch.where(unseen, loss.clamp_max(_UNSEEN_LOSS), loss)
     return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
 
 
