@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -95,7 +96,9 @@ def _meets(pose: Sim3, others: Sequence[Sim3], points: Tensor, tolerance: float)
 def _row(name: str, instance: str, runs: Sequence[Run]) -> list[str]:
     order = "any turn about z" if instance in ANY_TURN else f"{TURNS.get(instance, 1)}-fold about z"
     order += f", nearly {len(nearly(instance))} more" if nearly(instance) else ""
-    relations = sorted({relation for run in runs for relation in run.get("relations", [])})
+    # Which turns stand for a whole axis is a matter of chance.
+    said = {relation for run in runs for relation in run.get("relations", [])}
+    relations = sorted({re.sub(r"^-?\d+ degrees (.*any turn)", r"turns \1", relation) for relation in said})
     return [
         name,
         order,
