@@ -82,3 +82,10 @@ def test_boxes(world: World, box: Any, pointer: str) -> None:
 )
 def test_a_box_wholly_outside_the_scene(world: World, box: dict[str, Any]) -> None:
     assert_refused(post(world, world.valid_request() | {"detection": box}), 422, "DETECTION_OUTSIDE_SCENE")
+
+
+def test_a_label_that_nobody_knows_is_a_note(world: World) -> None:
+    """It is kept, and asks for nothing: there is no list of labels."""
+    box = BOX | {"label": "a thing that no detector names"}
+    answer = world.client.post("/register?dry_run=true", json=world.valid_request() | {"detection": box})
+    assert answer.status_code == 200

@@ -1,0 +1,82 @@
+"""docs/bad-inputs.md says what the tests show: each test it names exists, and a file's row has its outcome."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from service.reasons import REASONS
+from tests.gate.bad_containers import CONTAINERS
+from tests.gate.bad_pickles import PICKLES
+from tests.gate.bad_tensors import TENSORS
+
+ROOT = Path(__file__).resolve().parents[2]
+SECTIONS = ("Transport", "Names", "Container", "Pickle", "Tensors", "Boxes", "Requests")
+_WORD = re.compile(r"`([^`]+)`")
+_REASON = re.compile(r"`([A-Z][A-Z0-9_]+)`")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the page: what is sent, what is answered, and the tests' ids."""
+
+    section: str
+    given: str
+    answer: str
+    tests: tuple[str, ...]
+
+
+@cache
+def rows() -> tuple[Row, ...]:
+    section, found = "", []
+    for line in (ROOT / "docs" / "bad-inputs.md").read_text(encoding="utf-8").splitlines():
+        if line.startswith("## "):
+            section = line.removeprefix("## ")
+        cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+        if line.startswith("| ") and section in SECTIONS and cells[0] != "Input":
+            found.append(Row(section, cells[0], cells[1], tuple(_WORD.findall(cells[2]))))
+    return tuple(found)
+
+
+@cache
+def collected() -> frozenset[str]:
+    """The id of every test in the files that the page names, with and without its parameters."""
+    files = sorted({test.partition("::")[0] for row in rows() for test in row.tests})
+    command = [sys.executable, "-m", "pytest", "-o", "addopts=-p no:dash", "--collect-only", "-q", *files]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    ids = {line for line in done.stdout.splitlines() if "::" in line}
+    return frozenset(ids | {name.partition("[")[0] for name in ids})
+
+
+def test_the_page_has_every_section() -> None:
+    assert tuple(dict.fromkeys(row.section for row in rows())) == SECTIONS
+    assert len(rows()) > 150
+
+
+def test_every_row_names_tests_that_exist() -> None:
+    missing = {row.given: [test for test in row.tests if test not in collected()] for row in rows()}
+    assert {given: tests for given, tests in missing.items() if tests} == {}
+    assert [row.given for row in rows() if not row.tests] == []
+
+
+@pytest.mark.parametrize(
+    ("test", "files"), [("test_container", CONTAINERS), ("test_pickle", PICKLES), ("test_tensors", TENSORS)]
+)
+def test_every_bad_file_has_its_row_and_its_outcome(test: str, files: dict[str, tuple[object, str]]) -> None:
+    said = {name: row for row in rows() for name in row.tests if name.startswith(f"tests/gate/test_files.py::{test}[")}
+    for given, (_, outcome) in files.items():
+        row = said.pop(f"tests/gate/test_files.py::{test}[{given}]")
+        assert (row.given, row.answer.replace("`", "")) == (given, outcome)
+    assert said == {}
+
+
+def test_every_reason_is_one_that_is_documented() -> None:
+    known = set(REASONS) | set(_REASON.findall((ROOT / "docs" / "import-gate.md").read_text(encoding="utf-8")))
+    assert {reason for row in rows() for reason in _REASON.findall(row.answer)} <= known
