@@ -96,6 +96,11 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
         from regnf_core.importing.families.onnx import convert_onnx
 
         return convert_onnx(data, tensor_bytes, wanted)
+    if kind == "sqlite":
+        from regnf_core.importing.families.nvblox import convert_database
+        from regnf_core.importing.sqlite_source import TableSource
+
+        return convert_database(TableSource(data), tensor_bytes, wanted)
     if kind in MESH_FORMATS:
         from regnf_core.importing.families.mesh import convert_mesh
 

@@ -7,6 +7,7 @@ from regnf_core.importing.sniff_mesh import sniff_mesh
 HEAD_BYTES = 512
 """How many first bytes are enough to name every format."""
 
+_SQLITE_MAGIC = b"SQLite format 3\x00"
 _ZIP_LOCAL_HEADER = b"PK\x03\x04"
 _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
@@ -20,7 +21,8 @@ _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 
 
 def sniff_format(head: bytes) -> str | None:
-    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"onnx"``, a mesh's format; None: not taken.
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, or
+    None for what is not taken.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
@@ -31,6 +33,8 @@ def sniff_format(head: bytes) -> str | None:
         return "torch-legacy"
     if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head).endswith(b".npy"):
         return "npz"
+    if head.startswith(_SQLITE_MAGIC):
+        return "sqlite"
     if head[8:9] == b"{":
         return "safetensors"
     return "onnx" if _may_be_onnx(head) else sniff_mesh(head)
@@ -50,7 +54,7 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     return (
         "FORMAT_NOT_RECOGNISED",
-        "none of the formats that are taken: torch.save archives, safetensors, npz, ONNX, meshes",
+        "none of the formats that are taken: torch.save archives, safetensors, npz, SQLite, ONNX, meshes",
     )
 
 

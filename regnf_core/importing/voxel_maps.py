@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
 
 from regnf_core.importing.tensors import Float32Array, tensor_error
 
@@ -29,6 +28,8 @@ def fill_unseen(values: Float32Array, seen: BoolArray, voxel_size: float, outwar
     So what was never seen is free space beyond what was seen. values, seen: (B, R, R, R), at least one voxel seen in
     each block; ``values`` is changed in place. outward: -1 where values are negative in free space.
     """
+    from scipy import ndimage  # takes a moment to load, which most files need not wait for
+
     partial = np.flatnonzero(~seen.all(axis=(1, 2, 3)))
     at_once = max(1, _VOXELS_AT_ONCE // seen[0].size)
     for start in range(0, partial.size, at_once):

@@ -56,7 +56,7 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     blocks = _read(arrays)
     truncation, why, warnings = _truncation(blocks, wanted)
     values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
-    fill_unseen(values, blocks.seen, blocks.voxel_size)
+    fill_unseen(values, blocks.seen, blocks.voxel_size, wanted.sign or 1)
     low, high = seen_extent(blocks.keys, blocks.seen)
     description = {
         "family": "voxel_blocks",

@@ -32,8 +32,9 @@ def test_names_meshes() -> None:
     assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"
 
 
-def test_an_archive_of_arrays_is_named() -> None:
+def test_arrays_and_databases_are_named() -> None:
     assert sniff_format(zip_bytes([("points.npy", b"\x93NUMPY")])) == "npz"
+    assert sniff_format(b"SQLite format 3\x00".ljust(100, b"\x01")) == "sqlite"
 
 
 def test_a_zip_cut_short_is_still_a_torch_archive() -> None:

@@ -102,6 +102,15 @@ def test_unseen_voxels_count_as_free_space_behind_what_was_seen(tmp_path: Path) 
     torch.testing.assert_close(distance, torch.tensor([0.05, -0.05, 0.0, 0.05, 0.15]), rtol=0, atol=1e-5)
 
 
+def test_a_map_with_the_other_sign_is_filled_the_other_way(tmp_path: Path) -> None:
+    arrays = ball()
+    points = torch.from_numpy(np.random.default_rng(1).uniform(-1.5, 1.5, (200, 3)))
+    converted(tmp_path, arrays)
+    expected = open_field(tmp_path / FIELD_NAME).signed_distance(points)
+    converted(tmp_path, arrays | {"value_000": -arrays["value_000"]}, {"sign": -1})
+    torch.testing.assert_close(open_field(tmp_path / FIELD_NAME).signed_distance(points), expected)
+
+
 def test_the_uploader_may_tell_the_truncation(tmp_path: Path) -> None:
     converted(tmp_path, ball(4.0), {"truncation": 0.1, "world_scale": 10.0})
     surface = torch.from_numpy(10.0 * (CENTRE + np.array([RADIUS + 0.05, 0.0, 0.0])))[None]
