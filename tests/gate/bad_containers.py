@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from random import Random
 
+import numpy as np
 import torch
 
 from tests.core.importing.archives import patched, torch_zip, zip_bytes
@@ -72,6 +73,29 @@ def deflate_bomb(seeds: Seeds) -> bytes:
     packed = packer.compress(zeros) + packer.flush()
     claims = {"method": 8, "size": len(zeros), "crc": zlib.crc32(zeros)}
     return archive_bytes(record(seeds, weight_entry(seeds), data=packed, local=claims, central=claims))
+
+
+def arrays(**values: object) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **values)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def npz_bomb(_: Seeds) -> bytes:
+    """A dense grid of zeros, true to its size: 84 MB in 80 kB."""
+    return arrays(sdf=np.zeros((256, 256, 320), np.float32), bounds=np.array([[-1.0] * 3, [1.0] * 3]))
+
+
+def npz_that_lies(_: Seeds) -> bytes:
+    """A megabyte of zeros that claims to be a hundred bytes."""
+    packer = zlib.compressobj(wbits=-15)
+    packed = packer.compress(bytes(1 << 20)) + packer.flush()
+    claims = {"method": 8, "size": 100}
+    return archive_bytes([Record(b"sdf.npy", packed, local=claims, central=claims)])
+
+
+def npz_of_objects(_: Seeds) -> bytes:
+    return arrays(sdf=np.array([[[print]]], dtype=object), bounds=np.array([[-1.0] * 3, [1.0] * 3]))
 
 
 def overlap(seeds: Seeds) -> bytes:
@@ -148,6 +172,9 @@ CONTAINERS: Files = {
     "a nested zip": (lambda s: zip_bytes([("model.ckpt", s.archive)]), "415 FIELD_NOT_RECOGNISED"),
     "a zip for a pickle": (lambda s: s.with_pickle(s.archive), "rejected PICKLE_PROTOCOL"),
     "deflate bomb": (deflate_bomb, "rejected ARCHIVE_COMPRESSED_ENTRY"),
+    "deflate bomb in an npz": (npz_bomb, "rejected TENSOR_TOO_LARGE"),
+    "an npz that inflates to more than it claims": (npz_that_lies, "rejected ARCHIVE_DEFLATE_MALFORMED"),
+    "pickled objects in an npz": (npz_of_objects, "rejected NPY_OBJECT_ARRAY"),
     "overlapping entries": (overlap, "rejected ARCHIVE_OVERLAP"),
     "a million entries": (a_million_entries, "rejected ARCHIVE_TOO_MANY_ENTRIES"),
     "duplicate data.pkl": (
