@@ -125,7 +125,7 @@ def _refine(
             run.report("optimising", done)
 
         finalists.append(refine_contender(scene, view, one.field(), one.model, contender, options, seed, on_step))
-    return sorted(finalists, key=lambda finalist: finalist.rank)
+    return sorted(finalists, key=lambda finalist: finalist.conclusion.rank)
 
 
 def _register_first(

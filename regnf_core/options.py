@@ -114,6 +114,9 @@ class RobustOptions:
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
     """Rotations that the search starts from, evenly spread over all; with an up axis a tenth of them, about it.
     More when a pose that a person sees was missed; the search takes longer in proportion."""
+    feature_draws: Annotated[int, Ge(0), Le(64)] = 4
+    """Feature matches (FPFH and RANSAC, scale-free) searched from as well when the first search ends in a rejection.
+    Each costs about a tenth of a second, and only then. More help in heavy clutter; with 0 the first search decides."""
     scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
     """Most samples of the scene's surface in the detection box. More when the object is small in its box."""
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500

@@ -23,15 +23,19 @@ class Run:
 
     def __init__(self, progress: ProgressCallback | None) -> None:
         self.seconds: dict[str, float] = {}
+        self._done = 0.0
         self._progress = progress
 
     def report(self, phase: Phase, done: float) -> None:
+        """A second attempt begins at an earlier phase: the share done stands still until it is overtaken."""
+        self._done = max(self._done, min(done, 1.0))
         if self._progress is not None:
-            self._progress(phase, min(done, 1.0))
+            self._progress(phase, self._done)
 
     @contextmanager
     def phase(self, name: Phase) -> Iterator[None]:
         self.report(name, STARTS[name])
         start = time.perf_counter()
         yield
-        self.seconds[f"seconds_{name}"] = time.perf_counter() - start
+        key = f"seconds_{name}"
+        self.seconds[key] = self.seconds.get(key, 0.0) + time.perf_counter() - start

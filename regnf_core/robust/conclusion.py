@@ -30,10 +30,15 @@ class Conclusion:
     verdict: Verdict
     reason: str
     winner: int
+    T_work: Sim3
     T: Sim3
     metrics: dict[str, float]
     alternatives: list[Alternative]
-    covariance: Tensor
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """The smaller, the better: rejections last, among the others what agrees less."""
+        return self.verdict == "rejected", self.metrics["score"]
 
 
 def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -> Conclusion:
@@ -60,10 +65,11 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
         "iterations": float(len(outcome.finalists.trail.steps)),
         "finalists": float(evidence.scores.numel()),
     }
-    return Conclusion(decision, reason, winner, T, metrics, alternatives, _covariance(problem, T_work))
+    return Conclusion(decision, reason, winner, T_work, T, metrics, alternatives)
 
 
-def _covariance(problem: Problem, T_work: Sim3) -> Tensor:
+def pose_covariance(problem: Problem, T_work: Sim3) -> Tensor:
+    """(7, 7) of a pose between the working frames, in object units: see :mod:`regnf_core.robust.covariance`."""
     A, B = problem.A, problem.B
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
     r = residuals(problem.scene_field, problem.object_field, A, B, batch)

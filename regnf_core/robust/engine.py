@@ -84,10 +84,12 @@ def find_candidates(
     generator: torch.Generator,
     T_start: Sim3 | None = None,
     rounds: tuple[Round, ...] = ROUNDS,
+    more_seeds: Sim3 | None = None,
 ) -> tuple[Sim3, Tensor]:
     """Candidate poses (H,) and their scores (H,), best first, from the samples alone: no field is evaluated.
 
-    With ``T_start``, a single pose in working frames, only its neighbourhood is searched.
+    With ``T_start``, a single pose in working frames, only its neighbourhood is searched; ``more_seeds`` (H,) are
+    searched beside those of the geometry.
     """
     if T_start is not None:
         T = seeds_about(T_start, _WARM_SEEDS, generator)
@@ -100,6 +102,8 @@ def find_candidates(
             _rotations(options),
             torch.tensor(SCALE_FACTORS),
         )
+    if more_seeds is not None:
+        T = join([T, more_seeds])
     return search(view.proxy, model.proxy, view.foreground, model.samples, T, model.extremes, generator, rounds)
 
 

@@ -44,11 +44,6 @@ class Finalist:
     conclusion: Conclusion
     evaluations: int
 
-    @property
-    def rank(self) -> tuple[bool, float]:
-        """Rejected objects last; among the others, what agrees better comes first."""
-        return self.conclusion.verdict == "rejected", self.conclusion.metrics["score"]
-
 
 @dataclass(frozen=True, eq=False)
 class Contender:

@@ -13,6 +13,7 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.result import RegistrationResult
 from regnf_core.robust.conclusion import Conclusion, conclude
 from regnf_core.robust.engine import ITERATIONS, Outcome, Problem, find_candidates, pose_problem, refine_candidates
+from regnf_core.robust.features import feature_seeds
 from regnf_core.robust.object_model import ObjectModel, model_object
 from regnf_core.robust.report import result_of
 from regnf_core.robust.scene_view import SceneView, view_scene
@@ -44,19 +45,47 @@ def register_robust(
         view = scene_view or view_scene(scene_field, detection, options.robust, seed)
         model = object_model or model_object(obj, options.robust)
         problem = pose_problem(view, model, scene, obj, options.robust, generator)
-    T_start = None if T_object_scene_start is None else problem.in_working_frames(T_object_scene_start)
-    outcome, conclusion = _attempt(problem, options, generator, run, T_start)
-    if T_start is not None and conclusion.verdict == "rejected":
-        outcome, conclusion = _attempt(problem, options, generator, run, None)
+    outcome, conclusion = _best_attempt(problem, options, generator, seed, run, T_object_scene_start)
     evaluations = view.evaluations + scene.evaluations + obj.evaluations
     return result_of(problem, outcome, conclusion, options, seed, evaluations)
 
 
+def _best_attempt(
+    problem: Problem,
+    options: RegistrationOptions,
+    generator: torch.Generator,
+    seed: int,
+    run: Run,
+    T_object_scene_start: Sim3 | None,
+) -> tuple[Outcome, Conclusion]:
+    """Round a given start, else from the geometry, else from feature matches too: dearer ways where others fail."""
+    if T_object_scene_start is not None:
+        start = problem.in_working_frames(T_object_scene_start)
+        found = _attempt(problem, options, generator, run, T_start=start)
+        if found[1].verdict != "rejected":
+            return found
+    found = _attempt(problem, options, generator, run)
+    if found[1].verdict != "rejected" or options.robust.feature_draws == 0:
+        return found
+    matched = feature_seeds(problem.view.foreground, problem.model.samples, options.robust.feature_draws, seed)
+    if matched.scale.numel() == 0:
+        return found
+    again = _attempt(problem, options, generator, run, more_seeds=matched)
+    return min(found, again, key=lambda one: one[1].rank)
+
+
 def _attempt(
-    problem: Problem, options: RegistrationOptions, generator: torch.Generator, run: Run, T_start: Sim3 | None
+    problem: Problem,
+    options: RegistrationOptions,
+    generator: torch.Generator,
+    run: Run,
+    T_start: Sim3 | None = None,
+    more_seeds: Sim3 | None = None,
 ) -> tuple[Outcome, Conclusion]:
     with run.phase("initialising"):
-        candidates, _ = find_candidates(problem.view, problem.model, options.robust, generator, T_start)
+        candidates, _ = find_candidates(
+            problem.view, problem.model, options.robust, generator, T_start, more_seeds=more_seeds
+        )
     with run.phase("optimising"):
         outcome = refine_candidates(problem, candidates, options.robust, generator, _steps(run))
     with run.phase("verifying"):

@@ -8,7 +8,7 @@ import torch
 
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import IterationRecord, RegistrationResult, SurfaceSamples
-from regnf_core.robust.conclusion import Conclusion
+from regnf_core.robust.conclusion import Conclusion, pose_covariance
 from regnf_core.robust.engine import Outcome, Problem
 from regnf_core.robust.finalists import Trail
 from regnf_core.robust.poses import select
@@ -41,7 +41,7 @@ def result_of(
         seed=seed,
         options=options.to_dict(),
         alternatives=conclusion.alternatives,
-        covariance=conclusion.covariance,
+        covariance=pose_covariance(problem, conclusion.T_work),
         symmetry=model.symmetry.group(),
     )
 
