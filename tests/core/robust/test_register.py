@@ -89,6 +89,21 @@ def test_the_same_seed_gives_the_same_numbers_and_the_report_is_whole() -> None:
     assert (torch.linalg.eigvalsh(first.covariance) > 0).all()
 
 
+def test_the_number_of_threads_does_not_change_the_answer() -> None:
+    scene, obj = room(chair_pose()), chair()
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            results.append(run(scene, obj, detection(), seed=5))
+    finally:
+        torch.set_num_threads(before)
+    one, two = results
+    assert one.verdict == two.verdict
+    assert pose_distance(one.T_object_scene, two.T_object_scene, one) < 1e-4
+
+
 def test_a_can_has_a_free_axis_and_it_is_told() -> None:
     result = run(can_room(), can(), OrientedBox.from_corners([-0.2, -0.2, 0.0], [0.2, 0.2, 0.5]))
     assert result.verdict == "ambiguous"
