@@ -39,7 +39,7 @@ def table(context: Context) -> Table:
         [
             accuracy_section(
                 f"Lying, upside down and {RANDOM} random orientations of the scene, the object's frame turned at "
-                f"random as well; no up axis given; {PAIRS_EACH} of the pairs, main and held out, for each orientation.",
+                f"random as well; no up axis given; {PAIRS_EACH} of the pairs, main and held out, for each one.",
                 "box",
                 runs,
             )
