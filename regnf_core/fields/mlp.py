@@ -133,10 +133,7 @@ def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> Fun
     Tensors keep their device; they must have passed :meth:`MlpDescription.check_tensors`. Columns of sines and cosines
     that were never used are left out.
     """
-    encoding = description.positional_encoding
-    positional = None
-    if encoding is not None and encoding.used and encoding.degree > 0:
-        positional = PositionalEncoding.with_two_pi(encoding.degree, encoding.two_pi)
+    positional = PositionalEncoding.of(description.positional_encoding)
     live = 3 + (positional.width if positional is not None else 0)
     layers = []
     count = count_layers(tensors)

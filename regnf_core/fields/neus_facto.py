@@ -103,10 +103,7 @@ def build_neus_facto(description: NeusFactoDescription, tensors: Mapping[str, Te
     layers = sum(name.endswith(".weight") for name in tensors)
     weights = [tensors[f"layers.{i}.weight"].float() for i in range(layers)]
     biases = [tensors[f"layers.{i}.bias"].float() for i in range(layers)]
-    encoding = description.positional_encoding
-    positional = None
-    if encoding is not None and encoding.used and encoding.degree > 0:
-        positional = PositionalEncoding.with_two_pi(encoding.degree, encoding.two_pi)
+    positional = PositionalEncoding.of(description.positional_encoding)
     grid = None
     if description.hash is not None and description.use_grid:
         grid = HashEncoding(description.hash, tensors["hash_table"].float(), description.level_mask)

@@ -4,31 +4,49 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from regnf_core.fields.kinds.neus_facto import PositionalEncodingDescription
+
+_A, _B, _C, _D = 0.8506508, 0.5257311, 0.809017, 0.309017
+_ICOSAHEDRON = (
+    *((_A, 0.0, _B), (_C, 0.5, _D), (_B, _A, 0.0), (1.0, 0.0, 0.0), (_C, 0.5, -_D), (_A, 0.0, -_B), (_D, _C, -0.5)),
+    *((0.0, _B, -_A), (0.5, _D, -_C), (0.0, 1.0, 0.0), (-_B, _A, 0.0), (-_D, _C, -0.5), (0.0, _B, _A)),
+    *((-_D, _C, 0.5), (_D, _C, 0.5), (0.5, _D, _C), (0.5, -_D, _C), (0.0, 0.0, 1.0), (-0.5, _D, _C)),
+    *((-_C, 0.5, _D), (-_C, 0.5, -_D)),
+)
+"""Corners and middles of an icosahedron's edges, one of each opposite pair, in the order of mip-NeRF 360's matrix P."""
 
 
 @dataclass(frozen=True)
 class PositionalEncoding:
     """sin and cos of every coordinate times base_frequency 2^k, k = 0 .. degree-1 (Mildenhall et al. 2020).
 
-    Order: for each axis all frequencies, as sines; then the same block as cosines.
+    Order: for each axis all frequencies, as sines; then the same block as cosines. ``off_axis``: in place of the three
+    coordinates the lengths along 21 directions, those of an icosahedron (Barron et al. 2022).
     """
 
     degree: int
     base_frequency: float = 1.0
     """1 as sdfstudio has it, 2 pi as nerfstudio has it."""
+    off_axis: bool = False
 
     @classmethod
-    def with_two_pi(cls, degree: int, two_pi: bool) -> PositionalEncoding:
-        """The encoding with base frequency 2 pi, or 1."""
-        return cls(degree, 2.0 * math.pi if two_pi else 1.0)
+    def of(cls, description: PositionalEncodingDescription | None) -> PositionalEncoding | None:
+        """The encoding of a description, or None where there is none in use."""
+        if description is None or not description.used or not description.degree:
+            return None
+        frequency = 2.0 * math.pi if description.two_pi else 1.0
+        return cls(description.degree, frequency * description.base_frequency, description.off_axis)
 
     @property
     def width(self) -> int:
         """Number of features of an encoded point."""
-        return 6 * self.degree
+        return 2 * self.degree * (len(_ICOSAHEDRON) if self.off_axis else 3)
 
     def encode(self, points: Tensor) -> Tensor:
         """Features (N, 6 degree) at points (N, 3)."""
@@ -40,11 +58,17 @@ class PositionalEncoding:
         sines, cosines = encoded.chunk(2, dim=-1)
         by_sine, by_cosine = gradient.chunk(2, dim=-1)
         by_angle = by_sine * cosines - by_cosine * sines  # (N, 3 degree)
-        by_axis = by_angle.reshape(*encoded.shape[:-1], 3, self.degree)
-        return (by_axis * self._frequencies(encoded)).sum(dim=-1)
+        by_axis = by_angle.reshape(*encoded.shape[:-1], -1, self.degree)
+        by_length = (by_axis * self._frequencies(encoded)).sum(dim=-1)
+        return by_length @ self._directions(encoded) if self.off_axis else by_length
 
     def _angles(self, points: Tensor) -> Tensor:
-        return (points.unsqueeze(-1) * self._frequencies(points)).flatten(start_dim=1)
+        lengths = points @ self._directions(points).T if self.off_axis else points
+        return (lengths.unsqueeze(-1) * self._frequencies(points)).flatten(start_dim=1)
+
+    @staticmethod
+    def _directions(like: Tensor) -> Tensor:
+        return torch.tensor(_ICOSAHEDRON, dtype=like.dtype, device=like.device)
 
     def _frequencies(self, like: Tensor) -> Tensor:
         return self.base_frequency * 2.0 ** torch.arange(self.degree, dtype=like.dtype, device=like.device)

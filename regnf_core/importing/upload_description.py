@@ -67,6 +67,10 @@ class UploadDescription:
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Which axis of the field points up. Kept with the field, changes nothing about it."""
+    input_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
+    """The factor of the coordinates before the network sees them, where no file has it."""
+    output_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
+    """The factor of the network's results, where no file has it."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
     """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
     label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None

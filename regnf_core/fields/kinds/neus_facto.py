@@ -34,11 +34,15 @@ class PositionalEncodingDescription:
     two_pi: bool = False
     used: bool = True
     """False: the network has the columns, but they were always fed zeros."""
+    base_frequency: Annotated[float, Ge(1e-6), Le(1e6)] = 1.0
+    """A factor of all frequencies."""
+    off_axis: bool = False
+    """True: of the lengths along 21 directions, those of an icosahedron, in place of the three coordinates."""
 
     @property
     def width(self) -> int:
         """Columns of the network's input."""
-        return 6 * self.degree
+        return 2 * self.degree * (21 if self.off_axis else 3)
 
 
 @dataclass(frozen=True, kw_only=True)

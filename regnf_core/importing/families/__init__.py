@@ -9,6 +9,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
     deepsdf,
     instant_nsr_pl,
+    isdf,
     neuralangelo,
     neus,
     nglod,
@@ -37,6 +38,7 @@ FAMILIES: tuple[Family, ...] = (
     pin_slam.convert,
     torch_ngp.convert,
     nglod.convert,
+    isdf.convert,
     unsupported.refuse,
 )
 

@@ -13,10 +13,7 @@ from regnf_core.importing.upload_description import UploadDescription
 
 def refuse(checkpoint: dict[Any, Any], _source: TensorSource, _description: UploadDescription) -> ConvertedField | None:
     """None for a checkpoint of no known family. Raises FieldFormatError (FAMILY_NOT_SUPPORTED) naming a known one."""
-    if below(checkpoint.get("model"), "encoder."):
-        name = "torch-ngp radiance field"
-    elif below(checkpoint.get("model_state_dict"), "in_layer."):
-        name = "iSDF"
-    else:
+    if not below(checkpoint.get("model"), "encoder."):
         return None
-    raise FieldFormatError(f"this is a {name} checkpoint, which is not supported", reason="FAMILY_NOT_SUPPORTED")
+    message = "this is a checkpoint of torch-ngp's radiance fields, which have no distances and are not supported"
+    raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
