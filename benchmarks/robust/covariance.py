@@ -7,9 +7,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from scipy.stats import binomtest
+
 from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.cases import HELD_OUT, MAIN, UNDER_TRAINED, Case, Pair, load_pairs
-from benchmarks.robust.ellipsoid import calibration, mahalanobis_squared, nearest_truth, pose_error
+from benchmarks.robust.ellipsoid import Calibration, calibration, mahalanobis_squared, nearest_truth, pose_error
 from benchmarks.robust.judging import SUCCESSES
 from benchmarks.robust.report import Bar, Section, Table, by_group, failures_of, median
 from benchmarks.robust.runs import Context, Job, Run, run_all
@@ -32,8 +34,7 @@ def table(context: Context) -> Table:
     for name, some in groups.items():
         squares = [run["mahalanobis_squared"] for run in some if run["category"] in SUCCESSES]
         found = calibration(squares)
-        share = f"{100 * found.inside:.1f} % of {found.count}"
-        bars.append(Bar(f"{name}: 90 to 99 % inside", share, 0.9 <= found.inside <= 0.99))
+        bars.append(Bar(f"{name}: 90 to 99 % inside", _share(found), 0.9 <= found.inside <= 0.99))
         rows.append(
             [
                 name,
@@ -98,6 +99,14 @@ def bent(pair: Pair, amplitude: float, length: float, bend: int) -> Case:
     scene = BentField(case.scene, amplitude * in_scene, length * in_scene, 2 * bend)
     obj = BentField(case.obj, amplitude * size, length * size, 2 * bend + 1)
     return replace(case, name=f"{case.name} bend {bend}", scene=scene, obj=obj)
+
+
+def _share(found: Calibration) -> str:
+    """The share inside with its 95 % confidence interval (Clopper and Pearson): small groups say little."""
+    if found.count == 0:
+        return "no success"
+    low, high = binomtest(round(found.inside * found.count), found.count).proportion_ci(0.95)
+    return f"{100 * found.inside:.1f} % of {found.count} (95 % interval {100 * low:.0f} to {100 * high:.0f})"
 
 
 def _pairs(context: Context, file: str) -> Sequence[Pair]:
