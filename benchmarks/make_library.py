@@ -1,23 +1,24 @@
-"""Fit the library of 64 distinct objects that the library search is measured on.
+"""Make the library of 64 distinct objects that the library search is measured on.
 
     python -m benchmarks.make_library MESHES FIELDS
 
 MESHES holds the given meshes (glb, metres, z up); FIELDS is the folder that benchmarks.make_fields wrote, whose fields
-of the given objects are used. The others are fitted into FIELDS/library, each in a frame of its own scale; library.json
-lists all 64 with their models (FIELDS/library/*.model). About 15 minutes on one core; what exists is kept.
+of the given objects are used. The others, which no detection shows, are written into FIELDS/library as exact distances
+to their meshes; library.json lists all 64 with their models (FIELDS/library/*.model). What exists is kept.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.make_fields import OBJECT_OPTIONS
+import numpy as np
+
 from benchmarks.robust.library_objects import GIVEN, library_meshes
 from regnf_core import open_field
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.library import model_object, write_object_model
 from scripts import make_demo_fields as demo
 
@@ -27,7 +28,6 @@ INSTANCES = {
     "coffeetable_01": "t", "side_table_01": "wt",
 }  # fmt: skip
 """The names that the paper gives to some of the given objects."""
-OPTIONS = replace(OBJECT_OPTIONS, iterations=800, near_points=120_000, volume_points=30_000)
 _LARGEST = 1.2  # object units
 
 
@@ -36,13 +36,15 @@ def instance(name: str) -> str:
     return INSTANCES.get(name, name)
 
 
-def fit_missing(name: str, mesh: MeshField, path: Path) -> None:
-    """Fit an object that no other benchmark uses, its largest edge 1.2 units."""
+def write_missing(name: str, mesh: MeshField, path: Path) -> None:
+    """An object that no other benchmark uses, as the exact distance to its mesh, its largest edge 1.2 units."""
     if path.exists():
         return
     low, high = mesh.bounds
     target = mesh.transformed(demo.object_from_mesh(mesh, _LARGEST / float((high - low).max())))
-    demo.fit(target, path, OPTIONS, name, [name])
+    description = {"family": "mesh", "bounds": target.bounds.tolist(), "label": name}
+    tensors = {"vertices": target.vertices.astype(np.float32), "faces": target.faces.astype(np.int32)}
+    write_safe_field(path, description, tensors)
 
 
 def main() -> None:
@@ -57,7 +59,7 @@ def main() -> None:
         path = folder / f"{name.replace(' ', '-')}.safetensors"
         if name in GIVEN and (known := arguments.fields / f"{instance(name)}.safetensors").exists():
             path = known
-        fit_missing(name, mesh, path)
+        write_missing(name, mesh, path)
         model = folder / f"{name.replace(' ', '-')}.model"
         write_object_model(model, model_object(open_field(path)))
         entries.append({"name": instance(name), "field": str(path.relative_to(arguments.fields)), "model": model.name})
