@@ -8,6 +8,7 @@ HEAD_BYTES = 512
 """How many first bytes are enough to name every format."""
 
 _SQLITE_MAGIC = b"SQLite format 3\x00"
+_VDB_MAGICS = (b" BDV", b"NanoVDB")
 _ZIP_LOCAL_HEADER = b"PK\x03\x04"
 _ZIP_NAME_AT = 30
 _TORCH_MEMBERS = frozenset(
@@ -50,6 +51,8 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
     if head.lstrip()[:1] == b"{" and b'"asset"' in head:
         return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
+    if head.startswith(_VDB_MAGICS):
+        return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     return (

@@ -56,6 +56,8 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNISED"),  # an STL file's facets have corners
         (b"x" * 512, "FORMAT_NOT_RECOGNISED"),
         (zip_bytes([("points.txt", b"1 2 3")]), "FORMAT_NOT_SUPPORTED"),
+        (b" BDV\0\0\0\0\xe0\0\0\0", "FORMAT_NOT_SUPPORTED"),
+        (b"NanoVDB2" + bytes(40), "FORMAT_NOT_SUPPORTED"),
         (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNISED"),
         (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNISED"),
     ],
