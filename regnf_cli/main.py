@@ -13,6 +13,7 @@ from typing import Annotated
 import typer
 
 from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
+from regnf_cli.convert import convert
 from regnf_cli.fit import fit
 from regnf_cli.inspect import inspect
 from regnf_cli.register import register
@@ -41,7 +42,7 @@ def root(
         raise typer.Exit
 
 
-for command in (register, search, serve, worker, inspect, fit):
+for command in (register, search, serve, worker, inspect, convert, fit):
     app.command(command.__name__)(command)
 
 

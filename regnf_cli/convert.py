@@ -1,0 +1,89 @@
+"""``regnf convert``: a field in another format."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from regnf_cli.console import err, out
+from regnf_cli.request_files import read_object
+from regnf_core.errors import InvalidOptionsError
+
+_SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
+_GRID_MOST = 1024
+
+
+def convert(
+    field: Annotated[
+        Path, typer.Argument(help="A checkpoint, mesh, grid, ONNX model or safe field.", exists=True, dir_okay=False)
+    ],
+    output: Annotated[
+        Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
+    ],
+    resolution: Annotated[
+        int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
+    ] = 128,
+    description: Annotated[
+        Path | None, typer.Option(help="JSON: what the file does not carry.", exists=True, dir_okay=False)
+    ] = None,
+) -> None:
+    """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
+
+    Example: **regnf convert step-000030000.ckpt chair.glb --resolution 256**
+    """
+    if output.suffix.lower() not in _SUFFIXES:
+        raise InvalidOptionsError(f"the output must end in one of {', '.join(_SUFFIXES)}")
+    if not output.parent.is_dir():
+        raise InvalidOptionsError(f"no such folder: {output.parent}")
+    given = read_object(description, "description") if description else None
+    if output.suffix.lower() == ".safetensors":
+        _to_safe_field(field, output, given)
+    else:
+        _evaluated(field, output, resolution, given)
+
+
+def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None) -> None:
+    from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
+
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as folder:
+        with err.status("importing"):
+            report = import_field(field, Path(folder), given, ImportLimits())
+        os.replace(Path(folder) / FIELD_NAME, output)
+    _say(output, f"{report.family}, {report.parameters:,} parameters")
+    for warning in report.warnings:
+        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
+
+
+def _evaluated(field: Path, output: Path, resolution: int, given: dict[str, Any] | None) -> None:
+    with err.status("opening"):
+        from regnf_core.exporting import write_grid, write_mesh
+        from regnf_core.loading import load_field
+
+        source = load_field(field, given)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:,.0f} points"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err) as bar:
+        task = bar.add_task("evaluating", total=None)
+
+        def report(points: int) -> None:
+            bar.update(task, completed=points)
+
+        if output.suffix.lower() == ".npz":
+            shape = write_grid(source, output, resolution, report)
+            told = f"{' x '.join(map(str, shape))} nodes"
+        else:
+            told = f"{write_mesh(source, output, resolution, report):,} triangles"
+    _say(output, told)
+
+
+def _say(output: Path, what: str) -> None:
+    out.print(f"{output}: {what}, {output.stat().st_size / 1e6:.1f} MB", markup=False, soft_wrap=True)

@@ -1,0 +1,58 @@
+"""``regnf convert``: what it writes, and what it refuses before the work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from regnf_core.fields.safe_format import open_field, read_description
+from tests.cli.conftest import DATA, Run
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=3, radius=0.5).export(tmp_path / "ball.glb")
+    (tmp_path / "said.json").write_text('{"label": "ball"}')
+    safe, grid = tmp_path / "ball.safetensors", tmp_path / "ball.npz"
+    outcome = run("convert", tmp_path / "ball.glb", safe, "--description", tmp_path / "said.json")
+    assert outcome.code == 0, outcome.stderr
+    assert outcome.stdout.startswith(f"{safe}: mesh, ")
+    assert (read_description(safe)["family"], read_description(safe)["label"]) == ("mesh", "ball")
+    assert open_field(safe).signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.5, abs=0.01)
+    assert run("convert", tmp_path / "ball.glb", grid, "--resolution", 8).code == 0
+    assert np.load(grid)["sdf"].shape == (9, 9, 9)
+    assert {path.name for path in tmp_path.glob("ball*")} == {"ball.glb", safe.name, grid.name}
+
+
+def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
+    outcome = run("convert", DATA / "armchair.safetensors", tmp_path / "chair.ply", "--resolution", 24)
+    assert outcome.code == 0, outcome.stderr
+    assert "triangles" in outcome.stdout
+    assert trimesh.load_mesh(tmp_path / "chair.ply").is_watertight
+
+
+@pytest.mark.parametrize(
+    ("output", "reason"),
+    [
+        ("chair.stl", "INVALID_OPTIONS"),
+        ("absent/chair.ply", "INVALID_OPTIONS"),
+        ("chair.safetensors", "FORMAT_NOT_RECOGNISED"),
+        ("chair.ply", "FORMAT_NOT_RECOGNISED"),
+    ],
+)
+@pytest.mark.usefixtures("cache")
+def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
+    (tmp_path / "field.ckpt").write_bytes(b"\x07" * 4000)
+    outcome = run("convert", tmp_path / "field.ckpt", tmp_path / output)
+    assert outcome.code == 2
+    assert outcome.stderr.startswith(f"{reason} ")
+    assert {path.name for path in tmp_path.iterdir()} <= {"field.ckpt", "cache"}
