@@ -9,8 +9,10 @@ has to find out why this process ended. Needs no torch.
 from __future__ import annotations
 
 import base64
+import importlib
 import json
 import os
+import pkgutil
 import resource
 import signal
 import sys
@@ -21,6 +23,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from regnf_core.importing import families
 from tests.core.importing.fuzzing.cases import STAGES, make_case
 from tests.core.importing.fuzzing.line_coverage import Coverage
 from tests.core.importing.fuzzing.seeds import load_seeds
@@ -54,7 +57,9 @@ class Fuzzer:
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Have every module loaded that sound files need."""
+        """Have every module loaded that files may need: a family's own, and what sound files bring about."""
+        for module in pkgutil.walk_packages(families.__path__, f"{families.__name__}."):
+            importlib.import_module(module.name)
         for data in (self.seeds.archive, self.seeds.field_file, b"", *self.seeds.others.values()):
             for stage in STAGES:
                 run_stage(stage, data, self.scratch)
