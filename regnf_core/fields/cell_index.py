@@ -40,7 +40,7 @@ class CellIndex:
         Raises FieldFormatError (FIELD_INDEX_INVALID) for none, for one that occurs twice and for one too far away.
         """
         cells = cells.long()
-        if cells.shape[0] == 0 or int(cells.abs().max()) >= _FARTHEST:
+        if cells.shape[0] == 0 or int(cells.max()) >= _FARTHEST or int(cells.min()) <= -_FARTHEST:
             raise _invalid("there are no cells, or one is too far from the origin")
         low, high = cells.amin(0), cells.amax(0)
         size = high - low + 1

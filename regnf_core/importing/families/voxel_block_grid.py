@@ -75,7 +75,7 @@ def _read(arrays: ArraySource) -> _Blocks:
     if not 1 <= edge <= _LARGEST_EDGE or edge != int(edge) or not 1e-9 <= voxel_size <= 1e9:
         raise tensor_error(f"blocks of {edge:g}^3 voxels of {voxel_size:g} make no map", "TENSOR_SHAPE")
     keys = arrays.integers("key")
-    if keys.ndim != 2 or keys.shape[1] != 3 or not keys.size or np.abs(keys).max() >= 1 << 31:
+    if keys.ndim != 2 or keys.shape[1] != 3 or not keys.size or keys.max() >= 1 << 31 or keys.min() < -(1 << 31):
         raise tensor_error(f"key has shape {keys.shape}, expected (any, 3) block indices", "TENSOR_SHAPE")
     tsdf = _voxels(arrays.array(_attribute(arrays, "tsdf")))
     seen = _voxels(arrays.positive(_attribute(arrays, "weight"))) if "attr_name_weight" in arrays else np.isfinite(tsdf)

@@ -54,7 +54,13 @@ def test_few_cells_far_apart_take_little_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    "cells", [torch.zeros(0, 3), torch.tensor([[1, 2, 3], [1, 2, 3]]), torch.tensor([[1 << 20, 0, 0]])]
+    "cells",
+    [
+        torch.zeros(0, 3),
+        torch.tensor([[1, 2, 3], [1, 2, 3]]),
+        torch.tensor([[1 << 20, 0, 0]]),
+        torch.tensor([[-(1 << 63), 0, 0]]),
+    ],
 )
 def test_faulty_cells_are_refused(cells: torch.Tensor) -> None:
     with pytest.raises(FieldFormatError) as caught:

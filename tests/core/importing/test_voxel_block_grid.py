@@ -130,6 +130,7 @@ def test_a_doubtful_truncation_is_warned_of(tmp_path: Path) -> None:
         ({"key": np.zeros((5, 2), np.int32)}, "TENSOR_SHAPE"),
         ({"key": np.zeros((0, 3), np.int32)}, "TENSOR_SHAPE"),
         ({"key": np.zeros((5, 3), np.float32)}, "TENSOR_DTYPE"),
+        ({"key": np.full((5, 3), -(1 << 63))}, "TENSOR_SHAPE"),
         ({"block_resolution": np.array([0])}, "TENSOR_SHAPE"),
         ({"block_resolution": np.array([8, 8])}, "TENSOR_SHAPE"),
         ({"block_resolution": np.array([1 << 40])}, "TENSOR_SHAPE"),
