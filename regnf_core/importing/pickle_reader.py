@@ -221,7 +221,10 @@ class _Machine:
             target.state = state
 
     def persistent(self) -> None:
-        storage = pickle_globals.storage(self.pop())
+        identifier = self.pop()
+        if isinstance(identifier, tuple):
+            self.charge(len(identifier))
+        storage = pickle_globals.storage(identifier)
         if isinstance(storage, StorageRef):
             self.storages.setdefault(storage.key, storage)
         self.push(storage)

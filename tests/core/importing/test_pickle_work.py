@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from regnf_core.importing.pickle_reader import PickleLimits, read_pickle
-from tests.core.importing.archives import assert_refused
+from tests.core.importing.archives import assert_refused, text
 
 PROTO = b"\x80\x02"
 
@@ -36,6 +36,13 @@ def test_opcodes_and_remembered_values_are_counted() -> None:
 def test_calls_cost_what_they_may_copy(arguments: bytes, call: bytes) -> None:
     """Arguments that are remembered can be used again and again at the price of a few opcodes."""
     too_much(arguments + b"q\x00" + call * 5)
+
+
+def test_persistent_ids_cost_their_length() -> None:
+    identifier = (
+        b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x01" + b"N" * 30 + b"t"
+    )
+    too_much(identifier + b"q\x00" + b"h\x00Q0" * 5)
 
 
 def keys_of_one_hash(count: int) -> list[tuple[int, int]]:
