@@ -53,7 +53,7 @@ async def put_field(
     sha256: Annotated[str, Path(description="SHA-256 of the file.", json_schema_extra={"pattern": "^[0-9a-f]{64}$"})],
     content_digest: Annotated[str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.")] = None,
 ) -> JSONResponse:
-    """The bytes of a checkpoint, map, grid or mesh as they are (docs/import-gate.md). Repeat it freely: 200 when held."""
+    """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held."""
     if not is_sha256(sha256):
         raise Problem("INVALID_DIGEST", headers=body.CLOSE)
     if body.media_type(request).startswith("multipart/"):

@@ -12,7 +12,6 @@ import torch
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.safe_format import open_field, read_description
 from regnf_core.importing.convert import FIELD_NAME, convert_file
-from regnf_core.importing.gate import import_field
 from regnf_core.importing.report import ImportLimits
 from tests.core.analytic import chair, chair_pose, room, sphere
 from tests.core.importing.archives import assert_refused
@@ -124,11 +123,11 @@ def test_entries_that_mean_nothing_are_refused(tmp_path: Path) -> None:
     assert_refused(lambda: converted(tmp_path, {"family": "neus"}, **arrays), "FAMILY_NOT_SUPPORTED")
 
 
-def test_the_reference_file_through_the_gate(tmp_path: Path) -> None:
+def test_the_reference_file_is_reproduced(tmp_path: Path) -> None:
     folder = dev_data("formats", "dense_sdf_grid")
-    report = import_field(folder / "sdf_grid.npz", tmp_path)
-    assert report.family == "dense_sdf_grid"
-    assert report.warnings == ()
+    report = convert_file(folder / "sdf_grid.npz", tmp_path, None, ImportLimits())
+    assert report["family"] == "dense_sdf_grid"
+    assert report["warnings"] == []
     distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(
         torch.from_numpy(np.load(folder / "points.npy"))
     )
