@@ -7,7 +7,7 @@ from typing import Generic, Protocol, Self, TypeVar
 import torch
 from torch import Tensor
 
-_CHUNK = 1 << 12
+_CHUNK = 1 << 10  # the layers' outputs at so many points fit a core's own cache
 _CHUNK_ACCELERATOR = 1 << 18
 
 

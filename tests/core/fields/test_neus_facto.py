@@ -76,6 +76,13 @@ def test_chunks_change_nothing() -> None:
     assert parted.signed_distance(points[:0]).shape == (0,)
 
 
+def test_no_points_give_no_values() -> None:
+    field = small_field()
+    distance, gradient = field.signed_distance_and_gradient(torch.zeros(0, 3))
+    assert field.signed_distance(torch.zeros(0, 3)).shape == distance.shape == (0,)
+    assert gradient.shape == (0, 3)
+
+
 def test_masked_levels_count_as_zeros() -> None:
     zeroed = tensors(6)
     start = sum(GRID.level_entries()[:2])
