@@ -58,7 +58,7 @@ class PositionalEncoding:
         sines, cosines = encoded.chunk(2, dim=-1)
         by_sine, by_cosine = gradient.chunk(2, dim=-1)
         by_angle = by_sine * cosines - by_cosine * sines  # (N, 3 degree)
-        by_axis = by_angle.unflatten(-1, (by_angle.shape[-1] // self.degree, self.degree))
+        by_axis = by_angle.reshape(*by_angle.shape[:-1], by_angle.shape[-1] // self.degree, self.degree)
         by_length = (by_axis * self._frequencies(encoded)).sum(dim=-1)
         return by_length @ self._directions(encoded) if self.off_axis else by_length
 
