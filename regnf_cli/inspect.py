@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ import typer
 from regnf_cli.console import out
 from regnf_cli.extras import require
 from regnf_cli.request_files import read_object
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
 
 
 def inspect(
@@ -18,24 +20,38 @@ def inspect(
     description: Annotated[
         Path | None, typer.Option(help="JSON: what the checkpoint does not carry.", exists=True, dir_okay=False)
     ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: family, why, bounds, parameters, plausibility.
 
-    Example: **regnf inspect step-000030000.ckpt**
+    Example: **regnf inspect step-000030000.ckpt --picture chair.png**
     """
     require("engine")
     import tempfile
 
     from regnf_core.importing.gate import ImportLimits, import_field
+    from regnf_core.importing.picture import PICTURE_NAME
 
+    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
+        raise InvalidOptionsError(f"a picture ends in .png and needs a folder that exists: {picture}")
     given = read_object(description, "description") if description else None
     with tempfile.TemporaryDirectory() as folder:
-        report = import_field(field, Path(folder), given, ImportLimits()).to_dict()
+        report = import_field(field, Path(folder), given, ImportLimits(), picture is not None).to_dict()
+        if picture is not None:
+            _keep(Path(folder) / PICTURE_NAME, picture)
     if as_json:
         out.print_json(json.dumps(report))
     else:
         _show(report)
+
+
+def _keep(made: Path, picture: Path) -> None:
+    if not made.exists():
+        raise InvalidInputError("no picture could be made: the field is too slow for it", reason="NO_PICTURE")
+    shutil.copyfile(made, picture)
 
 
 def _show(values: dict[str, Any], indent: int = 0) -> None:

@@ -57,6 +57,9 @@ REASONS: dict[str, Reason] = {
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
+    "FIELD_PREVIEW_NOT_FOUND": Reason(
+        404, "No picture", "Only fields that are `ready` have one, and not all: `links.preview` is tried, not promised."
+    ),
     "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
     "FIELD_DESCRIPTION_DIFFERS": Reason(
         409, "Field held with another description", "The same bytes are held as another function. Delete them first."

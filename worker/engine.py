@@ -13,7 +13,9 @@ from regnf_core.options import RegistrationOptions
 
 Report = Callable[[str, float], None]
 Importer = Callable[[Path, Path, dict[str, Any]], dict[str, Any]]
-"""(upload, folder, description) -> report; writes folder/field.safetensors. Raises FieldFormatError."""
+"""(upload, folder, description) -> report; writes folder/field.safetensors, and folder/preview.png if it can.
+
+Raises FieldFormatError."""
 
 
 Model = Any
@@ -151,6 +153,6 @@ def core_importer(limits: ImportLimits) -> Importer:
     """The import gate of regnf_core within ``limits``."""
 
     def run(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
-        return import_field(upload, folder, description or None, limits).to_dict()
+        return import_field(upload, folder, description or None, limits, picture=True).to_dict()
 
     return run

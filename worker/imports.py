@@ -12,6 +12,7 @@ from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import RegnfError
+from regnf_core.importing.picture import PICTURE_NAME
 from service.records import FieldRecord, StaleAttemptError
 from worker.context import Context
 from worker.engine import Importer
@@ -115,6 +116,8 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
         folder = Path(temporary)
         report: dict[str, Any] = importer(upload, folder, description)
         _require_current(context, field)
+        if (folder / PICTURE_NAME).exists():
+            context.blobs.put(f"fields/{sha256}/{PICTURE_NAME}", (folder / PICTURE_NAME).read_bytes())
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
             while chunk := source.read(1 << 20):
                 writer.write(chunk)

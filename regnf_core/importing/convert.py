@@ -1,27 +1,31 @@
 """The conversion itself, run in a throw-away process: ``python -m regnf_core.importing.convert UPLOAD OUT_DIR``.
 
-Standard input holds one JSON object {"description", "limits", "parent_pid"}; standard output gets one JSON line: the
-report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors.
+Standard input holds one JSON object {"description", "limits", "parent_pid", "picture"}; standard output gets one JSON
+line: the report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors, a picture beside it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import mmap
 import os
 import re
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from regnf_core.errors import FieldFormatError
+from regnf_core.errors import FieldFormatError, RegnfError
+from regnf_core.importing.picture import PICTURE_NAME
 from regnf_core.importing.report import ImportLimits
 from regnf_core.importing.sandbox import confine
 from regnf_core.importing.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_core.importing.sniff_mesh import MESH_FORMATS
 
 if TYPE_CHECKING:
+    from regnf_core.fields.base import SdfField
     from regnf_core.importing.families.converted import ConvertedField
 
 FIELD_NAME = "field.safetensors"
@@ -30,13 +34,15 @@ _SIGN_UNCERTAIN = (
     "all round the bounds the values are negative: a room seen from within, or an object trained with its sign turned"
     " round; for the latter say sign -1"
 )
+_QUICK_S = 4.0
+"""Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
 def convert_file(
-    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits
+    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, picture: bool = False
 ) -> dict[str, Any]:
-    """Convert ``upload``, write the safe field and evaluate it once. Returns the report's values.
+    """Convert ``upload``, write the safe field, evaluate it once, draw it if asked to. Returns the report's values.
 
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
@@ -49,11 +55,14 @@ def convert_file(
     parameters = sum(array.size for array in converted.tensors.values())
     family, why, warnings = converted.family, converted.why, converted.warnings
     bounds, label = converted.description["bounds"], converted.description["label"]
-    sign_is_open = converted.sign_is_open
+    sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
     from regnf_core.importing.plausibility import check_plausibility  # loads torch, which a refused file never needs
 
-    figures, more = check_plausibility(open_field(target))
+    field, started = open_field(target), time.process_time()
+    figures, more = check_plausibility(field)
+    if picture and time.process_time() - started < _QUICK_S:
+        _draw(field, up_axis, out_dir / PICTURE_NAME)
     if sign_is_open and figures["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
@@ -65,6 +74,14 @@ def convert_file(
         "warnings": [*warnings, *more],
         "label": label,
     }
+
+
+def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
+    """A picture, if one can be made: it is no condition of the import."""
+    from regnf_core.diagnostics.field_picture import field_picture
+
+    with contextlib.suppress(RegnfError, MemoryError):
+        field_picture(field, up_axis).save(path)
 
 
 def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int) -> ConvertedField:
@@ -140,10 +157,12 @@ def _mapped(upload: Path) -> memoryview:
         return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
-def run(upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits) -> dict[str, Any]:
+def run(
+    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, picture: bool = False
+) -> dict[str, Any]:
     """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
     try:
-        return convert_file(upload, out_dir, description, limits)
+        return convert_file(upload, out_dir, description, limits, picture)
     except FieldFormatError as error:
         return {"reason": error.reason, "detail": str(error)}
     except MemoryError:
@@ -164,7 +183,7 @@ def main(arguments: list[str]) -> int:
     # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
     upload = os.open(arguments[0], os.O_RDONLY)
     isolation = confine(limits, request["parent_pid"], upload, out_dir)
-    report = run(Path(f"/proc/self/fd/{upload}"), out_dir, request["description"], limits)
+    report = run(Path(f"/proc/self/fd/{upload}"), out_dir, request["description"], limits, request["picture"])
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
     sys.stdout.flush()

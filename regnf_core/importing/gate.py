@@ -21,6 +21,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.child import ChildOutcome, run_child
+from regnf_core.importing.picture import PICTURE_NAME, is_sound_picture
 from regnf_core.importing.report import ImportLimits, ImportReport
 from regnf_core.importing.safetensors_header import read_header
 
@@ -45,18 +46,23 @@ _log = logging.getLogger(__name__)
 
 
 def import_field(
-    upload: Path, out_dir: Path, description: dict[str, Any] | None = None, limits: ImportLimits | None = None
+    upload: Path,
+    out_dir: Path,
+    description: dict[str, Any] | None = None,
+    limits: ImportLimits | None = None,
+    picture: bool = False,
 ) -> ImportReport:
     """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
-    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little.
+    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
+    of the field in ``out_dir``/preview.png too, if it can be made in good time.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
     limits = limits or ImportLimits()
-    request = _request(description, limits)
+    request = _request(description, limits, picture)
     upload = upload.resolve(strict=True)
     out_dir.mkdir(parents=True, exist_ok=True)
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
@@ -67,14 +73,16 @@ def import_field(
         values = _judge(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
+        if picture and is_sound_picture(work / PICTURE_NAME):
+            os.replace(work / PICTURE_NAME, out_dir / PICTURE_NAME)
         return report
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _request(description: dict[str, Any] | None, limits: ImportLimits) -> bytes:
+def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: bool) -> bytes:
     try:
-        request = {"description": description, "limits": asdict(limits), "parent_pid": os.getpid()}
+        request = {"description": description, "limits": asdict(limits), "parent_pid": os.getpid(), "picture": picture}
         text = json.dumps(request, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error

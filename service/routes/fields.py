@@ -7,12 +7,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from starlette.responses import JSONResponse, Response
 
+from regnf_core.importing.picture import PICTURE_NAME
 from service.dependencies import LimitQuery, PageTokenQuery, PrefixDep, Services, ServicesDep, WaitQuery, off_loop
 from service.digests import is_sha256
 from service.paging import decode_token, encode_token
 from service.problems import Problem
 from service.records import FieldRecord
-from service.routes.documentation import get_and_head, refusals
+from service.routes.documentation import BINARY, get_and_head, refusals
 from service.routes.uploads import field_etag
 from service.schemas.fields import FieldDocument, FieldPage, field_document
 from service.waiting import wait_for
@@ -46,6 +47,30 @@ async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait:
     if record.state == "validating":
         headers["Retry-After"] = "1"
     return JSONResponse(field_document(record, prefix), headers=headers)
+
+
+@get_and_head(
+    router,
+    "/fields/{sha256}/preview.png",
+    summary="A picture of a field",
+    response_class=Response,
+    responses={
+        200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
+        **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
+    },
+)
+def get_field_preview(sha256: str, services: ServicesDep) -> Response:
+    """The surface from two sides, and its section with lines of equal distance: orange is inside."""
+    record = _require(services, sha256)
+    if record.state != "ready":
+        raise Problem("FIELD_PREVIEW_NOT_FOUND")
+    try:
+        with services.blobs.open(f"fields/{sha256}/{PICTURE_NAME}") as file:
+            data = file.read()
+    except FileNotFoundError as error:
+        raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
+    headers = {"ETag": field_etag(sha256, record.version), "Cache-Control": "private, max-age=3600"}
+    return Response(data, media_type="image/png", headers=headers)
 
 
 @router.get(

@@ -55,5 +55,9 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "error": outgoing_problem(record.error),
         "created_at": rfc3339(record.created),
         "updated_at": rfc3339(record.updated),
-        "links": {"self": f"{prefix}/fields/{record.sha256}"},
+        "links": _links(record, f"{prefix}/fields/{record.sha256}"),
     }
+
+
+def _links(record: FieldRecord, address: str) -> Links:
+    return {"self": address} | ({"preview": f"{address}/preview.png"} if record.state == "ready" else {})

@@ -154,3 +154,23 @@ def test_uploads_far_larger_than_a_block_arrive_whole(tmp_path: Path) -> None:
     answer = world.client.put(f"/fields/{sha256(data)}", content=pieces)
     assert (answer.status_code, answer.json()["bytes"]) == (201, len(data))
     assert world.blobs.blobs[f"fields/{sha256(data)}/original"] == data
+
+
+def test_a_ready_field_has_a_picture_if_its_import_made_one(world: World) -> None:
+    known = world.ready_field("a")
+    address = world.client.get(f"/v1/fields/{known}").json()["links"]["preview"]
+    assert address == f"/v1/fields/{known}/preview.png"
+    assert_refused(world.client.get(address), 404, "FIELD_PREVIEW_NOT_FOUND")
+    world.blobs.put(f"fields/{known}/preview.png", b"\x89PNG")
+    answer = world.client.get(address)
+    assert (answer.status_code, answer.content, answer.headers["content-type"]) == (200, b"\x89PNG", "image/png")
+    head = world.client.head(address)
+    assert (head.status_code, head.content, head.headers["etag"]) == (200, b"", answer.headers["etag"])
+    world.client.delete(f"/fields/{known}")
+    assert_refused(world.client.get(address), 404, "FIELD_NOT_FOUND")
+
+
+def test_a_field_that_is_not_ready_has_no_picture(world: World) -> None:
+    world.client.put(f"/fields/{sha256(A)}", content=A)
+    assert "preview" not in world.client.get(f"/fields/{sha256(A)}").json()["links"]
+    assert_refused(world.client.get(f"/fields/{sha256(A)}/preview.png"), 404, "FIELD_PREVIEW_NOT_FOUND")
