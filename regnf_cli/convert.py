@@ -11,6 +11,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from regnf_cli.console import err, out
+from regnf_cli.extras import require
 from regnf_cli.request_files import read_object
 from regnf_core.errors import InvalidOptionsError
 
@@ -36,6 +37,7 @@ def convert(
 
     Example: **regnf convert step-000030000.ckpt chair.glb --resolution 256**
     """
+    require("engine")
     if output.suffix.lower() not in _SUFFIXES:
         raise InvalidOptionsError(f"the output must end in one of {', '.join(_SUFFIXES)}")
     if not output.parent.is_dir():

@@ -52,7 +52,9 @@ def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, famil
     loose = _open_edge_share(faces, len(vertices))
     why = (
         f"{origin}: {len(faces)} triangles, {len(vertices)} vertices",
-        "watertight" if loose == 0.0 else f"not watertight: {100 * loose:.2g} % of its edges are open; winding number",
+        "watertight"
+        if loose == 0.0
+        else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number tells inside",
         *(f"passed over: {what}" for what in geometry.left_out),
     )
     return ConvertedField(

@@ -137,7 +137,7 @@ def test_inverted_faces_are_turned_round() -> None:
 
 def test_holes_are_reported_and_have_an_inside_nonetheless() -> None:
     found = converted(trimesh.Trimesh(BALL.vertices, BALL.faces[16:], process=False).export(file_type="ply"))
-    assert found.why[1].startswith("not watertight: ")
+    assert found.why[1].startswith("not watertight, ")
     assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
 
 
