@@ -219,7 +219,7 @@ def test_odd_objects_beside_the_weights_do_no_harm() -> None:
         (_Odd(), "UNSAFE_GLOBAL_IN_WEIGHTS"),
         ({"neural_points": 1}, "FAMILY_NOT_SUPPORTED"),
         ({"model": {"encoder.embeddings": 1}}, "FAMILY_NOT_SUPPORTED"),
-        ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FAMILY_NOT_SUPPORTED"),
+        ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FIELD_NOT_RECOGNISED"),
     ],
 )
 def test_other_files_are_refused(values: object, reason: str) -> None:
