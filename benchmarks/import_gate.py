@@ -95,7 +95,7 @@ def measure(folder: Path, count: int) -> tuple[Runs, ImportReport, int]:
             runs.copy.append(seconds_of_copy(upload, folder / "copy"))
             runs.upload.append(seconds_of_upload(live, upload, sha256))
             begun = time.perf_counter()
-            report = import_field(upload, fields)
+            report = import_field(upload, fields, picture=True)  # as a worker does it
             runs.gate.append(time.perf_counter() - begun)
             runs.gate_cpu.append(report.cpu_seconds)
             runs.peak.append(report.peak_memory_bytes)
@@ -114,7 +114,7 @@ def table(runs: Runs, report: ImportReport, size: int) -> str:
     kept = 4 * report.parameters
     allowed = 3 * kept + 300 * MB
     speed, pace = ([size / MB / seconds for seconds in each] for each in (runs.upload, runs.copy))
-    share = median(speed) / median(pace)
+    share = median(mine / other for mine, other in zip(speed, pace, strict=True))
     rows = [
         ("the gate, wall time", "10 s", spread(runs.gate, "s"), median(runs.gate) <= 10),
         ("the gate, processor time", "", spread(runs.gate_cpu, "s"), True),
@@ -131,7 +131,8 @@ def table(runs: Runs, report: ImportReport, size: int) -> str:
             report.field_bytes <= 0.4 * size,
         ),
         ("cp and sha256sum of the upload", "", spread(pace, "MB/s", digits=0), True),
-        ("its upload", "60 % of that", f"{spread(speed, 'MB/s', digits=0)}: {100 * share:.0f} %", share >= 0.6),
+        ("its upload", "", spread(speed, "MB/s", digits=0), True),
+        ("the upload's speed, of cp's and sha256sum's in the same run", "60 %", f"{100 * share:.0f} %", share >= 0.6),
         ("opening the kept field", "0.2 s", spread(runs.opening, "s", digits=3), median(runs.opening) <= 0.2),
     ]
     lines = ["| | bar | measured | |", "|---|---|---|---|"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import tempfile
 import zipfile
+from pathlib import Path
 from random import Random
 
 from tests.core.importing.fuzzing.archive_model import Ending, Record, archive_bytes, lied
@@ -17,7 +19,7 @@ def make_others() -> dict[str, bytes]:
     import torch
     import trimesh
 
-    from tests.core.importing import onnx_models, small_families, test_pin_slam, test_voxel_block_grid
+    from tests.core.importing import onnx_models, small_families, test_nvblox, test_pin_slam, test_voxel_block_grid
     from tests.core.importing.checkpoints import checkpoint
 
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
@@ -30,6 +32,7 @@ def make_others() -> dict[str, bytes]:
     files["onnx"] = onnx_models.sphere().SerializeToString()
     files["legacy"] = _saved(torch, checkpoint(log2_size=8, hidden=6, optimiser=False), legacy=True)
     files["pin_slam"] = _saved(torch, test_pin_slam.floor())
+    files["sqlite"] = _database(test_nvblox.ball_blocks()[::12])
     for make in (small_families.neus, small_families.siren, small_families.deepsdf, small_families.instant_nsr_pl):
         files[make.__name__] = _saved(torch, make().checkpoint)
     return files
@@ -45,6 +48,13 @@ def _arrays(**arrays: object) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
+
+
+def _database(rows: list[tuple[int, int, int, bytes]]) -> bytes:
+    from tests.core.importing import test_nvblox
+
+    with tempfile.TemporaryDirectory() as folder:
+        return test_nvblox.write_map(Path(folder, "map"), rows).read_bytes()
 
 
 def _saved(torch: object, values: object, legacy: bool = False) -> bytes:

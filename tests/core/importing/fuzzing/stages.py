@@ -21,7 +21,18 @@ from regnf_core.importing.upload_description import UploadDescription
 BUDGET = 1 << 24
 """Bytes of tensors that one case may have."""
 _TAKEN = "taken"
-_QUIET = ("object.", "sys._getframe", "code.__new__", "builtins.id", "gc.", "tempfile.", "time.", "sys.", "mmap.")
+_QUIET = (
+    "object.",
+    "sys._getframe",
+    "code.__new__",
+    "builtins.id",
+    "gc.",
+    "tempfile.",
+    "time.",
+    "sys.",
+    "mmap.",
+    "sqlite3.",
+)
 """Beginnings of the audit events that mean nothing here."""
 
 
