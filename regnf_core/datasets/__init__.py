@@ -1,0 +1,1 @@
+"""Posed images of a scene: what they are, how they are read, written and rendered."""
