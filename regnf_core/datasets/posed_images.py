@@ -14,8 +14,8 @@ from regnf_core.box import OrientedBox
 class Instance:
     """A thing in the scene, as a detector would name it.
 
-    box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library object,
-    the truth if the dataset tells it.
+    box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library
+    object, the truth if the dataset tells it.
     """
 
     label: str
