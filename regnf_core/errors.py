@@ -4,7 +4,8 @@
     ├── InvalidInputError            the caller can mend it
     │   ├── InvalidOptionsError      INVALID_OPTIONS
     │   ├── InvalidDetectionError    INVALID_DETECTION, DETECTION_OUTSIDE_SCENE
-    │   └── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
+    │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
+    │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used
     ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
     ├── InitialisationError          NO_INITIAL_TRANSFORM
     └── CancelledError               CANCELLED
@@ -51,6 +52,12 @@ class FieldFormatError(InvalidInputError):
     """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault."""
 
     reason = "FIELD_NOT_RECOGNISED"
+
+
+class DatasetError(InvalidInputError):
+    """A folder of posed images cannot be read or written, or a scene cannot be rendered. ``reason`` tells the fault."""
+
+    reason = "DATASET_INVALID"
 
 
 class NoSurfaceError(RegnfError):

@@ -15,12 +15,15 @@ class Instance:
     """A thing in the scene, as a detector would name it.
 
     box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library
-    object, the truth if the dataset tells it.
+    object, the truth if the dataset tells it · world_pose, gt_pose: (4, 4), the thing's own frame to the world and to
+    the metric frame, as the dataset tells them; nothing is computed from these.
     """
 
     label: str
     box: OrientedBox
     T_object_world: NDArray[np.float64] | None = None
+    world_pose: NDArray[np.float64] | None = None
+    gt_pose: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

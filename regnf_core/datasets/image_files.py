@@ -1,0 +1,127 @@
+"""The image files of a dataset: colours, depths and masks, each checked against the size that is due."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from regnf_core.errors import DatasetError
+
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+_FAULTS_OF_CONTENT = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    EOFError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+    Image.DecompressionBombWarning,
+)
+"""What pillow and numpy raise on malformed files."""
+
+
+def resolve(folder: Path, name: Any, what: str) -> Path:
+    """The file ``name`` in the folder, which it may not leave.
+
+    Raises DatasetError (DATASET_METADATA_INVALID, DATASET_PATH_OUTSIDE, DATASET_IMAGE_MISSING).
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        raise DatasetError(f"{what} is no path", reason="DATASET_METADATA_INVALID")
+    try:
+        path = (folder / name).resolve()
+        inside = path.is_relative_to(folder.resolve())
+        exists = inside and path.is_file()
+    except (OSError, RuntimeError) as error:  # a name too long, or links in a circle
+        raise DatasetError(f"{what} cannot be followed: {name!r:.200}", reason="DATASET_METADATA_INVALID") from error
+    if not inside:
+        raise DatasetError(f"{what} leaves the dataset's folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")
+    if not exists:
+        raise DatasetError(f"{what} names no file of the dataset: {name!r:.200}", reason="DATASET_IMAGE_MISSING")
+    return path
+
+
+def image_size(path: Path) -> Size:
+    """Height and width by the file's header."""
+    try:
+        with Image.open(path) as image:
+            return image.height, image.width
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+
+
+def read_colours(path: Path, size: Size) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8, sRGB; transparency is left out."""
+    return np.asarray(_decoded(path, size, "RGB"), dtype=np.uint8)
+
+
+def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
+    """(H, W): true where the picture is brighter than half; one of zeros and ones counts as such."""
+    grey = _decoded(path, size, "L")
+    return np.asarray(grey > (127 if grey.max() > 1 else 0))
+
+
+def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32]:
+    """(H, W) float32 in world units, 0 where there is none: what is not finite and positive counts as none.
+
+    ``.npy`` holds world units; an image holds whole numbers of ``unit`` world units each.
+    Raises DatasetError (DATASET_DEPTH_UNIT_MISSING, DATASET_SIZES_DIFFER, DATASET_IMAGE_INVALID).
+    """
+    if path.suffix.lower() == ".npy":
+        values = _array_file(path, size)
+    elif unit is None:
+        raise DatasetError(
+            f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata",
+            reason="DATASET_DEPTH_UNIT_MISSING",
+        )
+    else:
+        values = _decoded(path, size, None).astype(np.float64) * unit
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = values.astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
+
+
+def _array_file(path: Path, size: Size) -> NDArray[Any]:
+    try:
+        stored = np.load(path, mmap_mode="r", allow_pickle=False)
+        shape, kind = stored.shape, stored.dtype.kind
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+    if kind not in "fiu":
+        raise DatasetError(f"{path.name} holds no numbers", reason="DATASET_IMAGE_INVALID")
+    if shape not in (size, (*size, 1), (1, *size)):
+        raise _differs(path, shape, size)
+    return np.array(stored).reshape(size)
+
+
+def _decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
+    try:
+        with Image.open(path) as image:
+            # Told by the header: nothing of the wrong size is decoded.
+            if (image.height, image.width) != size:
+                raise _differs(path, (image.height, image.width), size)
+            pixels = np.asarray(image.convert(mode) if mode else image)
+    except _FAULTS_OF_CONTENT as error:
+        raise _invalid(path, error) from error
+    if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
+        raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
+    return pixels
+
+
+def _differs(path: Path, found: tuple[int, ...], size: Size) -> DatasetError:
+    shape = " x ".join(map(str, found))
+    return DatasetError(
+        f"{path.name} is {shape}, not {size[0]} x {size[1]} (height x width)", reason="DATASET_SIZES_DIFFER"
+    )
+
+
+def _invalid(path: Path, error: BaseException) -> DatasetError:
+    return DatasetError(f"{path.name} cannot be read as an image: {error}", reason="DATASET_IMAGE_INVALID")
