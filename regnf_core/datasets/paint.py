@@ -52,7 +52,8 @@ class TexturePaint:
         height, width = self.picture.shape[:2]
         column = np.floor(u * width).astype(np.int64) % width
         row = np.floor((1.0 - v) * height).astype(np.int64) % height
-        return self.picture[row, column].astype(np.float64)
+        texels: NDArray[np.float64] = self.picture[row, column].astype(np.float64)
+        return texels
 
 
 @dataclass(frozen=True)

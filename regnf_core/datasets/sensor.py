@@ -63,7 +63,8 @@ class DepthSensor:
         height, width = depth.shape
         shift = rng.normal(scale=self.lateral_pixels * width / _NGUYEN_WIDTH, size=(2, height, width))
         rows, columns = np.indices(depth.shape) + np.round(shift).astype(np.int64)
-        return depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        shifted: NDArray[np.float64] = depth[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        return shifted
 
 
 def jumps(depth: NDArray[np.float64], jump: float) -> NDArray[np.bool_]:
