@@ -17,6 +17,7 @@ from regnf_cli.convert import convert
 from regnf_cli.fit import fit
 from regnf_cli.inspect import inspect
 from regnf_cli.register import register
+from regnf_cli.render_dataset import render_dataset
 from regnf_cli.search import search
 from regnf_cli.serve import serve
 from regnf_cli.worker import worker
@@ -44,6 +45,7 @@ def root(
 
 for command in (register, search, serve, worker, inspect, convert, fit):
     app.command(command.__name__)(command)
+app.command("render-dataset")(render_dataset)
 
 
 def main() -> None:

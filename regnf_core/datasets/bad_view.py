@@ -26,24 +26,27 @@ _LEAST_SEEN = 0.02
 def bad_view(scene: MeshScene, thing: int, size: Size, intrinsics: Array, floor: float) -> Array:
     """(4, 4): of all views that show the thing, the one that sees the least of its surface.
 
-    Candidates stand in free space at 16 azimuths, 35 cm and 1.3 m above the floor, from where the thing fills the picture
-    down to .65 of that distance. A view counts as showing the thing when at most half of what it would show of it alone is
-    hidden by others. So the camera ends up behind backs or low at a corner. The first of equals is taken.
+    Candidates stand in free space at 16 azimuths, 35 cm and 1.3 m above the floor, where the thing just fills the
+    picture; nearer only if none of these will do. A view counts as showing the thing when others hide at most half of
+    what it would show of it alone. So the camera ends up behind a back or low at a side. The first of equals is taken.
     Raises DatasetError (DATASET_NO_VIEW).
     """
     solid = scene.things[thing].solid
     assert isinstance(solid, SurfaceSource)
     samples = solid.sample_surface(_SAMPLES, np.random.default_rng(0))
     alone = MeshScene([scene.things[thing]])
-    best, least = None, np.inf
-    for pose in _candidates(scene, solid.bounds.numpy(), size, intrinsics, floor):
-        seen = seen_points(scene, pose, size, intrinsics, samples).mean()
-        shown = seen_points(alone, pose, size, intrinsics, samples).mean()
-        if seen >= max(_LEAST_SHOWN * shown, _LEAST_SEEN) and seen < least:
-            best, least = pose, seen
-    if best is None:
-        raise DatasetError(f"{scene.things[thing].name} is hidden from everywhere", reason="DATASET_NO_VIEW")
-    return best
+    bounds = solid.bounds.numpy()
+    for nearer in _NEARER:
+        best, least = None, np.inf
+        distance = nearer * framing_distance(bounds, half_view(size, intrinsics))
+        for pose in _candidates(scene, bounds.mean(axis=0), distance, floor):
+            seen = seen_points(scene, pose, size, intrinsics, samples).mean()
+            shown = seen_points(alone, pose, size, intrinsics, samples).mean()
+            if seen >= max(_LEAST_SHOWN * shown, _LEAST_SEEN) and seen < least:
+                best, least = pose, seen
+        if best is not None:
+            return best
+    raise DatasetError(f"{scene.things[thing].name} is hidden from everywhere", reason="DATASET_NO_VIEW")
 
 
 def seen_points(scene: MeshScene, pose: Array, size: Size, intrinsics: Array, points: Array) -> NDArray[np.bool_]:
@@ -61,21 +64,18 @@ def half_view(size: Size, intrinsics: Array) -> float:
     return float(min(np.arctan(size[1] / 2.0 / intrinsics[0, 0]), np.arctan(size[0] / 2.0 / intrinsics[1, 1])))
 
 
-def _candidates(scene: MeshScene, bounds: Array, size: Size, intrinsics: Array, floor: float) -> Iterator[Array]:
-    centre = bounds.mean(axis=0)
-    farthest = framing_distance(bounds, half_view(size, intrinsics))
+def _candidates(scene: MeshScene, centre: Array, distance: float, floor: float) -> Iterator[Array]:
     low, high = scene.bounds
     alone = len(scene.things) == 1
-    for nearer in _NEARER:
-        for height in _HEIGHTS_M:
-            rise = floor + height - centre[2]
-            level = (farthest * nearer) ** 2 - rise**2
-            if level <= 0.0:
-                continue
-            angles = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
-            ring = np.sqrt(level) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-            positions = centre + np.concatenate([ring, np.full((_AZIMUTHS, 1), rise)], axis=1)
-            free = scene.signed_distance(positions) >= CLEARANCE_M
-            # The far side of a wall is free too, but outside of the room.
-            inside = alone | ((positions > low) & (positions < high))[:, :2].all(axis=1)
-            yield from look_at(positions[free & inside], np.tile(centre, (int((free & inside).sum()), 1)))
+    for height in _HEIGHTS_M:
+        rise = floor + height - centre[2]
+        level = distance**2 - rise**2
+        if level <= 0.0:
+            continue
+        angles = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+        ring = np.sqrt(level) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        positions = centre + np.concatenate([ring, np.full((_AZIMUTHS, 1), rise)], axis=1)
+        free = scene.signed_distance(positions) >= CLEARANCE_M
+        # The far side of a wall is free too, but outside of the room.
+        inside = alone | ((positions > low) & (positions < high))[:, :2].all(axis=1)
+        yield from look_at(positions[free & inside], np.tile(centre, (int((free & inside).sum()), 1)))

@@ -28,8 +28,8 @@ class DepthSensor:
     grazing_deg: float = 80.0
     """Surfaces seen at a larger angle from their normal give no reading."""
     edge_jump_m: float = 0.05
-    edge_dropout: float = 0.5
-    """The share of readings lost where the depth jumps by ``edge_jump_m`` or more."""
+    edge_dropout: float = 0.2
+    """The share of readings lost where the depth jumps by ``edge_jump_m`` or more; a choice, for small images."""
     axial: bool = True
 
     def deviation_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:

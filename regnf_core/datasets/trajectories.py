@@ -25,6 +25,7 @@ _RING_SHARES = (0.27, 0.3, 0.27, 0.16)
 _NEAREST_M = 0.55
 _SHORT_ARC_DEG = 130.0
 _SMOOTHING = 5
+_GAZE_AT_NEAREST = 0.4
 
 
 def look_at(positions: Array, targets: Array) -> Array:
@@ -80,15 +81,18 @@ def long_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Arr
 
 
 def short_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Array:
-    """(frames, 4, 4): once along the side of the room that is freest, looking at the nearest furniture of each moment.
+    """(frames, 4, 4): once along the two adjoining sides of the room that are freest.
 
-    What faces away is never seen.
+    The gaze lies between the middle of all boxes (2, 3) and the nearest one. What faces away is never seen.
     """
     sides = ground.sides()
-    path = max(sides, key=lambda side: float(ground.clearance_along(side).mean()))
+    free = [float(ground.clearance_along(side).mean()) for side in sides]
+    first = max(range(len(sides)), key=lambda side: free[side] + free[(side + 1) % len(sides)])
+    path = np.concatenate([sides[first], sides[(first + 1) % len(sides)]])
     centres = np.array([box.mean(axis=0) for box in boxes])
     nearest = np.linalg.norm(path[:, None] - centres[None, :, :2], axis=2).argmin(axis=1)
-    return _walked(path, centres[nearest], frames, WALK_HEIGHTS_M[0])
+    gaze = (1.0 - _GAZE_AT_NEAREST) * centres.mean(axis=0) + _GAZE_AT_NEAREST * centres[nearest]
+    return _walked(path, gaze, frames, WALK_HEIGHTS_M[0])
 
 
 def _tour(ground: WalkingGround, boxes: Sequence[Array]) -> tuple[Array, Array]:
