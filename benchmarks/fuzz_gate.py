@@ -1,6 +1,6 @@
 """Fuzz the import gate: many damaged and invented files, each stage in one process, some through the whole gate.
 
-    python -m benchmarks.fuzz_gate --cases 200000 --seed 1 [--output benchmarks/results/fuzz_gate.md] [--keep FOLDER]
+    python -m benchmarks.fuzz_gate --cases 200000 --seed 1 [--stages NAME ...] [--output FILE] [--keep FOLDER]
 
 A case fails if a stage raises anything but FieldFormatError, takes five seconds of processor time, needs more
 than 2 GiB of address space, leaves a file, or brings about an import, a program, a socket or the opening of a file;
@@ -42,9 +42,9 @@ _FAULTS = ("IMPORT_CRASHED", "IMPORT_TIMEOUT", "IMPORT_OUT_OF_MEMORY", "IMPORT_O
 class Worker:
     """A fuzzing process that is replaced when it ends before its answer."""
 
-    def __init__(self, seeds: Path, folder: Path, seed: str) -> None:
+    def __init__(self, seeds: Path, folder: Path, seed: str, stages: list[str]) -> None:
         self._folder = folder
-        command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", str(seeds), str(folder), seed]
+        command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", str(seeds), str(folder), seed, *stages]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def run(self, first: int, count: int) -> dict[str, Any] | None:
@@ -140,7 +140,7 @@ def fuzz(folder: Path, arguments: argparse.Namespace) -> Tally:
     first, part = 0, 0
     while first < arguments.cases:
         part += 1
-        with Worker(folder / "seeds", folder, f"{arguments.seed}.{part}") as worker:
+        with Worker(folder / "seeds", folder, f"{arguments.seed}.{part}", arguments.stages) as worker:
             while first < arguments.cases:
                 count = min(arguments.chunk, arguments.cases - first)
                 results = worker.run(first, count)
@@ -171,6 +171,8 @@ def table(tally: Tally) -> str:
 def report(tally: Tally, arguments: argparse.Namespace, seconds: float) -> str:
     """The text of the results' page."""
     command = f"python -m benchmarks.fuzz_gate --cases {arguments.cases} --seed {arguments.seed}"
+    if arguments.stages != list(STAGES):
+        command += f" --stages {' '.join(arguments.stages)}"
     failures = [f"- {where}: {fault}" for where, fault in tally.failures] or ["No case failed."]
     slowest, where = tally.slowest
     return "\n".join(
@@ -195,6 +197,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=200_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES), help="these alone")
     parser.add_argument("--chunk", type=int, default=1000)
     parser.add_argument("--output", type=Path)
     parser.add_argument("--keep", type=Path, help="where failing cases are written")

@@ -50,6 +50,15 @@ class Network(nn.Module):
         return points.norm(dim=-1, keepdim=True) - 0.5 + 0.05 * self.second(hidden)
 
 
+def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_path: Path) -> None:
+    """Its field file holds no tensor; and may be uploaded again."""
+    report = import_field(saved(tmp_path, sphere().SerializeToString()), tmp_path / "out")
+    assert (report.family, report.parameters) == ("onnx", 0)
+    again = import_field(tmp_path / "out" / "field.safetensors", tmp_path / "again")
+    assert again.plausibility == report.plausibility
+
+
+
 @pytest.mark.parametrize("exporter", ["of today", "of before"])
 def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Path) -> None:
     torch.manual_seed(0)

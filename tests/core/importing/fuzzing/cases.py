@@ -7,16 +7,16 @@ from random import Random
 from tests.core.importing.archives import tensor, text
 from tests.core.importing.fuzzing.archive_model import Ending, archive_bytes, lied
 from tests.core.importing.fuzzing.byte_mutations import damaged
+from tests.core.importing.fuzzing.container_mutations import SPOILERS
 from tests.core.importing.fuzzing.header_mutations import rewritten
-from tests.core.importing.fuzzing.other_files import spoilt
 from tests.core.importing.fuzzing.pickle_grammar import Grammar, contiguous
 from tests.core.importing.fuzzing.pickle_mutations import opcodes_of, respelt
 from tests.core.importing.fuzzing.seeds import EMPTY, Seeds
 
-STAGES = ("container", "pickle", "tensors", "header", "file", "other")
+STAGES = ("container", "pickle", "tensors", "header", "file", *SPOILERS)
 """container: any bytes as an archive. pickle: any bytes as a pickle. tensors: an archive that is sound but for its
-pickle and storages, up to the field. header: any bytes as a safetensors file. file: any bytes as an upload.
-other: a file of another kind, damaged, as an upload."""
+pickle and storages, up to the field. header: any bytes as a safetensors file. file: any bytes as an upload. legacy,
+arrays, database, mesh, onnx: a file of that container, damaged, as an upload; other: so other trainers' checkpoints."""
 
 _LEGACY = bytes.fromhex("80028a0a6cfc9c46f9206aa850192e")
 
@@ -34,8 +34,8 @@ def make_case(random: Random, stage: str, seeds: Seeds, finds: list[bytes]) -> b
             return _tensors(random, seeds)
         case "header":
             return _header(random, seeds)
-        case "other":
-            return _other(random, seeds)
+    if stage in SPOILERS:
+        return _other(random, stage, seeds)
     return random.choice((_container, _tensors, _tensors, _header, _header, _head))(random, seeds)
 
 
@@ -103,9 +103,9 @@ def _header(random: Random, seeds: Seeds) -> bytes:
     return damaged(random, seeds.field_file) if random.random() < 0.2 else rewritten(random, seeds.field_file)
 
 
-def _other(random: Random, seeds: Seeds) -> bytes:
-    files = list(seeds.others.values())
-    return spoilt(random, random.choice(files), random.choice(files))
+def _other(random: Random, stage: str, seeds: Seeds) -> bytes:
+    files = list(seeds.others[stage].values())
+    return SPOILERS[stage](random, random.choice(files), random.choice(files))
 
 
 def _head(random: Random, seeds: Seeds) -> bytes:

@@ -39,9 +39,9 @@ def rewritten(random: Random, file: bytes) -> bytes:
             described = json.loads(header["__metadata__"]["field"]) if _is_described(header) else {}
             header.setdefault("__metadata__", {})
             if isinstance(header["__metadata__"], dict):
-                header["__metadata__"]["field"] = json.dumps(_altered(random, described))
+                header["__metadata__"]["field"] = json.dumps(altered(random, described))
         else:
-            header = _altered(random, header)
+            header = altered(random, header)
         if not isinstance(header, dict):
             break
     return joined(random, header, body[: random.randrange(len(body) + 1)] if random.random() < 0.1 else body)
@@ -55,10 +55,10 @@ def _is_described(header: dict[str, Any]) -> bool:
         return False
 
 
-def _altered(random: Random, value: Any) -> Any:
+def altered(random: Random, value: Any, most_depth: int = 4) -> Any:
     """``value`` with one of its parts, at any depth, changed, dropped, doubled or renamed."""
     value = copy.deepcopy(value)
-    here, depth = value, random.randrange(5)
+    here, depth = value, random.randrange(most_depth + 1)
     while depth and isinstance(here, dict | list) and here:
         below = here[random.choice(list(here))] if isinstance(here, dict) else random.choice(here)
         if not isinstance(below, dict | list) or not below:

@@ -1,40 +1,74 @@
-"""One small sound file of every other kind that the gate takes, and damage that knows how such files are built."""
+"""Small sound files of every other kind that the gate takes."""
 
 from __future__ import annotations
 
 import io
 import tempfile
-import zipfile
 from pathlib import Path
-from random import Random
 
-from tests.core.importing.fuzzing.archive_model import Ending, Record, archive_bytes, lied
-from tests.core.importing.fuzzing.byte_mutations import damaged
-from tests.core.importing.fuzzing.pickle_mutations import opcodes_of, respelt
+import numpy as np
+import torch
+import trimesh
+
+from tests.core.importing import (
+    onnx_models,
+    test_isdf,
+    test_nglod,
+    test_nvblox,
+    test_pin_slam,
+    test_point_clouds,
+    test_torch_ngp,
+    test_voxel_block_grid,
+)
+from tests.core.importing import small_families as small
+from tests.core.importing.checkpoints import checkpoint
 
 
-def make_others() -> dict[str, bytes]:
-    """The files by their kind. Needs torch and the libraries that write such files."""
-    import numpy as np
-    import torch
-    import trimesh
+def make_others() -> dict[str, dict[str, bytes]]:
+    """The files by their stage and kind. Needs torch and the libraries that write such files."""
+    return {
+        "legacy": _legacy_files(),
+        "arrays": _array_files(),
+        "database": {"nvblox": _database(test_nvblox.ball_blocks()[::12])},
+        "mesh": _mesh_files(),
+        "onnx": _models(),
+        "other": _checkpoints(),
+    }
 
-    from tests.core.importing import onnx_models, small_families, test_nvblox, test_pin_slam, test_voxel_block_grid
-    from tests.core.importing.checkpoints import checkpoint
 
+def _legacy_files() -> dict[str, bytes]:
+    files = {"neus_facto": _saved(checkpoint(log2_size=8, hidden=6, optimiser=False), legacy=True)}
+    return files | {make.__name__: _saved(make().checkpoint, legacy=True) for make in (small.siren, small.deepsdf)}
+
+
+def _array_files() -> dict[str, bytes]:
+    axes = np.linspace(-1.0, 1.0, 9)
+    distance = np.linalg.norm(np.stack(np.meshgrid(axes, axes, axes, indexing="ij")), axis=0) - 0.5
+    grid = _arrays(sdf=distance.astype(np.float32), bounds=np.array([[-1.0] * 3, [1.0] * 3]))
+    return {"grid": grid, "voxels": _arrays(**test_voxel_block_grid.ball())}
+
+
+def _mesh_files() -> dict[str, bytes]:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
     files = {kind: _bytes(ball.export(file_type=kind)) for kind in ("ply", "stl", "stl_ascii", "obj", "glb")}
     files["ply_ascii"] = _bytes(ball.export(file_type="ply", encoding="ascii"))
-    axes = np.linspace(-1.0, 1.0, 9)
-    distance = np.linalg.norm(np.stack(np.meshgrid(axes, axes, axes, indexing="ij")), axis=0) - 0.5
-    files["grid"] = _arrays(sdf=distance.astype(np.float32), bounds=np.array([[-1.0] * 3, [1.0] * 3]))
-    files["voxels"] = _arrays(**test_voxel_block_grid.ball())
-    files["onnx"] = onnx_models.sphere().SerializeToString()
-    files["legacy"] = _saved(torch, checkpoint(log2_size=8, hidden=6, optimiser=False), legacy=True)
-    files["pin_slam"] = _saved(torch, test_pin_slam.floor())
-    files["sqlite"] = _database(test_nvblox.ball_blocks()[::12])
-    for make in (small_families.neus, small_families.siren, small_families.deepsdf, small_families.instant_nsr_pl):
-        files[make.__name__] = _saved(torch, make().checkpoint)
+    around = test_point_clouds.directions(150)
+    return files | {"cloud": test_point_clouds.ply(0.5 * around, around)}
+
+
+def _models() -> dict[str, bytes]:
+    layers = {"w": np.eye(3, 8, dtype=np.float32), "b": np.zeros(8, np.float32), "v": np.ones((8, 1), np.float32)}
+    network = onnx_models.model("h = Gemm x w b; a = Relu h; y = MatMul a v", layers)
+    return {name: each.SerializeToString() for name, each in (("sphere", onnx_models.sphere()), ("network", network))}
+
+
+def _checkpoints() -> dict[str, bytes]:
+    """Of other trainers, in the container of today."""
+    files = {"pin_slam": _saved(test_pin_slam.floor()), "isdf": _saved(test_isdf.checkpoint())}
+    files["nglod"] = _saved(test_nglod.checkpoint())
+    files["torch_ngp"] = _saved(test_torch_ngp.tcnn_checkpoint())
+    for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
+        files[make.__name__] = _saved(make().checkpoint)
     return files
 
 
@@ -43,39 +77,17 @@ def _bytes(data: bytes | str) -> bytes:
 
 
 def _arrays(**arrays: object) -> bytes:
-    import numpy as np
-
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     return buffer.getvalue()
 
 
 def _database(rows: list[tuple[int, int, int, bytes]]) -> bytes:
-    from tests.core.importing import test_nvblox
-
     with tempfile.TemporaryDirectory() as folder:
         return test_nvblox.write_map(Path(folder, "map"), rows).read_bytes()
 
 
-def _saved(torch: object, values: object, legacy: bool = False) -> bytes:
+def _saved(values: object, legacy: bool = False) -> bytes:
     buffer = io.BytesIO()
-    torch.save(values, buffer, _use_new_zipfile_serialization=not legacy)  # type: ignore[attr-defined]
+    torch.save(values, buffer, _use_new_zipfile_serialization=not legacy)
     return buffer.getvalue()
-
-
-def spoilt(random: Random, file: bytes, other: bytes) -> bytes:
-    """The file after some damage; of an archive mostly to one entry, which is then packed as if it belonged."""
-    if not file.startswith(b"PK\x03\x04") or random.random() < 0.2:
-        return damaged(random, file, other)
-    with zipfile.ZipFile(io.BytesIO(file)) as archive:
-        records = [Record(name.encode(), archive.read(name)) for name in archive.namelist()]
-    if random.random() < 0.2:
-        return archive_bytes(*lied(random, records, Ending()))
-    at = random.randrange(len(records))
-    name, data = records[at].name, records[at].data
-    if name.endswith(b"data.pkl") and random.random() < 0.7:
-        codes = opcodes_of(data)
-        records[at] = Record(name, respelt(random, codes, codes))
-    else:
-        records[at] = Record(name, damaged(random, data, other))
-    return archive_bytes(records)

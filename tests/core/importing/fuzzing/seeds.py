@@ -9,7 +9,6 @@ from pathlib import Path
 
 from regnf_core.importing.container import read_archive
 from tests.core.importing.fuzzing.archive_model import Record, archive_bytes
-from tests.core.importing.fuzzing.other_files import make_others
 
 EMPTY = "90"
 """Key of a storage without a byte."""
@@ -24,8 +23,13 @@ class Seeds:
     tensors: tuple[tuple[str, str, tuple[int, ...]], ...]
     """Name, storage key and shape of each tensor of the checkpoint's field."""
     field_file: bytes
-    others: dict[str, bytes]
-    """Sound files of other kinds."""
+    others: dict[str, dict[str, bytes]]
+    """Sound files of other kinds, by the stage that begins with them."""
+
+    @property
+    def other_files(self) -> dict[str, bytes]:
+        """All of ``others``."""
+        return {f"{stage} {kind}": data for stage, files in self.others.items() for kind, data in files.items()}
 
     @property
     def archive(self) -> bytes:
@@ -56,6 +60,7 @@ def make_seeds(folder: Path) -> Seeds:
     from regnf_core.importing.convert import FIELD_NAME, convert_file
     from regnf_core.importing.report import ImportLimits
     from tests.core.importing.checkpoints import checkpoint
+    from tests.core.importing.fuzzing.other_files import make_others
 
     values = checkpoint(log2_size=8, hidden=6, optimiser=False)
     upload = folder / "seed.ckpt"

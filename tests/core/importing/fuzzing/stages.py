@@ -20,6 +20,8 @@ from regnf_core.importing.upload_description import UploadDescription
 
 BUDGET = 1 << 24
 """Bytes of tensors that one case may have."""
+PARTS = ("container", "pickle", "tensors", "header")
+"""The stages that see a part of the gate; all others begin with a whole file."""
 _TAKEN = "taken"
 _QUIET = (
     "object.",
@@ -53,7 +55,7 @@ class Watch:
     @contextmanager
     def over(self, stage: str) -> Iterator[None]:
         """Watch one case."""
-        self._armed, self._files = True, stage in ("file", "other")
+        self._armed, self._files = True, stage not in PARTS
         try:
             yield
         finally:
@@ -72,7 +74,7 @@ def run_stage(stage: str, data: bytes, folder: Path) -> str:
                 _tensors(data)
             case "header":
                 read_header(memoryview(data))
-            case "file" | "other":
+            case _:
                 _file(data, folder)
     except FieldFormatError as error:
         return error.reason

@@ -1,6 +1,6 @@
 """The process that runs a fuzzer's cases: little memory, a time limit each, every import and file noticed.
 
-    python -m tests.core.importing.fuzzing.worker SEEDS FOLDER SEED
+    python -m tests.core.importing.fuzzing.worker SEEDS FOLDER SEED STAGE...
 
 Reads lines "FIRST COUNT" and answers each with one line of JSON. The case under way lies in FOLDER/case, for whoever
 has to find out why this process ended. Needs no torch.
@@ -24,10 +24,10 @@ from random import Random
 from typing import Any
 
 from regnf_core.importing import families
-from tests.core.importing.fuzzing.cases import STAGES, make_case
+from tests.core.importing.fuzzing.cases import make_case
 from tests.core.importing.fuzzing.line_coverage import Coverage
 from tests.core.importing.fuzzing.seeds import load_seeds
-from tests.core.importing.fuzzing.stages import Watch, run_stage
+from tests.core.importing.fuzzing.stages import PARTS, Watch, run_stage
 
 MEMORY_BYTES = 2 << 30
 CASE_S = 5.0
@@ -46,32 +46,32 @@ def _late(*_: object) -> None:
 class Fuzzer:
     """Makes cases and runs them. A case's index and the seed decide it, together with what was found before."""
 
-    def __init__(self, seeds: Path, folder: Path, seed: str) -> None:
-        self.seeds = load_seeds(seeds)
+    def __init__(self, seeds: Path, folder: Path, seed: str, stages: list[str]) -> None:
+        self.seeds, self.stages = load_seeds(seeds), stages
         self.folder, self.seed = folder, seed
         self.scratch = folder / "scratch"
         self.scratch.mkdir(exist_ok=True)
         self.case = (folder / "case").open("w+b", buffering=0)
         self.coverage, self.watch = Coverage(), Watch()
-        self.finds: dict[str, list[bytes]] = {stage: [] for stage in STAGES}
+        self.finds: dict[str, list[bytes]] = {stage: [] for stage in stages}
         self._warm_up()
 
     def _warm_up(self) -> None:
         """Have every module loaded that files may need: a family's own, and what sound files bring about."""
         for module in pkgutil.walk_packages(families.__path__, f"{families.__name__}."):
             importlib.import_module(module.name)
-        for data in (self.seeds.archive, self.seeds.field_file, b"", *self.seeds.others.values()):
-            for stage in STAGES:
+        for data in (self.seeds.archive, self.seeds.field_file, b"", *self.seeds.other_files.values()):
+            for stage in (*PARTS, "file"):
                 run_stage(stage, data, self.scratch)
         run_stage("pickle", self.seeds.pickles[1], self.scratch)
 
     def run_chunk(self, first: int, count: int) -> dict[str, Any]:
         outcomes: Counter[str] = Counter()
         failures: list[dict[str, Any]] = []
-        samples: dict[str, tuple[str, bytes]] = {}
+        samples: dict[bool, list[tuple[str, bytes]]] = {True: [], False: []}
         slowest, slowest_at = 0.0, ""
         for index in range(first, first + count):
-            stage = STAGES[index % len(STAGES)]
+            stage = self.stages[index % len(self.stages)]
             data = make_case(Random(f"{self.seed} {index}"), stage, self.seeds, self.finds[stage])
             begun = time.process_time()
             outcome, fault = self.run_case(stage, data, Random(index).random() < _TRACED_SHARE)
@@ -82,14 +82,15 @@ class Fuzzer:
             if fault:
                 failures.append({"at": f"{stage} {index}", "fault": fault, "case": base64.b64encode(data).decode()})
             if stage != "pickle":
-                samples["taken" if outcome == "taken" else "refused"] = (stage, data)
+                samples[outcome == "taken"].append((stage, data))
+        chosen = [Random(f"{self.seed} {first}").choice(of_a_kind) for of_a_kind in samples.values() if of_a_kind]
         return {
             "outcomes": outcomes,
             "failures": failures,
             "slowest": [slowest, slowest_at],
             "lines": self.coverage.lines(),
             "finds": sum(map(len, self.finds.values())),
-            "samples": [[stage, base64.b64encode(data).decode()] for stage, data in samples.values()],
+            "samples": [[stage, base64.b64encode(data).decode()] for stage, data in chosen],
             "peak_bytes": _peak_bytes(),
         }
 
@@ -138,7 +139,7 @@ def main(arguments: list[str]) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, _late)
-    fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2])
+    fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2], arguments[3:])
     if "torch" in sys.modules:
         raise RuntimeError("the stages loaded torch")
     for line in sys.stdin:
