@@ -58,7 +58,6 @@ def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_p
     assert again.plausibility == report.plausibility
 
 
-
 @pytest.mark.parametrize("exporter", ["of today", "of before"])
 def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
