@@ -7,6 +7,7 @@ import socket
 
 from regnf_cli.start_errors import StartError
 from service.settings import Settings
+from service.tokens import TokensError, read_callers
 
 _BACKLOG = 2048
 
@@ -14,15 +15,19 @@ _BACKLOG = 2048
 def open_socket(settings: Settings) -> socket.socket:
     """A listening socket on the settings' host and port (0: a free one).
 
-    Raises StartError: ADDRESS_UNAVAILABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others can reach while
-    no token is asked for.
+    Raises StartError: ADDRESS_UNAVAILABLE, TOKENS_UNUSABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others
+    can reach while no token is asked for.
     """
-    if not is_loopback(settings.host) and not settings.api_tokens and not settings.allow_unauthenticated:
+    if not is_loopback(settings.host) and not settings.needs_token and not settings.allow_unauthenticated:
         raise StartError(
             f"{settings.host} can be reached by others and no token is asked for: set REGNF_API_TOKENS, "
             "or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
         )
+    try:
+        read_callers(settings.api_tokens, settings.api_tokens_file)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason) from error
     try:
         found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, protocol, _, address = found[0]

@@ -10,7 +10,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 from urllib.parse import urlsplit
@@ -20,7 +20,7 @@ from regnf_cli.embedded_redis import answers, server_command
 from regnf_cli.listening import address_of, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
-from service.settings import Settings
+from service.settings import SECRETS, Settings
 
 _LOOK_EVERY_S = 0.2
 _START_DEADLINE_S = 60.0
@@ -78,7 +78,7 @@ class Supervisor:
     def _start_redis(self, lock: StateLock, lifeline: int) -> str:
         path = lock.make_socket_dir() / "redis.sock"
         command = server_command(path, self._settings.state_dir / "redis")
-        self._redis = Child("redis", command, os.environ, lifeline)
+        self._redis = Child("redis", command, _without_secrets(os.environ), lifeline)
         self._redis.start()
         url = f"unix://{path}"
         self._until(lambda: answers(url), self._redis, "Redis")
@@ -97,7 +97,8 @@ class Supervisor:
         self._api = Child("api", api, environment, lifeline, passed=[descriptor])
         worker = [sys.executable, "-m", "worker.main"]
         self._workers = [
-            Child(f"worker {number}", worker, environment, lifeline) for number in range(1, self._settings.workers + 1)
+            Child(f"worker {number}", worker, _without_secrets(environment), lifeline)
+            for number in range(1, self._settings.workers + 1)
         ]
         for child in (self._api, *self._workers):
             child.start()
@@ -156,3 +157,8 @@ def _api_answers(address: str) -> bool:
     finally:
         connection.close()
     return True
+
+
+def _without_secrets(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment of a process that has no business with callers and their tokens."""
+    return {name: value for name, value in environment.items() if name not in SECRETS}

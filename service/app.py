@@ -33,6 +33,7 @@ from service.redis_records import RedisRecordStore
 from service.routes import fields, jobs, meta, pages, registrations, results, uploads
 from service.settings import Settings
 from service.shutdown import stopping_on_signals
+from service.tokens import read_callers
 from service.waiting import pause
 
 logger = logging.getLogger(__name__)
@@ -57,9 +58,10 @@ def create_app(
 ) -> FastAPI:
     """The application over the given stores, or over Redis and the local folder that the settings name.
 
-    Raises ConfigurationError when stores are missing and no Redis is named.
+    Raises ConfigurationError when stores are missing and no Redis is named, TokensError when the tokens are unusable.
     """
     settings = settings or Settings()
+    callers = read_callers(settings.api_tokens, settings.api_tokens_file)
     redis: Redis | None = None
     if records is None or queue is None:
         if settings.redis_url is None:
@@ -78,7 +80,12 @@ def create_app(
         lifespan=_lifespan_of(services, redis),
         middleware=[
             Middleware(RequestContext),
-            Middleware(TokenGate, tokens=settings.api_tokens, allow_unauthenticated=settings.allow_unauthenticated),
+            Middleware(
+                TokenGate,
+                callers=callers,
+                needs_token=settings.needs_token,
+                allow_unauthenticated=settings.allow_unauthenticated,
+            ),
         ],
     )
     app.state.services = services

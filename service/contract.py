@@ -24,8 +24,9 @@ Upload both fields, post a detection to `/register`, follow the job, fetch its r
 (RFC 9457) with a stable `reason`; switch on it, never on text. Answers may gain members.
 
 Where tokens are configured every call but `/healthz`, `/static` and a job's page needs `Authorization: Bearer`, and is
-refused with 401 `UNAUTHENTICATED` otherwise. Query parameters that an address of fields, registrations or jobs does not
-know are refused with 400 `INVALID_QUERY`.
+refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's fields and jobs are 404.
+
+Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
 """
 _MODELS: tuple[Any, ...] = (
     ProblemDocument, UploadDescription, RegisterRequest, Question, DryRunDocument, JobDocument,

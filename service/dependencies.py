@@ -51,12 +51,19 @@ def prefix_of(request: Request) -> str:
     return root + ("/v1" if path == "/v1" or path.startswith("/v1/") else "")
 
 
+def caller_of_request(request: Request) -> str:
+    """Whose call it is."""
+    caller: str = request.state.caller
+    return caller
+
+
 async def off_loop(work: Callable[..., _Result], *arguments: Any) -> _Result:
     """Run blocking work, a call of a store, in a thread."""
     return await to_thread.run_sync(work, *arguments)
 
 
 ServicesDep = Annotated[Services, Depends(services_of)]
+CallerDep = Annotated[str, Depends(caller_of_request)]
 PrefixDep = Annotated[str, Depends(prefix_of)]
 WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
 LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]

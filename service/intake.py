@@ -7,6 +7,7 @@ from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
 from service.dependencies import Services, off_loop
+from service.ownership import reference_of
 from service.problems import Problem
 from service.records import FieldRecord
 from service.schemas.fields import function_of
@@ -21,23 +22,24 @@ class Intake:
     created: bool
 
 
-def original_key(sha256: str) -> str:
+def original_key(reference: str) -> str:
     """Where the uploaded bytes lie until the import has ended."""
-    return f"fields/{sha256}/original"
+    return f"fields/{reference}/original"
 
 
 async def take_in(
-    services: Services, upload: Upload, received: Received, description: UploadDescription | None = None
+    services: Services, caller: str, upload: Upload, received: Received, description: UploadDescription | None = None
 ) -> Intake:
-    """Keep a finished upload unless its bytes are held already, and see to it that its import is queued.
+    """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function.
     """
-    known = await off_loop(services.records.get_field, received.sha256)
+    reference = reference_of(caller, received.sha256)
+    known = await off_loop(services.records.get_field, reference)
     if known is not None and known.state != "rejected":
         return await off_loop(_keep, services, known, description)
-    await upload.commit(original_key(received.sha256))
-    return await off_loop(_record, services, received, description)
+    await upload.commit(original_key(reference))
+    return await off_loop(_record, services, reference, received.bytes, description)
 
 
 def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> Intake:
@@ -52,14 +54,14 @@ def _keep(services: Services, known: FieldRecord, description: UploadDescription
     return Intake(known, created=False)
 
 
-def _record(services: Services, received: Received, description: UploadDescription | None) -> Intake:
+def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> Intake:
     now = services.records.now()
     said: dict[str, Any] = {} if description is None else function_of(description)
     record, created = services.records.create_field(
         FieldRecord(
-            sha256=received.sha256,
+            sha256=reference,
             state="validating",
-            bytes=received.bytes,
+            bytes=size,
             created=now,
             updated=now,
             label=None if description is None else description.label,
@@ -68,7 +70,7 @@ def _record(services: Services, received: Received, description: UploadDescripti
     )
     if record.state == "ready":
         # another upload of the same bytes came first and is imported already
-        services.blobs.delete(original_key(received.sha256))
+        services.blobs.delete(original_key(reference))
     if not created:
         return _keep(services, record, description)
     services.queue.enqueue_import(record.sha256, record.attempt)

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from service import transitions
 from service.blobs import check_key
+from service.ownership import ANONYMOUS
 from service.records import ACTIVE, FieldRecord, JobEvent, JobRecord, QueueFullError, StaleAttemptError
 
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
@@ -37,7 +38,7 @@ class InMemoryRecordStore:
         self._jobs: dict[str, JobRecord] = {}
         self._waiting: list[str] = []
         self._events: dict[str, list[JobEvent]] = {}
-        self._tombstones: set[str] = set()
+        self._tombstones: dict[str, str] = {}
         self._fields: dict[str, FieldRecord] = {}
         self._attempts_at_deleted: dict[str, int] = {}
         self._remembered: dict[str, tuple[str, float]] = {}
@@ -93,20 +94,24 @@ class InMemoryRecordStore:
                 return known, False
             if len(self.active_jobs()) >= max_active:
                 raise QueueFullError(f"{max_active} jobs are active already")
-            self._tombstones.discard(record.id)
+            self._tombstones.pop(record.id, None)
             return self._save(fresh), True
 
     def get_job(self, job_id: str) -> JobRecord | None:
         with self._changed:
             return self._live(job_id)
 
-    def job_expired(self, job_id: str) -> bool:
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         with self._changed:
-            return job_id in self._tombstones or (job_id in self._jobs and self._live(job_id) is None)
+            dead = self._jobs[job_id].owner if job_id in self._jobs and self._live(job_id) is None else None
+            return owner in (dead, self._tombstones.get(job_id))
 
-    def list_jobs(self, status: str | None, limit: int, before: tuple[float, str] | None) -> list[JobRecord]:
+    def list_jobs(
+        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[JobRecord]:
         with self._changed:
             live = [record for job_id in self._jobs if (record := self._live(job_id)) is not None]
+            live = [record for record in live if owner in (None, record.owner)]
             return _page([record for record in live if status in (None, record.status)], "id", limit, before)
 
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
@@ -133,7 +138,7 @@ class InMemoryRecordStore:
                 raise StaleAttemptError(f"a job that is {record.status} is not deleted")
             self._jobs.pop(job_id, None)
             self._events.pop(job_id, None)
-            self._tombstones.discard(job_id)
+            self._tombstones.pop(job_id, None)
             return record is not None
 
     def active_jobs(self) -> list[JobRecord]:
@@ -144,9 +149,8 @@ class InMemoryRecordStore:
         with self._changed:
             expired = [job_id for job_id in self._jobs if self._live(job_id) is None]
             for job_id in expired:
-                del self._jobs[job_id]
+                self._tombstones[job_id] = self._jobs.pop(job_id).owner
                 self._events.pop(job_id, None)
-                self._tombstones.add(job_id)
             return expired
 
     def queue_position(self, job_id: str) -> int | None:
@@ -191,9 +195,12 @@ class InMemoryRecordStore:
         with self._changed:
             return self._fields.get(sha256)
 
-    def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]:
+    def list_fields(
+        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[FieldRecord]:
         with self._changed:
             chosen = [record for record in self._fields.values() if label in (None, record.label)]
+            chosen = [record for record in chosen if owner in (None, record.owner)]
             return _page(chosen, "sha256", limit, before)
 
     def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import ipaddress
 import re
 import uuid
-from collections.abc import Iterable
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.ownership import ANONYMOUS
 from service.problems import Problem, problem_response
+from service.tokens import Callers, caller_of
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
 _OPEN_PATHS = re.compile(r"(/v1)?/healthz|/static/.*|(/v1)?/jobs/[A-Za-z0-9_-]+/view")
@@ -61,36 +60,34 @@ def _came_from_outside(scope: Scope) -> bool:
 
 
 class TokenGate:
-    """Refuses every call without one of the tokens.
+    """Refuses every call without one of the tokens, and tells whose it was: ``caller`` in the request's state.
 
     Without tokens it refuses what arrives from beyond loopback, unless ``allow_unauthenticated``: whichever server runs
     the application, wherever it was told to listen.
     """
 
-    def __init__(self, app: ASGIApp, tokens: Iterable[str], allow_unauthenticated: bool = False) -> None:
+    def __init__(self, app: ASGIApp, callers: Callers, needs_token: bool, allow_unauthenticated: bool = False) -> None:
         self._app = app
+        self._callers = callers
+        self._needs_token = needs_token
         self._allow_unauthenticated = allow_unauthenticated
-        # digests have one length, so that a comparison tells nothing about a token's
-        self._digests = [hashlib.sha256(token.encode()).digest() for token in tokens]
-
-    def _allows(self, authorization: str) -> bool:
-        scheme, _, token = authorization.partition(" ")
-        digest = hashlib.sha256(token.strip().encode("utf-8", "surrogateescape")).digest()
-        matches = [hmac.compare_digest(digest, known) for known in self._digests]
-        return scheme.lower() == "bearer" and any(matches)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        problem = self._refusal(scope) if scope["type"] == "http" and not _is_open(scope) else None
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        caller = ANONYMOUS
+        if self._needs_token:
+            found = caller_of(self._callers, Headers(scope=scope).get("authorization", ""))
+            caller, known = found or ANONYMOUS, found is not None
+        else:
+            known = self._allow_unauthenticated or not _came_from_outside(scope)
+        scope.setdefault("state", {})["caller"] = caller
+        problem = None if known or _is_open(scope) else self._refusal()
         if problem is not None:
             await problem_response(problem, scope)(scope, receive, send)
         else:
             await self._app(scope, receive, send)
 
-    def _refusal(self, scope: Scope) -> Problem | None:
-        detail = None
-        if self._digests:
-            refused = not self._allows(Headers(scope=scope).get("authorization", ""))
-        else:
-            refused = not self._allow_unauthenticated and _came_from_outside(scope)
-            detail = _NO_TOKENS
-        return Problem("UNAUTHENTICATED", detail, headers=_CHALLENGE) if refused else None
+    def _refusal(self) -> Problem:
+        return Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)

@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
+from service.ownership import ANONYMOUS, owner_of
+
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
 FieldState = Literal["validating", "ready", "rejected"]
 ACTIVE: frozenset[str] = frozenset({"accepted", "running"})
@@ -55,10 +57,15 @@ class JobRecord:
     worker: str | None = None
     """Who claimed the attempt."""
 
+    @property
+    def owner(self) -> str:
+        """The caller whose job it is: whoever owns the scene."""
+        return owner_of(self.request["scene"]) if "scene" in self.request else ANONYMOUS
+
 
 @dataclass(frozen=True)
 class FieldRecord:
-    """One field, named by the SHA-256 of the bytes that were uploaded."""
+    """One field. ``sha256`` is its reference: the SHA-256 of the bytes that were uploaded, and its owner's name."""
 
     sha256: str
     state: FieldState
@@ -78,6 +85,11 @@ class FieldRecord:
     """How often this upload was handed out again because its worker vanished."""
     symmetry: dict[str, Any] | None = None
     """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
+
+    @property
+    def owner(self) -> str:
+        """The caller whose field it is."""
+        return owner_of(self.sha256)
 
 
 @dataclass(frozen=True)
@@ -114,12 +126,14 @@ class RecordStore(Protocol):
 
     def get_job(self, job_id: str) -> JobRecord | None: ...
 
-    def job_expired(self, job_id: str) -> bool:
-        """Whether a job of this id was kept once and has outlived its retention."""
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
+        """Whether a job of this id and owner was kept once and has outlived its retention."""
         ...
 
-    def list_jobs(self, status: str | None, limit: int, before: tuple[float, str] | None) -> list[JobRecord]:
-        """Newest first, older than ``before`` = (created, id)."""
+    def list_jobs(
+        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[JobRecord]:
+        """Newest first, older than ``before`` = (created, id); ``owner`` None: everybody's."""
         ...
 
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
@@ -178,7 +192,11 @@ class RecordStore(Protocol):
 
     def get_field(self, sha256: str) -> FieldRecord | None: ...
 
-    def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]: ...
+    def list_fields(
+        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[FieldRecord]:
+        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
+        ...
 
     def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
         """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from service import transitions
+from service.ownership import owner_of
 from service.records import FieldRecord, StaleAttemptError
 from service.redis_documents import PREFIX, Command, RedisDocuments, text
 
@@ -20,6 +21,11 @@ def _key(sha256: str) -> str:
     return f"{PREFIX}field:{sha256}"
 
 
+def _created_keys(reference: str) -> tuple[str, str]:
+    """Where a field is listed: among all, and among its owner's."""
+    return _CREATED, f"{_CREATED}:{owner_of(reference)}"
+
+
 def _attempts_key(sha256: str) -> str:
     return f"{PREFIX}field:{sha256}:attempts"
 
@@ -29,8 +35,11 @@ class RedisFieldRecords(RedisDocuments):
 
     def _save_field(self, expected_version: int, record: FieldRecord) -> bool:
         index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
-        created: Command = ("ZADD", _CREATED, repr(record.created), record.sha256)
-        return self._compare_and_set(_key(record.sha256), expected_version, [index, created], asdict(record)) == "OK"
+        indexes = [
+            index,
+            *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
+        ]
+        return self._compare_and_set(_key(record.sha256), expected_version, indexes, asdict(record)) == "OK"
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
         while True:
@@ -62,9 +71,12 @@ class RedisFieldRecords(RedisDocuments):
         document, _ = self._read(_key(sha256))
         return FieldRecord(**document) if document is not None else None
 
-    def list_fields(self, label: str | None, limit: int, before: tuple[float, str] | None) -> list[FieldRecord]:
+    def list_fields(
+        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[FieldRecord]:
         found: list[FieldRecord] = []
-        for document in self._newest_first(_CREATED, _key, before):
+        index = _CREATED if owner is None else f"{_CREATED}:{owner}"
+        for document in self._newest_first(index, _key, before):
             record = FieldRecord(**document)
             if label in (None, record.label):
                 found.append(record)
@@ -89,7 +101,7 @@ class RedisFieldRecords(RedisDocuments):
                 return False
             commands: list[Command] = [
                 ("DEL", _key(sha256)),
-                ("ZREM", _CREATED, sha256),
+                *(("ZREM", each, sha256) for each in _created_keys(sha256)),
                 ("SREM", _VALIDATING, sha256),
                 ("SET", _attempts_key(sha256), str(document["attempt"]), "EX", _ATTEMPTS_KEPT_S),
             ]

@@ -1,8 +1,9 @@
 """The record store in Redis. What a record may become is in ``transitions``; here it is only kept.
 
-Keys:  regnf:job:{id}             hash: the record          regnf:jobs:created    sorted by time of creation
+Keys:  regnf:job:{id}             hash: the record          regnf:jobs:created    sorted by time of creation,
+                                                            also one for each owner, :{owner}
        regnf:job:{id}:events      stream                    regnf:jobs:active     set of accepted and running
-       regnf:job:{id}:gone        tombstone                 regnf:jobs:waiting    sorted by time of acceptance
+       regnf:job:{id}:gone        tombstone: the owner      regnf:jobs:waiting    sorted by time of acceptance
        regnf:field:{sha256}       hash: the record          regnf:jobs:expiring   sorted by time of expiry
 """
 
@@ -17,6 +18,7 @@ from typing import Any
 from redis import Redis
 
 from service import transitions
+from service.ownership import ANONYMOUS
 from service.records import ACTIVE, JobEvent, JobRecord, QueueFullError, StaleAttemptError
 from service.redis_documents import PREFIX, Command, text
 from service.redis_fields import RedisFieldRecords
@@ -34,14 +36,20 @@ local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
 if not expires or tonumber(expires) > tonumber(ARGV[2]) then return 0 end
 redis.call('ZREM', KEYS[1], ARGV[1])
 redis.call('ZREM', KEYS[2], ARGV[1])
+local owner = redis.call('GET', KEYS[5])
+if owner then redis.call('ZREM', KEYS[2] .. ':' .. owner, ARGV[1]) end
 redis.call('DEL', KEYS[3], KEYS[4])
-redis.call('SET', KEYS[5], '1', 'EX', ARGV[3])
 return 1
 """
 
 
 def _key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}"
+
+
+def _created_keys(record: JobRecord) -> tuple[str, str]:
+    """Where a job is listed: among all, and among its owner's."""
+    return _CREATED, f"{_CREATED}:{record.owner}"
 
 
 def _events_key(job_id: str) -> str:
@@ -68,7 +76,7 @@ class RedisRecordStore(RedisFieldRecords):
         """What has to change around a record when ``before`` becomes ``after``."""
         key, events = _key(after.id), _events_key(after.id)
         commands: list[Command] = [
-            ("ZADD", _CREATED, repr(after.created), after.id),
+            *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
             ("SADD" if after.status in ACTIVE else "SREM", _ACTIVE, after.id),
         ]
         if after.status != "accepted":
@@ -82,6 +90,8 @@ class RedisRecordStore(RedisFieldRecords):
         if after.finished is not None:
             expires = after.finished + self._retention_s
             commands.append(("ZADD", _EXPIRING, repr(expires), after.id))
+            gone = str(int((expires + self._retention_s) * 1000))
+            commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
             commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
         else:
             commands += [("PERSIST", each) for each in (key, events)]
@@ -121,17 +131,19 @@ class RedisRecordStore(RedisFieldRecords):
         document, _ = self._read(_key(job_id))
         return JobRecord(**document) if document is not None else None
 
-    def job_expired(self, job_id: str) -> bool:
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.exists(_key(job_id))
-            pipeline.exists(_gone_key(job_id))
-            pipeline.zscore(_EXPIRING, job_id)
-            held, gone, expires = pipeline.execute()
-        return not held and (bool(gone) or expires is not None)
+            pipeline.get(_gone_key(job_id))
+            held, gone = pipeline.execute()
+        return not held and gone is not None and text(gone) == owner
 
-    def list_jobs(self, status: str | None, limit: int, before: tuple[float, str] | None) -> list[JobRecord]:
+    def list_jobs(
+        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[JobRecord]:
         found: list[JobRecord] = []
-        for document in self._newest_first(_CREATED, _key, before):
+        index = _CREATED if owner is None else f"{_CREATED}:{owner}"
+        for document in self._newest_first(index, _key, before):
             if status in (None, document["status"]):
                 found.append(JobRecord(**document))
             if len(found) == limit:
@@ -160,7 +172,10 @@ class RedisRecordStore(RedisFieldRecords):
                 raise StaleAttemptError(f"a job that is {document['status']} is not deleted")
             version = document["version"] if document is not None else 0
             commands: list[Command] = [("DEL", _key(job_id), _events_key(job_id), _gone_key(job_id))]
-            commands += [("ZREM", index, job_id) for index in (_CREATED, _WAITING, _EXPIRING)]
+            indexes = [_CREATED, _WAITING, _EXPIRING]
+            if document is not None:
+                indexes.append(_created_keys(JobRecord(**document))[1])
+            commands += [("ZREM", index, job_id) for index in indexes]
             if self._compare_and_set(_key(job_id), version, commands) == "OK":
                 return document is not None
 
@@ -174,7 +189,7 @@ class RedisRecordStore(RedisFieldRecords):
         names: Any = self._redis.zrangebyscore(_EXPIRING, "-inf", now)
         for job_id in map(text, names):
             keys = [_EXPIRING, _CREATED, _key(job_id), _events_key(job_id), _gone_key(job_id)]
-            if self._expire(keys=keys, args=[job_id, now, self._retention_s]):
+            if self._expire(keys=keys, args=[job_id, now]):
                 expired.append(job_id)
         return expired
 

@@ -8,6 +8,7 @@ from typing import Any
 from service.boxes import boxes_overlap
 from service.canonical import digest, job_id_of
 from service.dependencies import Services
+from service.ownership import ANONYMOUS, owned_request, reference_of
 from service.problems import Problem
 from service.records import FieldRecord, JobRecord
 
@@ -21,14 +22,18 @@ def check_idempotency_key(key: str | None) -> None:
         raise Problem("INVALID_IDEMPOTENCY_KEY")
 
 
-def check_fields(services: Services, request: dict[str, Any], named: Mapping[str, str]) -> None:
+def check_fields(services: Services, caller: str, request: dict[str, Any], named: Mapping[str, str]) -> None:
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
-    ``named`` are the fields that must be held, by where the request names them, a JSON Pointer.
+    ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
     Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE.
     """
-    _require_usable({pointer: services.records.get_field(sha256) for pointer, sha256 in named.items()})
-    bounds = _bounds(services.records.get_field(request["scene"]))
+
+    def field(sha256: str) -> FieldRecord | None:
+        return services.records.get_field(reference_of(caller, sha256))
+
+    _require_usable({pointer: field(sha256) for pointer, sha256 in named.items()})
+    bounds = _bounds(field(request["scene"]))
     box = request["detection"]
     if bounds is None or boxes_overlap(box["centre"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
         return
@@ -58,14 +63,16 @@ def _bounds(scene: FieldRecord | None) -> tuple[Sequence[float], Sequence[float]
     return None
 
 
-def submit(services: Services, request: dict[str, Any], idempotency_key: str | None) -> JobRecord:
-    """The job for a canonical request: a new one, or the one that exists, queued if it has not run.
+def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_key: str | None) -> JobRecord:
+    """The job for a caller's canonical request: a new one, or the one that exists, queued if it has not run.
 
     Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError.
     """
+    request = owned_request(asked, caller)
     job_id = job_id_of(request)
     if idempotency_key is not None:
-        existing = _earlier_answer(services, idempotency_key, job_id)
+        key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]
+        existing = _earlier_answer(services, digest(key), job_id)
         if existing is not None:
             return existing
     now = services.records.now()
@@ -75,7 +82,7 @@ def submit(services: Services, request: dict[str, Any], idempotency_key: str | N
             kind="registration",
             status="accepted",
             request=request,
-            inputs=_inputs(request),
+            inputs=_inputs(asked),
             created=now,
             updated=now,
         ),
@@ -90,7 +97,7 @@ def submit(services: Services, request: dict[str, Any], idempotency_key: str | N
 def _earlier_answer(services: Services, key: str, job_id: str) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
     mine = f"{job_id} {services.records.now()!r}"
-    bound = services.records.remember(f"idempotency:{digest(key)}", mine, _KEY_LIFETIME_S)
+    bound = services.records.remember(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
     bound_id, _, bound_at = bound.partition(" ")
     if bound_id != job_id:
         raise Problem("IDEMPOTENCY_KEY_REUSED")

@@ -17,25 +17,31 @@ def _default_state_dir() -> Path:
     return (Path(base) if base else Path.home() / ".local" / "state") / "regnf"
 
 
+SECRETS = frozenset({"REGNF_API_TOKENS"})
+"""Variables that only the API's process needs to see."""
+
+
 class Settings(BaseSettings):
     """Every setting has a default that works on one machine; each is REGNF_<NAME> in the environment."""
 
-    model_config = SettingsConfigDict(env_prefix="REGNF_", frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(env_prefix="REGNF_", frozen=True, extra="ignore", hide_input_in_errors=True)
 
     host: str = "127.0.0.1"
     port: int = Field(default=8080, ge=0, le=65535)
     """0 asks the system for a free port; the address is printed once it listens."""
     state_dir: Path = Field(default_factory=_default_state_dir)
     """Blobs, the embedded Redis' files and temporary uploads live under it."""
-    redis_url: str | None = None
+    redis_url: str | None = Field(default=None, repr=False)
     """Unset: `regnf serve` starts a private server of its own."""
     workers: int = Field(default=1, ge=0, le=64)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where registrations run; auto: on the GPU if torch can use one."""
     threads: int | None = Field(default=None, ge=1, le=256)
     """Threads of each job's process; unset: cores / workers."""
-    api_tokens: frozenset[str] = frozenset()
-    """JSON list. Empty: no token needed, which is allowed on loopback only."""
+    api_tokens: frozenset[str] = Field(default=frozenset(), repr=False)
+    """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
+    api_tokens_file: Path | None = None
+    """More of them, one a line."""
     allow_unauthenticated: bool = False
     """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
     max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
@@ -56,6 +62,11 @@ class Settings(BaseSettings):
     """How long finished jobs and their artifacts are kept."""
 
     log_format: Literal["text", "json"] = "text"
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether callers must name themselves."""
+        return bool(self.api_tokens) or self.api_tokens_file is not None
 
     @property
     def scratch_dir(self) -> Path:

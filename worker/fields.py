@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from regnf_core.errors import InvalidInputError
+from service.ownership import sha256_of
 from service.records import FieldRecord
 from worker.context import Context
 from worker.pulse import Pulse
@@ -45,14 +46,14 @@ class Fields:
         return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
 
     def _usable(self, sha256: str) -> FieldRecord:
-        field = self._context.records.get_field(sha256)
+        field, name = self._context.records.get_field(sha256), sha256_of(sha256)
         if field is None:
-            raise InvalidInputError(f"field {sha256} was deleted", reason="FIELD_NOT_FOUND")
+            raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
         if field.state == "rejected":
             why = (field.error or {}).get("reason", "unknown")
-            raise InvalidInputError(f"field {sha256} was rejected: {why}", reason="FIELD_REJECTED")
+            raise InvalidInputError(f"field {name} was rejected: {why}", reason="FIELD_REJECTED")
         settings = self._context.settings
         longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
         if field.state == "validating" and self._context.records.now() - field.updated > longest:
-            raise InvalidInputError(f"field {sha256} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
+            raise InvalidInputError(f"field {name} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
         return field

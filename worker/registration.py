@@ -12,6 +12,7 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
+from service.ownership import sha256_of
 from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts
 from worker.context import Context
@@ -131,7 +132,8 @@ def _register(
     object_file, model = fields.file(one.sha256), None
     if options.get("preset") == "robust":
         model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
-    return engine.register(scene_file, object_file, model, request, pulse.report, folder)
+    asked = request | {"object": sha256_of(one.sha256)}
+    return engine.register(scene_file, object_file, model, asked, pulse.report, folder)
 
 
 def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, pulse: Pulse) -> Candidate:
@@ -141,5 +143,5 @@ def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, pulse: 
     try:
         model = models.of(field, lambda: fields.file(sha256))
     except (NoSurfaceError, InvalidInputError) as error:
-        return Candidate(sha256, lambda: fields.file(sha256), None, error.reason)
-    return Candidate(sha256, lambda: fields.file(sha256), model)
+        return Candidate(sha256_of(sha256), lambda: fields.file(sha256), None, error.reason)
+    return Candidate(sha256_of(sha256), lambda: fields.file(sha256), model)

@@ -8,8 +8,18 @@ from fastapi import APIRouter, Query
 from starlette.responses import JSONResponse, Response
 
 from regnf_core.importing.picture import PICTURE_NAME
-from service.dependencies import LimitQuery, PageTokenQuery, PrefixDep, Services, ServicesDep, WaitQuery, off_loop
+from service.dependencies import (
+    CallerDep,
+    LimitQuery,
+    PageTokenQuery,
+    PrefixDep,
+    Services,
+    ServicesDep,
+    WaitQuery,
+    off_loop,
+)
 from service.digests import is_sha256
+from service.ownership import reference_of
 from service.paging import decode_token, encode_token
 from service.problems import Problem
 from service.records import FieldRecord
@@ -21,8 +31,9 @@ from service.waiting import wait_for
 router = APIRouter(tags=["fields"])
 
 
-def _require(services: Services, sha256: str) -> FieldRecord:
-    record = services.records.get_field(sha256) if is_sha256(sha256) else None
+def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
+    """The caller's field. Raises Problem FIELD_NOT_FOUND."""
+    record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
     if record is None:
         raise Problem("FIELD_NOT_FOUND")
     return record
@@ -35,15 +46,17 @@ def _require(services: Services, sha256: str) -> FieldRecord:
     response_model=FieldDocument,
     responses=refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
 )
-async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait: WaitQuery = 0) -> JSONResponse:
+async def get_field(
+    sha256: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep, wait: WaitQuery = 0
+) -> JSONResponse:
     """With `wait`, the answer comes as soon as the field is no longer `validating`.
 
     200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
     """
     record = await wait_for(
-        lambda: _require(services, sha256), lambda found: found.state != "validating", wait, services.stopping
+        lambda: _require(services, caller, sha256), lambda found: found.state != "validating", wait, services.stopping
     )
-    headers = {"ETag": field_etag(record.sha256, record.version), "Cache-Control": "no-cache"}
+    headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
     if record.state == "validating":
         headers["Retry-After"] = "1"
     return JSONResponse(field_document(record, prefix), headers=headers)
@@ -59,17 +72,17 @@ async def get_field(sha256: str, services: ServicesDep, prefix: PrefixDep, wait:
         **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
     },
 )
-def get_field_preview(sha256: str, services: ServicesDep) -> Response:
+def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
     """The surface from two sides, and its section with lines of equal distance: orange is inside."""
-    record = _require(services, sha256)
+    record = _require(services, caller, sha256)
     if record.state != "ready":
         raise Problem("FIELD_PREVIEW_NOT_FOUND")
     try:
-        with services.blobs.open(f"fields/{sha256}/{PICTURE_NAME}") as file:
+        with services.blobs.open(f"fields/{record.sha256}/{PICTURE_NAME}") as file:
             data = file.read()
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
-    headers = {"ETag": field_etag(sha256, record.version), "Cache-Control": "private, max-age=3600"}
+    headers = {"ETag": field_etag(record), "Cache-Control": "private, max-age=3600"}
     return Response(data, media_type="image/png", headers=headers)
 
 
@@ -81,6 +94,7 @@ def get_field_preview(sha256: str, services: ServicesDep) -> Response:
 )
 async def list_fields(
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
@@ -88,7 +102,7 @@ async def list_fields(
 ) -> dict[str, Any]:
     before = decode_token(page_token)
     # one more than asked for tells whether there is a next page
-    found = await off_loop(services.records.list_fields, label, limit + 1, before)
+    found = await off_loop(services.records.list_fields, label, limit + 1, before, caller)
     page = found[:limit]
     more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
     return {"fields": [field_document(record, prefix) for record in page], "next_page_token": more}
@@ -101,11 +115,11 @@ async def list_fields(
     response_class=Response,
     responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"),
 )
-def delete_field(sha256: str, services: ServicesDep) -> Response:
+def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
     """Refused while an active job needs the field. Results of finished jobs stay."""
-    _require(services, sha256)
-    if next(iter(services.records.jobs_using_field(sha256)), None) is not None:
+    reference = _require(services, caller, sha256).sha256
+    if next(iter(services.records.jobs_using_field(reference)), None) is not None:
         raise Problem("FIELD_IN_USE")
-    services.records.delete_field(sha256)
-    services.blobs.delete_prefix(f"fields/{sha256}")
+    services.records.delete_field(reference)
+    services.blobs.delete_prefix(f"fields/{reference}")
     return Response(status_code=204)

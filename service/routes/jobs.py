@@ -9,7 +9,16 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from service import sse
 from service.canonical import digest
-from service.dependencies import LimitQuery, PageTokenQuery, PrefixDep, Services, ServicesDep, WaitQuery, off_loop
+from service.dependencies import (
+    CallerDep,
+    LimitQuery,
+    PageTokenQuery,
+    PrefixDep,
+    Services,
+    ServicesDep,
+    WaitQuery,
+    off_loop,
+)
 from service.lookup import find_job
 from service.paging import decode_token, encode_token
 from service.problems import Problem
@@ -54,13 +63,14 @@ def _etag(record: JobRecord, position: int | None) -> str:
 )
 def list_jobs(
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
 ) -> dict[str, Any]:
     """`queue_position` is left out here: ask for the job itself."""
-    found = services.records.list_jobs(status, limit + 1, decode_token(page_token))
+    found = services.records.list_jobs(status, limit + 1, decode_token(page_token), caller)
     page = found[:limit]
     more = encode_token(page[-1].created, page[-1].id) if len(found) > limit else None
     documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page]
@@ -80,6 +90,7 @@ def list_jobs(
 async def get_job(
     id: str,  # noqa: A002 -- the contract's own word
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     wait: WaitQuery = 0,
     if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
@@ -87,7 +98,7 @@ async def get_job(
     """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
 
     def look() -> tuple[JobRecord, int | None]:
-        record = find_job(services, id)
+        record = find_job(services, id, caller)
         return record, _position(services, record)
 
     def is_news(seen: tuple[JobRecord, int | None]) -> bool:
@@ -117,10 +128,11 @@ async def get_job(
 async def job_events(
     id: str,  # noqa: A002
     services: ServicesDep,
+    caller: CallerDep,
     last_event_id: Annotated[str | None, Header(description="Resume after this event.")] = None,
 ) -> Response:
     """From the beginning, or after `Last-Event-ID`."""
-    record = await off_loop(find_job, services, id)
+    record = await off_loop(find_job, services, id, caller)
     try:
         waiting = await off_loop(services.records.events, id, last_event_id, 0.0)
     except ValueError as error:
@@ -143,9 +155,14 @@ async def job_events(
         **refusals("JOB_NOT_FOUND", "JOB_FINISHED", "JOB_EXPIRED"),
     },
 )
-async def cancel_job(id: str, services: ServicesDep, prefix: PrefixDep) -> JSONResponse:  # noqa: A002
+async def cancel_job(
+    id: str,  # noqa: A002
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+) -> JSONResponse:
     """Cancelling twice is no error."""
-    before = await off_loop(find_job, services, id)
+    before = await off_loop(find_job, services, id, caller)
     if before.status == "dismissed":
         return await job_answer(services, before, prefix)
     after = await off_loop(services.records.request_cancel, id)
@@ -164,9 +181,9 @@ async def cancel_job(id: str, services: ServicesDep, prefix: PrefixDep) -> JSONR
     response_class=Response,
     responses=refusals("JOB_NOT_FOUND", "JOB_ACTIVE", "JOB_EXPIRED"),
 )
-def delete_job(id: str, services: ServicesDep) -> Response:  # noqa: A002
+def delete_job(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
     """Only a finished job: cancel it first."""
-    if find_job(services, id).status in ACTIVE:
+    if find_job(services, id, caller).status in ACTIVE:
         raise Problem("JOB_ACTIVE")
     services.records.delete_job(id)
     services.blobs.delete_prefix(f"jobs/{id}")

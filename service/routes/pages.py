@@ -9,6 +9,7 @@ from starlette.responses import FileResponse
 
 from service.dependencies import ServicesDep
 from service.lookup import find_job
+from service.ownership import ANONYMOUS
 from service.routes.documentation import get_and_head, refusals
 
 router = APIRouter(tags=["results"])
@@ -28,8 +29,8 @@ PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-acti
 )
 def view(id: str, services: ServicesDep) -> FileResponse:  # noqa: A002
     """Shows progress while the job is active. Where tokens are needed, the page asks for one."""
-    if not services.settings.api_tokens:
+    if not services.settings.needs_token:
         # with tokens the page comes before the token, so it must not tell which jobs there are
-        find_job(services, id)
+        find_job(services, id, ANONYMOUS)
     headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-cache"}
     return FileResponse(WEB / "view.html", media_type="text/html", headers=headers)

@@ -12,9 +12,10 @@ from starlette.responses import JSONResponse
 
 from service import body
 from service.canonical import canonical_request, job_id_of
-from service.dependencies import PrefixDep, Services, ServicesDep, off_loop
+from service.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
 from service.intake import take_in
 from service.multipart import boundary_of, read_parts
+from service.ownership import owned_request
 from service.problems import Problem
 from service.records import ACTIVE, FINISHED
 from service.registrations import check_fields, check_idempotency_key, submit
@@ -94,6 +95,7 @@ def preferred_wait(prefer: str | None) -> int | None:
 async def register(
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     dry_run: Annotated[bool, Query(description="Check everything, start nothing.")] = False,
     prefer: Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")] = None,
@@ -109,14 +111,14 @@ async def register(
     check_idempotency_key(idempotency_key)
     kind = body.media_type(request)
     if kind == JSON:
-        asked = await _by_reference(request, services)
+        asked = await _by_reference(request, services, caller)
     elif kind == "multipart/form-data":
-        asked = await _one_shot(request, services, keep=not dry_run)
+        asked = await _one_shot(request, services, caller, keep=not dry_run)
     else:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
     if dry_run:
-        return JSONResponse({"valid": True, "id": job_id_of(asked), "request": asked})
-    record = await off_loop(submit, services, asked, idempotency_key)
+        return JSONResponse({"valid": True, "id": job_id_of(owned_request(asked, caller)), "request": asked})
+    record = await off_loop(submit, services, caller, asked, idempotency_key)
     wait = preferred_wait(prefer)
     if wait and record.status in ACTIVE:
         record = await wait_for(
@@ -132,7 +134,7 @@ async def register(
     return response
 
 
-async def _by_reference(request: Request, services: Services) -> dict[str, Any]:
+async def _by_reference(request: Request, services: Services, caller: str) -> dict[str, Any]:
     settings = services.settings
     text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
     question = read_model(RegisterRequest, text)
@@ -141,11 +143,11 @@ async def _by_reference(request: Request, services: Services) -> dict[str, Any]:
     if question.object is not None:
         named["/object"] = question.object
     named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(question.candidates or ())}
-    await off_loop(check_fields, services, asked, named)
+    await off_loop(check_fields, services, caller, asked, named)
     return asked
 
 
-async def _one_shot(request: Request, services: Services, keep: bool) -> dict[str, Any]:
+async def _one_shot(request: Request, services: Services, caller: str, keep: bool) -> dict[str, Any]:
     """Both files and the question in one body. Nothing is kept before all of it has arrived and been checked."""
     body.refuse_encoding(request)
     settings = services.settings
@@ -160,8 +162,8 @@ async def _one_shot(request: Request, services: Services, keep: bool) -> dict[st
         question = read_model(Question, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
         asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
-        await off_loop(check_fields, services, asked, {})  # they are taken in next, so none need be held
+        await off_loop(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():
-                await take_in(services, upload, received[name])
+                await take_in(services, caller, upload, received[name])
     return asked

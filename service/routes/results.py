@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from service.dependencies import PrefixDep, Services, ServicesDep, off_loop
+from service.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
 from service.lookup import find_job
 from service.problems import Problem
 from service.ranges import ByteRange, parse_range
@@ -34,9 +34,9 @@ def _require_successful(record: JobRecord) -> None:
         raise Problem.stored(whole_problem(record.error or {}))
 
 
-def _manifest(services: Services, job_id: str) -> Manifest:
+def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
     """The manifest of a successful job. Raises as ``find_job`` and ``_require_successful``, and Problem JOB_EXPIRED."""
-    _require_successful(find_job(services, job_id))
+    _require_successful(find_job(services, job_id, caller))
     manifest = read_manifest(services.blobs, job_id)
     if manifest is None:
         raise Problem("JOB_EXPIRED")
@@ -60,9 +60,9 @@ def _manifest(services: Services, job_id: str) -> Manifest:
         "OUT_OF_MEMORY",
     ),
 )
-def get_result(id: str, services: ServicesDep, prefix: PrefixDep) -> Any:  # noqa: A002
+def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
     """A failed job answers here with its own problem."""
-    manifest = _manifest(services, id)
+    manifest = _manifest(services, id, caller)
     try:
         document = read_result(services.blobs, manifest)
     except FileNotFoundError as error:
@@ -102,12 +102,13 @@ async def get_artifact(
     id: str,  # noqa: A002
     name: str,
     services: ServicesDep,
+    caller: CallerDep,
     range_: Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")] = None,
     if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
     if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
 ) -> Response:
     """The names are those of the result's `artifacts` list."""
-    manifest = await off_loop(_manifest, services, id)
+    manifest = await off_loop(_manifest, services, id, caller)
     if name not in manifest.artifacts:
         raise Problem("ARTIFACT_NOT_FOUND")
     size, etag = manifest.artifacts[name].bytes, f'"{manifest.artifacts[name].sha256[:32]}"'

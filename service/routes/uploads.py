@@ -12,11 +12,12 @@ from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
 from service import body
-from service.dependencies import PrefixDep, Services, ServicesDep
+from service.dependencies import CallerDep, PrefixDep, Services, ServicesDep
 from service.digests import announced_digest, is_sha256
 from service.intake import Intake, take_in
 from service.multipart import boundary_of, read_parts
 from service.problems import Problem
+from service.records import FieldRecord
 from service.routes.documentation import BINARY, MULTIPART_REFUSALS, UPLOAD_REFUSALS, header, reference, refusals
 from service.schemas.fields import FieldDocument, field_document
 from service.schemas.reading import read_model
@@ -49,6 +50,7 @@ _MULTIPART = {
 async def put_field(
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     sha256: Annotated[str, Path(description="SHA-256 of the file.", json_schema_extra={"pattern": "^[0-9a-f]{64}$"})],
     content_digest: Annotated[str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.")] = None,
@@ -63,7 +65,7 @@ async def put_field(
         received = await _receive_raw(request, services, upload)
         if received.sha256 != sha256 or digest not in (None, received.sha256):
             raise Problem("DIGEST_MISMATCH")
-        taken = await take_in(services, upload, received)
+        taken = await take_in(services, caller, upload, received)
     return _answer(taken, prefix)
 
 
@@ -89,6 +91,7 @@ async def put_field(
 async def post_field(
     request: Request,
     services: ServicesDep,
+    caller: CallerDep,
     prefix: PrefixDep,
     content_digest: Annotated[str | None, Header(description="RFC 9530, of the body as sent.")] = None,
 ) -> JSONResponse:
@@ -101,7 +104,7 @@ async def post_field(
             received, description = await _receive_raw(request, services, upload), None
             if digest not in (None, received.sha256):
                 raise Problem("DIGEST_MISMATCH")
-        taken = await take_in(services, upload, received, description)
+        taken = await take_in(services, caller, upload, received, description)
     return _answer(taken, prefix)
 
 
@@ -142,10 +145,10 @@ async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[by
 
 def _answer(taken: Intake, prefix: str) -> JSONResponse:
     document = field_document(taken.record, prefix)
-    headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record.sha256, taken.record.version)}
+    headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)
 
 
-def field_etag(sha256: str, version: int) -> str:
+def field_etag(record: FieldRecord) -> str:
     """Changes with every change of the field's record."""
-    return f'"{sha256[:16]}.{version}"'
+    return f'"{record.sha256[:16]}.{record.version}"'

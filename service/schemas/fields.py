@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from regnf_core.importing.upload_description import UploadDescription
+from service.ownership import sha256_of
 from service.records import FieldRecord
 from service.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem, rfc3339
 from service.schemas.results import SymmetryDocument
@@ -45,7 +46,7 @@ class FieldPage(Outgoing):
 def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
     """The field as it travels; ``prefix`` is what the API's paths begin with."""
     return {
-        "sha256": record.sha256,
+        "sha256": sha256_of(record.sha256),
         "state": record.state,
         "bytes": record.bytes,
         "label": record.label,
@@ -55,7 +56,7 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "error": outgoing_problem(record.error),
         "created_at": rfc3339(record.created),
         "updated_at": rfc3339(record.updated),
-        "links": _links(record, f"{prefix}/fields/{record.sha256}"),
+        "links": _links(record, f"{prefix}/fields/{sha256_of(record.sha256)}"),
     }
 
 

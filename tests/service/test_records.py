@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from service.memory import InMemoryRecordStore
+from service.ownership import reference_of
 from service.records import FieldRecord, JobRecord, QueueFullError, RecordStore, StaleAttemptError
 from service.redis_client import connect
 from service.redis_records import RedisRecordStore
@@ -349,6 +350,7 @@ def test_finished_jobs_expire_and_are_remembered_as_gone_in_redis(redis_url: str
         assert set(redis.keys()) - {b"regnf:job:waiting", b"regnf:job:waiting:events"} == {
             b"regnf:job:done:gone",
             b"regnf:jobs:created",
+            b"regnf:jobs:created:anonymous",
             b"regnf:jobs:active",
             b"regnf:jobs:waiting",
         }
@@ -491,3 +493,37 @@ def test_text_of_any_kind_survives(store: RecordStore) -> None:
     record = store.update_job("j1", 1, status="running", engine={"label": odd})
     assert store.get_job("j1") == record
     assert record.request["label"] == odd
+
+
+# whose they are
+
+
+def test_lists_and_tombstones_are_each_owners_own(store: RecordStore) -> None:
+    for owner, created in (("alice", 1.0), ("bob", 2.0), ("anonymous", 3.0)):
+        scene = reference_of(owner, SCENE)
+        store.create_field(field(store, scene, created))
+        store.create_job(replace(job(store, f"job-of-{owner}", created), request={"scene": scene}), 10)
+    assert [record.sha256 for record in store.list_fields(None, 10, None, "alice")] == [f"{SCENE}_alice"]
+    assert [record.id for record in store.list_jobs(None, 10, None, "bob")] == ["job-of-bob"]
+    assert [record.id for record in store.list_jobs(None, 10, None, "carol")] == []
+    assert len(store.list_fields(None, 10, None)) == len(store.list_jobs(None, 10, None)) == 3
+    store.update_job("job-of-bob", 1, status="failed", error={"reason": "INTERNAL"})
+    store.delete_job("job-of-bob")
+    store.delete_field(f"{SCENE}_alice")
+    assert store.list_jobs(None, 10, None, "bob") == store.list_fields(None, 10, None, "alice") == []
+
+
+def test_an_expired_job_is_so_to_its_owner_alone(redis_url: str) -> None:
+    with connect(redis_url) as redis:
+        redis.flushall()
+        store = RedisRecordStore(redis, retention_s=0)
+        store.create_job(replace(job(store), request={"scene": reference_of("alice", SCENE)}), 10)
+        store.update_job("j1", 1, status="failed", error={"reason": "INTERNAL"})
+        redis.set("regnf:job:j1:gone", "alice")  # with no retention at all the tombstone would be gone as well
+        redis.delete("regnf:job:j1")
+        assert store.job_expired("j1", "alice")
+        assert not store.job_expired("j1", "bob")
+        assert not store.job_expired("j1")
+        assert store.expire_jobs() == ["j1"]
+        assert store.list_jobs(None, 10, None, "alice") == []
+        assert not redis.exists("regnf:jobs:created:alice")

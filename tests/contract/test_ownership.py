@@ -1,0 +1,193 @@
+"""Whose is whose: a caller sees its own fields and jobs only, and nothing tells it what others have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.ownership import reference_of
+from tests.contract.asgi import client_of
+from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
+
+SCENE, OBJECT = field_bytes("scene"), field_bytes("object")
+ALICE, BOB = {"Authorization": "Bearer alices-token"}, {"Authorization": "Bearer bobs-token"}
+
+
+@pytest.fixture
+def shared(tmp_path: Path) -> Iterator[World]:
+    """A service of two callers; its client is alice's."""
+    file = tmp_path / "tokens"
+    file.write_text("# who may call\n\nbob:bobs-token\nbob:bobs-next-token\n")
+    made = make_world(tmp_path, api_tokens=frozenset({"alice:alices-token"}), api_tokens_file=file)
+    made.client.headers.update(ALICE)
+    with made.client:
+        yield made
+
+
+@pytest.fixture
+def bob(shared: World) -> Iterator[httpx.Client]:
+    with client_of(shared.app, headers=BOB) as client:
+        yield client
+
+
+def ready(world: World, client: httpx.Client, caller: str, data: bytes, **report: Any) -> str:
+    """A caller's field whose import went well."""
+    assert client.put(f"/fields/{sha256(data)}", content=data).status_code == 201
+    world.records.update_field(reference_of(caller, sha256(data)), state="ready", report=report)
+    return sha256(data)
+
+
+def ask(client: httpx.Client, **changes: Any) -> httpx.Response:
+    request = {"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX} | changes
+    return client.post("/register", json=request)
+
+
+@pytest.fixture
+def alices_job(shared: World) -> str:
+    """A finished job of alice's with an artifact, her fields ready."""
+    for data in (SCENE, OBJECT):
+        ready(shared, shared.client, "alice", data)
+    job_id = str(ask(shared.client).json()["id"])
+    shared.succeed(job_id, {"trace.json": b"{}"})
+    shared.blobs.put(f"fields/{reference_of('alice', sha256(SCENE))}/picture.png", b"png")
+    return job_id
+
+
+FIELD_ROUTES = [
+    ("GET", "/fields/{field}"),
+    ("HEAD", "/fields/{field}"),
+    ("GET", "/fields/{field}?wait=1"),
+    ("GET", "/fields/{field}/preview.png"),
+    ("HEAD", "/fields/{field}/preview.png"),
+    ("DELETE", "/fields/{field}"),
+]
+JOB_ROUTES = [
+    ("GET", "/jobs/{job}"),
+    ("GET", "/jobs/{job}?wait=1"),
+    ("GET", "/jobs/{job}/events"),
+    ("GET", "/jobs/{job}/result"),
+    ("GET", "/jobs/{job}/artifacts/trace.json"),
+    ("HEAD", "/jobs/{job}/artifacts/trace.json"),
+    ("POST", "/jobs/{job}/cancel"),
+    ("DELETE", "/jobs/{job}"),
+]
+
+
+def test_the_tables_name_every_route_with_an_id(shared: World) -> None:
+    named = {(method, path.split("?")[0]) for method, path in FIELD_ROUTES + JOB_ROUTES}
+    named |= {("PUT", "/fields/{field}"), ("GET", "/jobs/{job}/view"), ("HEAD", "/jobs/{job}/view")}
+    spelled = {
+        (method.upper(), path.replace("{sha256}", "{field}").replace("{id}", "{job}").replace("{name}", "trace.json"))
+        for path, operations in shared.app.openapi()["paths"].items()
+        for method in operations
+        if path.startswith(("/fields/", "/jobs/", "/register"))
+    }
+    assert spelled - {("POST", "/register")} == named
+
+
+@pytest.mark.parametrize("prefix", ["", "/v1"])
+@pytest.mark.parametrize(("method", "path"), FIELD_ROUTES + JOB_ROUTES)
+def test_anothers_is_not_there(
+    shared: World, bob: httpx.Client, alices_job: str, method: str, path: str, prefix: str
+) -> None:
+    """The answer is the one for an id that nobody has, member by member, and alice's still stands afterwards."""
+    answer = bob.request(method, prefix + path.format(field=sha256(SCENE), job=alices_job))
+    unknown = bob.request(method, prefix + path.format(field="0" * 64, job="0" * 32))
+    assert answer.status_code == unknown.status_code == 404
+    told, untold = (dict(one.json()) if one.content else {} for one in (answer, unknown))
+    for document in (told, untold):
+        document.pop("instance", None)
+        document.pop("request_id", None)
+    assert told == untold
+    assert shared.client.get(f"/jobs/{alices_job}/result").status_code == 200
+    assert shared.client.get(f"/fields/{sha256(SCENE)}").status_code == 200
+
+
+def test_a_job_that_has_expired_is_gone_to_its_owner_and_unknown_to_others(
+    shared: World, bob: httpx.Client, alices_job: str
+) -> None:
+    later = shared.records.now() + shared.settings.retention_s + 1
+    shared.records._clock = lambda: later
+    for expire in (lambda: None, shared.records.expire_jobs):
+        expire()
+        assert_refused(shared.client.get(f"/jobs/{alices_job}"), 410, "JOB_EXPIRED")
+        assert_refused(bob.get(f"/jobs/{alices_job}"), 404, "JOB_NOT_FOUND")
+
+
+def test_lists_hold_ones_own(shared: World, bob: httpx.Client, alices_job: str) -> None:
+    assert bob.get("/fields").json()["fields"] == bob.get("/jobs").json()["jobs"] == []
+    ready(shared, bob, "bob", OBJECT)
+    assert [field["sha256"] for field in bob.get("/fields").json()["fields"]] == [sha256(OBJECT)]
+    assert len(shared.client.get("/fields").json()["fields"]) == 2
+    assert [job["id"] for job in shared.client.get("/jobs").json()["jobs"]] == [alices_job]
+    first = shared.client.get("/fields?limit=1").json()
+    assert bob.get("/fields", params={"page_token": first["next_page_token"]}).json()["next_page_token"] is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"object": sha256(SCENE)}, {"object": None, "candidates": [sha256(SCENE), sha256(OBJECT)]}],
+    ids=["both", "object", "search"],
+)
+def test_anothers_field_is_of_no_use(bob: httpx.Client, alices_job: str, changes: dict[str, Any]) -> None:
+    request = {"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX} | changes
+    given = {name: value for name, value in request.items() if value is not None}
+    for query in ("", "?dry_run=true"):
+        assert_refused(bob.post(f"/register{query}", json=given), 404, "FIELD_NOT_FOUND")
+
+
+def test_the_same_bytes_are_each_callers_own(shared: World, bob: httpx.Client, alices_job: str) -> None:
+    """New to bob in every way: 201, to be imported, without alice's label; and alice's outlives his deletion."""
+    described = {"file": ("f", SCENE), "description": ("d", b'{"label": "my room"}', "application/json")}
+    answer = bob.post("/fields", files=described)
+    assert (answer.status_code, answer.json()["state"], answer.json()["label"]) == (201, "validating", "my room")
+    assert shared.client.get(f"/fields/{sha256(SCENE)}").json()["label"] is None
+    assert (reference_of("bob", sha256(SCENE)), 1) in shared.queue.imports
+    assert bob.delete(f"/fields/{sha256(SCENE)}").status_code == 204
+    assert shared.client.get(f"/fields/{sha256(SCENE)}").json()["state"] == "ready"
+    assert shared.blobs.exists(f"fields/{reference_of('alice', sha256(SCENE))}/picture.png")
+
+
+def test_a_put_without_the_bytes_tells_nothing(bob: httpx.Client, alices_job: str) -> None:
+    for known in (sha256(SCENE), "0" * 64):
+        assert_refused(bob.put(f"/fields/{known}", content=b""), 400, "UPLOAD_EMPTY")
+        assert_refused(bob.put(f"/fields/{known}", content=field_bytes("other")), 400, "DIGEST_MISMATCH")
+
+
+def test_the_same_question_is_each_callers_own_job(shared: World, bob: httpx.Client, alices_job: str) -> None:
+    for data in (SCENE, OBJECT):
+        ready(shared, bob, "bob", data)
+    answer = ask(bob)
+    assert answer.status_code == 202, "alice's has finished, and would have been answered at once"
+    assert answer.json()["id"] != alices_job
+    assert answer.json()["inputs"]["scene"] == sha256(SCENE)
+    assert bob.post("/register?dry_run=true", json={"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX}
+                    ).json()["request"]["scene"] == sha256(SCENE)  # fmt: skip
+    assert bob.delete(f"/fields/{sha256(SCENE)}").status_code == 409
+    assert shared.client.delete(f"/fields/{sha256(SCENE)}").status_code == 204, "bob's job is no use of hers"
+
+
+def test_idempotency_keys_are_each_callers_own(shared: World, bob: httpx.Client, alices_job: str) -> None:
+    for data in (SCENE, OBJECT):
+        ready(shared, bob, "bob", data)
+    request = {"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX}
+    keyed = {"Idempotency-Key": "one"}
+    assert shared.client.post("/register", json=request | {"seed": 1}, headers=keyed).status_code == 202
+    assert bob.post("/register", json=request | {"seed": 2}, headers=keyed).status_code == 202
+    assert_refused(bob.post("/register", json=request | {"seed": 3}, headers=keyed), 422, "IDEMPOTENCY_KEY_REUSED")
+
+
+def test_a_caller_is_one_whichever_of_its_tokens_it_sends(shared: World, bob: httpx.Client) -> None:
+    ready(shared, bob, "bob", SCENE)
+    bob.headers["Authorization"] = "Bearer bobs-next-token"
+    assert bob.get(f"/fields/{sha256(SCENE)}").status_code == 200
+
+
+def test_no_answer_tells_how_fields_are_called_inside(shared: World, alices_job: str) -> None:
+    client = shared.client
+    texts = [client.get(path).text for path in ("/fields", "/jobs", f"/jobs/{alices_job}", f"/fields/{sha256(SCENE)}")]
+    assert not [text for text in texts if "_alice" in text]

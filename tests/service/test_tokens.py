@@ -1,0 +1,60 @@
+"""Tokens: whose they are, what is refused, and that nothing repeats them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from service.app import create_app
+from service.ownership import owner_of, reference_of, sha256_of
+from service.settings import Settings
+from service.tokens import TokensError, caller_of, read_callers
+
+SECRET = "s3cret-of-somebody"
+SHA = "a" * 64
+
+
+def test_names_and_tokens(tmp_path: Path) -> None:
+    file = tmp_path / "tokens"
+    file.write_text("# staff\nbob:two\n  carol-3:three:with:colons  \n\n")
+    callers = read_callers(["alice:one", "Notaname!:four"], file)
+    known = {"one": "alice", "two": "bob", "three:with:colons": "carol-3"}
+    assert {token: caller_of(callers, f"Bearer {token}") for token in known} == known
+    nameless = caller_of(callers, "Bearer Notaname!:four")
+    # the first digits of the token's SHA-256, by another program
+    assert nameless == "token-65e70dd8"
+    assert caller_of(callers, "Bearer alice:one") is caller_of(callers, "Basic one") is caller_of(callers, "") is None
+
+
+@pytest.mark.parametrize("entry", ["", "alice:", f"alice:{SECRET} x", f"alice:{SECRET}\u202e", f"anonymous:{SECRET}"])
+def test_what_cannot_be_a_token_is_refused_without_repeating_it(entry: str) -> None:
+    with pytest.raises(TokensError) as refused:
+        read_callers([entry], None)
+    assert SECRET not in str(refused.value)
+
+
+def test_a_token_has_one_caller(tmp_path: Path) -> None:
+    with pytest.raises(TokensError, match="same token") as refused:
+        read_callers([f"alice:{SECRET}", f"bob:{SECRET}"], None)
+    assert SECRET not in str(refused.value)
+    with pytest.raises(TokensError, match="FileNotFoundError"):
+        create_app(Settings(state_dir=tmp_path, api_tokens_file=tmp_path / "none"))
+
+
+def test_settings_never_repeat_a_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(api_tokens=frozenset({f"alice:{SECRET}"}), redis_url=f"redis://:{SECRET}@h:1/0")
+    assert SECRET not in repr(settings) + str(settings)
+    monkeypatch.setenv("REGNF_API_TOKENS", f'[["{SECRET}"]]')
+    with pytest.raises(ValidationError) as refused:
+        Settings()
+    assert SECRET not in str(refused.value)
+
+
+def test_a_reference_says_whose_it_is() -> None:
+    assert reference_of("anonymous", SHA) == SHA
+    for caller in ("anonymous", "alice", "a-b-c", "0"):
+        reference = reference_of(caller, SHA)
+        assert (sha256_of(reference), owner_of(reference)) == (SHA, caller)
+        assert all(letter.isalnum() or letter in "_-" for letter in reference)
