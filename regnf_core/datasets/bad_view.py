@@ -19,7 +19,7 @@ _AZIMUTHS = 16
 _HEIGHTS_M = (0.35, 1.3)
 _NEARER = (1.0, 0.8, 0.65)
 _SAMPLES = 2000
-_LEAST_SHOWN = 0.5
+_LEAST_SHOWN = 0.8
 _LEAST_SEEN = 0.02
 
 
@@ -27,8 +27,8 @@ def bad_view(scene: MeshScene, thing: int, size: Size, intrinsics: Array, floor:
     """(4, 4): of all views that show the thing, the one that sees the least of its surface.
 
     Candidates stand in free space at 16 azimuths, 35 cm and 1.3 m above the floor, where the thing just fills the
-    picture; nearer only if none of these will do. A view counts as showing the thing when others hide at most half of
-    what it would show of it alone. So the camera ends up behind a back or low at a side. The first of equals is taken.
+    picture; nearer only if none of these will do. A view counts as showing the thing when others hide at most a fifth
+    of what it would show of it alone. So the camera ends up behind a back or low at a side, the first of equals.
     Raises DatasetError (DATASET_NO_VIEW).
     """
     solid = scene.things[thing].solid

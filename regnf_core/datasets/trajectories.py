@@ -81,14 +81,11 @@ def long_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Arr
 
 
 def short_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Array:
-    """(frames, 4, 4): once along the two adjoining sides of the room that are freest.
+    """(frames, 4, 4): once along the side of the room that is freest, from corner to corner.
 
     The gaze lies between the middle of all boxes (2, 3) and the nearest one. What faces away is never seen.
     """
-    sides = ground.sides()
-    free = [float(ground.clearance_along(side).mean()) for side in sides]
-    first = max(range(len(sides)), key=lambda side: free[side] + free[(side + 1) % len(sides)])
-    path = np.concatenate([sides[first], sides[(first + 1) % len(sides)]])
+    path = max(ground.sides(), key=lambda side: float(ground.clearance_along(side).mean()))
     centres = np.array([box.mean(axis=0) for box in boxes])
     nearest = np.linalg.norm(path[:, None] - centres[None, :, :2], axis=2).argmin(axis=1)
     gaze = (1.0 - _GAZE_AT_NEAREST) * centres.mean(axis=0) + _GAZE_AT_NEAREST * centres[nearest]
