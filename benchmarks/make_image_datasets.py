@@ -4,7 +4,7 @@
 
 MESHES and ROOMS are those of benchmarks.make_fields, and so are the frames: what is fitted to these images compares
 with the fields and the truths made there. Each dataset is a folder in the sdfstudio data format. What exists already is
-kept as long as manifest.json says that it was made from the same inputs. About 8 minutes on one core, 170 MB.
+kept as long as manifest.json says that it was made from the same inputs. About 6 minutes on one core, 120 MB.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def test_readme_is_short() -> None:
 
 def test_commands_named_in_the_readme_exist() -> None:
     shell = "\n".join(re.findall(r"```bash\n(.*?)```", README, flags=re.S))
-    named = set(re.findall(r"^(?:\.venv/bin/)?regnf (\w+)", shell, flags=re.M))
+    named = set(re.findall(r"^(?:\.venv/bin/)?regnf ([\w-]+)", shell, flags=re.M))
     assert {"serve", "register", "inspect", "fit"} <= named
     for command in named:
         done = subprocess.run(
