@@ -6,7 +6,7 @@ import ipaddress
 import socket
 
 from regnf_cli.start_errors import StartError
-from service.settings import Settings
+from service.settings import Settings, is_loopback
 from service.tokens import TokensError, read_callers
 
 _BACKLOG = 2048
@@ -43,14 +43,6 @@ def open_socket(settings: Settings) -> socket.socket:
         detail = f"cannot listen on {settings.host}, port {settings.port}: {error.strerror or error}"
         raise StartError(detail, reason="ADDRESS_UNAVAILABLE") from error
     return listener
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach the host. Names other than localhost are not looked up: they are not."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def address_of(listener: socket.socket) -> str:

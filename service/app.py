@@ -25,6 +25,7 @@ from service.local_blobs import LocalBlobStore
 from service.middleware import RequestContext, TokenGate
 from service.query import refuse_unknown_parameters
 from service.queue import JobQueue
+from service.rate_limits import RateGate, RateLimiter, RedisRateLimiter
 from service.reaper import Reaper
 from service.records import RecordStore
 from service.redis_client import connect
@@ -55,6 +56,7 @@ def create_app(
     records: RecordStore | None = None,
     blobs: BlobStore | None = None,
     queue: JobQueue | None = None,
+    limiter: RateLimiter | None = None,
 ) -> FastAPI:
     """The application over the given stores, or over Redis and the local folder that the settings name.
 
@@ -69,6 +71,8 @@ def create_app(
         redis = connect(settings.redis_url)
         records = records or RedisRecordStore(redis, settings.retention_s)
         queue = queue or RqJobQueue(redis)
+        if limiter is None and settings.calls_per_s:
+            limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
     services = Services(settings, records, blobs or LocalBlobStore(settings.blob_dir), queue)
     app = FastAPI(
         title="regnf",
@@ -86,6 +90,7 @@ def create_app(
                 needs_token=settings.needs_token,
                 allow_unauthenticated=settings.allow_unauthenticated,
             ),
+            *([Middleware(RateGate, limiter=limiter)] if limiter is not None else []),
         ],
     )
     app.state.services = services

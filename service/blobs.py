@@ -6,18 +6,34 @@ Keys in use:
     fields/{sha256}/object-model-1.safetensors   what registrations know of it as an object, made by the first of them
     jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
     jobs/{id}/manifest.json                written last, atomically: the job's result is exactly what it lists
+    journal/jobs/{id}/{attempt}-{event}    what was accepted and how it ended: see service.journal
+    journal/fields/{sha256}                a field's record as it was last written
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
 
 class StorageFullError(OSError):
     """No space is left for the bytes."""
+
+
+class StorageUnavailableError(OSError):
+    """The store does not answer, or refuses for reasons of its own."""
+
+
+@dataclass(frozen=True)
+class BlobEntry:
+    """One blob of a listing; ``modified`` in seconds since the epoch, by the store's clock."""
+
+    key: str
+    bytes: int
+    modified: float
 
 
 def check_key(key: str) -> str:
@@ -67,10 +83,22 @@ class BlobStore(Protocol):
         """Keys below the folder ``prefix`` ("jobs/{id}"), sorted; "" lists all."""
         ...
 
+    def entries(self, prefix: str) -> Iterator[BlobEntry]:
+        """The same with sizes and times."""
+        ...
+
     def delete(self, key: str) -> None:
         """Delete one blob; a missing one is no error."""
         ...
 
     def delete_prefix(self, prefix: str) -> None:
         """Delete every blob below the folder ``prefix``."""
+        ...
+
+    def sweep(self, older_than_s: float) -> int:
+        """Delete what writers that died this long ago have left behind; how many blobs that were."""
+        ...
+
+    def probe(self) -> None:
+        """Returns when the store takes bytes. Raises OSError."""
         ...

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Any, TypeVar
 
 from anyio import CapacityLimiter, to_thread
@@ -13,8 +14,9 @@ from fastapi import Depends, Query
 from starlette.requests import Request
 
 from service.blobs import BlobStore
+from service.concurrency import Slots
 from service.queue import JobQueue
-from service.records import RecordStore
+from service.records import Quota, RecordStore
 from service.settings import Settings
 from service.uploads import Upload, open_upload
 
@@ -34,9 +36,28 @@ class Services:
     # threads of their own: uploads to a slow disk must not keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
 
-    def open_upload(self) -> AbstractAsyncContextManager[Upload]:
-        """A new upload into the blob store, within the settings' limit."""
-        return open_upload(self.blobs, self.settings.max_upload_bytes, self.upload_limiter)
+    @cached_property
+    def quota(self) -> Quota:
+        """What each caller may have."""
+        chosen = self.settings
+        return Quota(chosen.quota_active_jobs, chosen.quota_fields, chosen.quota_stored_bytes)
+
+    @cached_property
+    def uploads(self) -> Slots:
+        """Uploads that are under way."""
+        return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")
+
+    @cached_property
+    def streams(self) -> Slots:
+        """Event streams that are being read."""
+        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_STREAMS")
+
+    @asynccontextmanager
+    async def open_upload(self, caller: str) -> AsyncIterator[Upload]:
+        """A new upload into the blob store, within the settings' limits. Raises Problem TOO_MANY_UPLOADS."""
+        with self.uploads.held(caller):
+            async with open_upload(self.blobs, self.settings.max_upload_bytes, self.upload_limiter) as upload:
+                yield upload
 
 
 def services_of(request: Request) -> Services:

@@ -6,12 +6,28 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
+from service.body import CLOSE
 from service.dependencies import Services, off_loop
 from service.ownership import reference_of
 from service.problems import Problem
-from service.records import FieldRecord
+from service.records import FieldRecord, QuotaError
 from service.schemas.fields import function_of
 from service.uploads import Received, Upload
+
+
+def check_room(services: Services, caller: str, sha256: str, size: int | None) -> None:
+    """Refuse an upload of ``size`` bytes before it comes if the caller has no room for it. Raises Problem."""
+    quota = services.quota
+    if size is None or (quota.fields is None and quota.stored_bytes is None):
+        return
+    known = services.records.get_field(reference_of(caller, sha256))
+    if known is not None and known.state != "rejected":
+        return
+    count, stored = services.records.stored(caller)
+    if quota.fields is not None and count >= quota.fields:
+        raise Problem("QUOTA_FIELDS", headers=CLOSE)
+    if quota.stored_bytes is not None and stored + size > quota.stored_bytes:
+        raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
 
 
 @dataclass(frozen=True)
@@ -32,7 +48,7 @@ async def take_in(
 ) -> Intake:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
-    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function.
+    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, and QuotaError.
     """
     reference = reference_of(caller, received.sha256)
     known = await off_loop(services.records.get_field, reference)
@@ -57,17 +73,20 @@ def _keep(services: Services, known: FieldRecord, description: UploadDescription
 def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> Intake:
     now = services.records.now()
     said: dict[str, Any] = {} if description is None else function_of(description)
-    record, created = services.records.create_field(
-        FieldRecord(
-            sha256=reference,
-            state="validating",
-            bytes=size,
-            created=now,
-            updated=now,
-            label=None if description is None else description.label,
-            description=said,
-        )
+    field = FieldRecord(
+        sha256=reference,
+        state="validating",
+        bytes=size,
+        created=now,
+        updated=now,
+        label=None if description is None else description.label,
+        description=said,
     )
+    try:
+        record, created = services.records.create_field(field, services.quota)
+    except QuotaError:
+        services.blobs.delete(original_key(reference))
+        raise
     if record.state == "ready":
         # another upload of the same bytes came first and is imported already
         services.blobs.delete(original_key(reference))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -12,7 +13,7 @@ from types import TracebackType
 from typing import BinaryIO
 from uuid import uuid4
 
-from service.blobs import StorageFullError, check_key
+from service.blobs import BlobEntry, StorageFullError, check_key
 
 _TEMPORARY = ".tmp"
 _FULL = {errno.ENOSPC, errno.EDQUOT}
@@ -105,15 +106,21 @@ class LocalBlobStore:
         self.temporary.mkdir(exist_ok=True)
         self.sweep()
 
-    def sweep(self) -> int:
-        """Delete temporary files whose writers have died; how many they were."""
+    def sweep(self, older_than_s: float = 0.0) -> int:
         swept = 0
+        oldest = time.time() - older_than_s
         for path in self.temporary.iterdir():
             with suppress(FileNotFoundError, BlockingIOError), path.open("rb") as file:
+                if os.fstat(file.fileno()).st_mtime > oldest:
+                    continue
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 path.unlink()
                 swept += 1
         return swept
+
+    def probe(self) -> None:
+        with self.writer() as writer:
+            writer.write(b"probe")
 
     def path_of(self, key: str) -> Path:
         """Where a blob lies. Raises ValueError for a malformed key, or one that a link leads out of the store."""
@@ -160,6 +167,12 @@ class LocalBlobStore:
             folders[:] = [name for name in folders if not name.startswith(".")]
             found += [(Path(folder) / name).relative_to(self.root).as_posix() for name in files]
         return iter(sorted(found))
+
+    def entries(self, prefix: str) -> Iterator[BlobEntry]:
+        for key in self.list(prefix):
+            with suppress(FileNotFoundError):
+                status = self.path_of(key).stat()
+                yield BlobEntry(key, status.st_size, status.st_mtime)
 
     def delete(self, key: str) -> None:
         path = self.path_of(key)

@@ -13,9 +13,19 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
 from service import transitions
-from service.blobs import check_key
+from service.blobs import BlobEntry, check_key
 from service.ownership import ANONYMOUS
-from service.records import ACTIVE, FieldRecord, JobEvent, JobRecord, QueueFullError, StaleAttemptError
+from service.records import (
+    ACTIVE,
+    NO_QUOTA,
+    FieldRecord,
+    JobEvent,
+    JobRecord,
+    QueueFullError,
+    Quota,
+    QuotaError,
+    StaleAttemptError,
+)
 
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 
@@ -85,7 +95,7 @@ class InMemoryRecordStore:
         self._changed.notify_all()
         return record
 
-    def create_job(self, record: JobRecord, max_active: int) -> tuple[JobRecord, bool]:
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
         with self._changed:
             known = self._live(record.id)
             fresh = record if known is None else transitions.restarted_job(known, self.now())
@@ -94,6 +104,9 @@ class InMemoryRecordStore:
                 return known, False
             if len(self.active_jobs()) >= max_active:
                 raise QueueFullError(f"{max_active} jobs are active already")
+            owned = sum(active.owner == record.owner for active in self.active_jobs())
+            if quota.active_jobs is not None and owned >= quota.active_jobs:
+                raise QuotaError("QUOTA_ACTIVE_JOBS")
             self._tombstones.pop(record.id, None)
             return self._save(fresh), True
 
@@ -180,7 +193,7 @@ class InMemoryRecordStore:
         self._fields[record.sha256] = record
         return record
 
-    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         with self._changed:
             known = self._fields.get(record.sha256)
             before = self._attempts_at_deleted.get(record.sha256, 0)
@@ -189,7 +202,17 @@ class InMemoryRecordStore:
             if fresh is None:
                 assert known is not None
                 return known, False
+            count, size = self.stored(fresh.owner)
+            if quota.fields is not None and count >= quota.fields:
+                raise QuotaError("QUOTA_FIELDS")
+            if quota.stored_bytes is not None and size + fresh.bytes > quota.stored_bytes:
+                raise QuotaError("QUOTA_STORED_BYTES")
             return self._save_field(fresh), True
+
+    def stored(self, owner: str) -> tuple[int, int]:
+        with self._changed:
+            sizes = [one.bytes for one in self._fields.values() if one.owner == owner and one.state != "rejected"]
+            return len(sizes), sum(sizes)
 
     def get_field(self, sha256: str) -> FieldRecord | None:
         with self._changed:
@@ -325,3 +348,12 @@ class InMemoryBlobStore:
     def delete_prefix(self, prefix: str) -> None:
         for key in list(self.list(prefix)):
             del self.blobs[key]
+
+    def entries(self, prefix: str) -> Iterator[BlobEntry]:
+        return (BlobEntry(key, self.size(key), 0.0) for key in self.list(prefix))
+
+    def sweep(self, older_than_s: float) -> int:  # noqa: ARG002 - nothing here outlives its writer
+        return 0
+
+    def probe(self) -> None:
+        pass

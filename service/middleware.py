@@ -44,7 +44,7 @@ class RequestContext:
         await self._app(scope, receive, send_marked)
 
 
-def _is_open(scope: Scope) -> bool:
+def is_open(scope: Scope) -> bool:
     """What needs no token: the liveness probe, and the page, which asks for the token itself."""
     return scope["method"] in ("GET", "HEAD") and _OPEN_PATHS.fullmatch(scope["path"]) is not None
 
@@ -83,7 +83,7 @@ class TokenGate:
         else:
             known = self._allow_unauthenticated or not _came_from_outside(scope)
         scope.setdefault("state", {})["caller"] = caller
-        problem = None if known or _is_open(scope) else self._refusal()
+        problem = None if known or is_open(scope) else self._refusal()
         if problem is not None:
             await problem_response(problem, scope)(scope, receive, send)
         else:

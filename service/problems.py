@@ -21,7 +21,7 @@ from regnf_core.errors import RegnfError
 from service.blobs import StorageFullError
 from service.contract import allowed_methods
 from service.reasons import REASONS
-from service.records import QueueFullError, RecordError
+from service.records import QueueFullError, QuotaError, RecordError
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
@@ -104,6 +104,8 @@ def problem_of(error: Exception) -> Problem:
             return Problem(reason, headers=error.headers)
         case QueueFullError():
             return Problem("QUEUE_FULL", headers=RETRY_LATER)
+        case QuotaError():
+            return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
         case RecordError():
             return Problem("CONFLICT")
         case RegnfError():

@@ -33,6 +33,7 @@ REASONS: dict[str, Reason] = {
     "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a token that holds."),
     "NOT_FOUND": Reason(404, "Not found", "There is nothing under this address. `GET /` names every address."),
     "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
+    "RATE_LIMITED": Reason(429, "Too many calls", "Calls come faster than the service takes. See `Retry-After`."),
     "CONFLICT": Reason(409, "Conflict", "Somebody else changed the same thing at the same time. Look again, repeat."),
     "REQUEST_TOO_LARGE": Reason(413, "Request too large", "The JSON or a text part exceeds the service's limit."),
     "UNSUPPORTED_MEDIA_TYPE": Reason(
@@ -54,6 +55,11 @@ REASONS: dict[str, Reason] = {
     "FIELD_NOT_RECOGNISED": Reason(
         415, "Not a field file", "By its first bytes, or inside, the file is none of the fields that the service knows."
     ),
+    "TOO_MANY_UPLOADS": Reason(429, "Too many uploads at once", "Let one of yours end, then repeat."),
+    "QUOTA_STORED_BYTES": Reason(
+        403, "Quota of bytes used up", "Your fields are as large as they may be. Delete some."
+    ),
+    "QUOTA_FIELDS": Reason(403, "Quota of fields used up", "You have as many fields as you may. Delete some."),
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
@@ -98,9 +104,11 @@ REASONS: dict[str, Reason] = {
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
     ),
     "QUEUE_FULL": Reason(503, "Queue full", "As many jobs are active as the service takes. Retry after `Retry-After`."),
+    "QUOTA_ACTIVE_JOBS": Reason(429, "Quota of jobs used up", "As many of your jobs are active as may be."),
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
+    "TOO_MANY_STREAMS": Reason(429, "Too many streams at once", "You read as many streams as you may. Close one."),
     "JOB_NOT_READY": Reason(409, "Job not finished", "The job has no result yet. Retry after `Retry-After`."),
     "JOB_DISMISSED": Reason(409, "Job was dismissed", "The job was cancelled. Post the request again to run it."),
     "JOB_FINISHED": Reason(409, "Job has finished", "A job that succeeded or failed can no longer be cancelled."),

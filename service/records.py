@@ -27,8 +27,28 @@ class QueueFullError(RecordError):
     """As many jobs are active as the service takes."""
 
 
+class QuotaError(RecordError):
+    """The owner has as much as it may have; ``reason`` says of what."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
 class StaleAttemptError(RecordError):
     """The change came from an attempt that is no longer the current one, or from a state that forbids it."""
+
+
+@dataclass(frozen=True)
+class Quota:
+    """The most that one owner may have; None: any number."""
+
+    active_jobs: int | None = None
+    fields: int | None = None
+    stored_bytes: int | None = None
+
+
+NO_QUOTA = Quota()
 
 
 @dataclass(frozen=True)
@@ -116,11 +136,12 @@ class RecordStore(Protocol):
         ...
 
     # jobs
-    def create_job(self, record: JobRecord, max_active: int) -> tuple[JobRecord, bool]:
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
         """Store a new job, or return the one that exists under its id (False).
 
         A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
-        returned, with its attempt. Atomic. Raises QueueFullError when ``max_active`` jobs are active already.
+        returned, with its attempt. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
+        QuotaError when the owner has as many as it may.
         """
         ...
 
@@ -183,11 +204,16 @@ class RecordStore(Protocol):
         ...
 
     # fields
-    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         """Store a new field, or return the one that exists (False).
 
         A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        Rejected ones count towards no quota. Raises QuotaError.
         """
+        ...
+
+    def stored(self, owner: str) -> tuple[int, int]:
+        """How many fields that were not rejected an owner has, and the bytes of their uploads."""
         ...
 
     def get_field(self, sha256: str) -> FieldRecord | None: ...

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 from uuid import uuid4
 
@@ -18,12 +18,22 @@ _PAGE = 100
 _WRITE = """
 if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return 'OK' end
 if (redis.call('HGET', KEYS[1], 'version') or '0') ~= ARGV[2] then return 'CONFLICT' end
-if ARGV[3] ~= '' and redis.call('SCARD', KEYS[2]) >= tonumber(ARGV[3]) then return 'FULL' end
+for _, cap in ipairs(cjson.decode(ARGV[3])) do
+  local held = 0
+  if cap[1] == 'HVALS' then
+    for _, value in ipairs(redis.call('HVALS', cap[2])) do held = held + tonumber(value) end
+  else
+    held = redis.call(cap[1], cap[2])
+  end
+  if held + cap[3] > cap[4] then return cap[5] end
+end
 for i = 4, #ARGV do redis.call(unpack(cjson.decode(ARGV[i]))) end
 return 'OK'
 """
 
 Command = tuple[str, ...]
+Cap = tuple[str, str, int, int, str]
+"""(SCARD, HLEN or HVALS for the sum of a hash's values, key, what is to be added, the most, the answer beyond it)."""
 
 
 class RedisDocuments:
@@ -78,20 +88,24 @@ class RedisDocuments:
         expected_version: int,
         commands: Iterable[Command],
         document: dict[str, Any] | None = None,
-        cap: tuple[str, int] | None = None,
+        caps: Sequence[Cap] = (),
     ) -> str:
         """Run ``commands`` and store ``document`` if the version is the expected one (0: no document).
 
-        ``cap`` = (key of a set, most members it may have before). Returns OK, CONFLICT or FULL.
+        Returns OK, CONFLICT, or the answer of the first of ``caps`` that would be exceeded.
         """
         token = uuid4().hex
         writes = list(commands)
         if document is not None:
             text = json.dumps(document, separators=(",", ":"))
             writes.insert(0, ("HSET", key, "document", text, "version", str(document["version"]), "token", token))
-        cap_key, most = cap if cap is not None else (key, "")
-        arguments = [token, expected_version, most, *(json.dumps(command) for command in writes)]
-        answer: bytes | str = self._write(keys=[key, cap_key], args=arguments)
+        arguments: list[str | int] = [
+            token,
+            expected_version,
+            json.dumps(caps),
+            *(json.dumps(command) for command in writes),
+        ]
+        answer: bytes | str = self._write(keys=[key], args=arguments)
         return answer.decode() if isinstance(answer, bytes) else answer
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 from service import transitions
 from service.ownership import owner_of
-from service.records import FieldRecord, StaleAttemptError
-from service.redis_documents import PREFIX, Command, RedisDocuments, text
+from service.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError
+from service.redis_documents import PREFIX, Cap, Command, RedisDocuments, text
 
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
@@ -26,6 +26,20 @@ def _created_keys(reference: str) -> tuple[str, str]:
     return _CREATED, f"{_CREATED}:{owner_of(reference)}"
 
 
+def _stored_key(owner: str) -> str:
+    """The bytes of an owner's uploads by their fields, as long as these are not rejected."""
+    return f"{PREFIX}owner:{owner}:stored"
+
+
+def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
+    key, caps = _stored_key(record.owner), []
+    if quota.fields is not None:
+        caps.append(("HLEN", key, 1, quota.fields, "QUOTA_FIELDS"))
+    if quota.stored_bytes is not None:
+        caps.append(("HVALS", key, record.bytes, quota.stored_bytes, "QUOTA_STORED_BYTES"))
+    return caps
+
+
 def _attempts_key(sha256: str) -> str:
     return f"{PREFIX}field:{sha256}:attempts"
 
@@ -33,13 +47,17 @@ def _attempts_key(sha256: str) -> str:
 class RedisFieldRecords(RedisDocuments):
     """The half of the record store that is about fields."""
 
-    def _save_field(self, expected_version: int, record: FieldRecord) -> bool:
+    def _save_field(self, expected_version: int, record: FieldRecord, caps: Sequence[Cap] = ()) -> str:
         index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
         indexes = [
             index,
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
         ]
-        return self._compare_and_set(_key(record.sha256), expected_version, indexes, asdict(record)) == "OK"
+        if record.state == "rejected":
+            indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
+        else:
+            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.bytes)))
+        return self._compare_and_set(_key(record.sha256), expected_version, indexes, asdict(record), caps)
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
         while True:
@@ -48,10 +66,10 @@ class RedisFieldRecords(RedisDocuments):
                 raise StaleAttemptError("there is no such field")
             known = FieldRecord(**document)
             changed = change(known, now)
-            if self._save_field(known.version, changed):
+            if self._save_field(known.version, changed) == "OK":
                 return changed
 
-    def create_field(self, record: FieldRecord) -> tuple[FieldRecord, bool]:
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         while True:
             document, now = self._read(_key(record.sha256))
             known = FieldRecord(**document) if document is not None else None
@@ -59,13 +77,20 @@ class RedisFieldRecords(RedisDocuments):
             if fresh is None:
                 assert known is not None
                 return known, False
-            if self._save_field(known.version if known is not None else 0, fresh):
+            answer = self._save_field(known.version if known is not None else 0, fresh, _caps(fresh, quota))
+            if answer.startswith("QUOTA"):
+                raise QuotaError(answer)
+            if answer == "OK":
                 return fresh, True
 
     def _first(self, record: FieldRecord) -> FieldRecord:
         """The new field, its attempts counted on from those at a deleted one: whatever still works at them is stale."""
         before: Any = self._redis.get(_attempts_key(record.sha256))
         return record if before is None else replace(record, attempt=record.attempt + int(before))
+
+    def stored(self, owner: str) -> tuple[int, int]:
+        sizes: Any = self._redis.hvals(_stored_key(owner))
+        return len(sizes), sum(map(int, sizes))
 
     def get_field(self, sha256: str) -> FieldRecord | None:
         document, _ = self._read(_key(sha256))
@@ -103,6 +128,7 @@ class RedisFieldRecords(RedisDocuments):
                 ("DEL", _key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
                 ("SREM", _VALIDATING, sha256),
+                ("HDEL", _stored_key(owner_of(sha256)), sha256),
                 ("SET", _attempts_key(sha256), str(document["attempt"]), "EX", _ATTEMPTS_KEPT_S),
             ]
             if self._compare_and_set(_key(sha256), document["version"], commands) == "OK":

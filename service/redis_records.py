@@ -19,8 +19,8 @@ from redis import Redis
 
 from service import transitions
 from service.ownership import ANONYMOUS
-from service.records import ACTIVE, JobEvent, JobRecord, QueueFullError, StaleAttemptError
-from service.redis_documents import PREFIX, Command, text
+from service.records import ACTIVE, NO_QUOTA, JobEvent, JobRecord, QueueFullError, Quota, QuotaError, StaleAttemptError
+from service.redis_documents import PREFIX, Cap, Command, text
 from service.redis_fields import RedisFieldRecords
 
 _CREATED = f"{PREFIX}jobs:created"
@@ -52,6 +52,10 @@ def _created_keys(record: JobRecord) -> tuple[str, str]:
     return _CREATED, f"{_CREATED}:{record.owner}"
 
 
+def _active_key(record: JobRecord) -> str:
+    return f"{PREFIX}owner:{record.owner}:active"
+
+
 def _events_key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}:events"
 
@@ -77,7 +81,7 @@ class RedisRecordStore(RedisFieldRecords):
         key, events = _key(after.id), _events_key(after.id)
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
-            ("SADD" if after.status in ACTIVE else "SREM", _ACTIVE, after.id),
+            *(("SADD" if after.status in ACTIVE else "SREM", each, after.id) for each in (_ACTIVE, _active_key(after))),
         ]
         if after.status != "accepted":
             commands.append(("ZREM", _WAITING, after.id))
@@ -111,7 +115,10 @@ class RedisRecordStore(RedisFieldRecords):
             if self._compare_and_set(_key(job_id), known.version, commands, asdict(changed)) == "OK":
                 return changed
 
-    def create_job(self, record: JobRecord, max_active: int) -> tuple[JobRecord, bool]:
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
+        if quota.active_jobs is not None:
+            caps.append(("SCARD", _active_key(record), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
         while True:
             document, now = self._read(_key(record.id))
             known = JobRecord(**document) if document is not None else None
@@ -121,9 +128,11 @@ class RedisRecordStore(RedisFieldRecords):
                 return known, False
             version = known.version if known is not None else 0
             commands = self._commands(known, fresh)
-            answer = self._compare_and_set(_key(record.id), version, commands, asdict(fresh), (_ACTIVE, max_active))
+            answer = self._compare_and_set(_key(record.id), version, commands, asdict(fresh), caps)
             if answer == "FULL":
                 raise QueueFullError(f"{max_active} jobs are active already")
+            if answer.startswith("QUOTA"):
+                raise QuotaError(answer)
             if answer == "OK":
                 return fresh, True
 

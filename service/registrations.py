@@ -87,6 +87,7 @@ def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_k
             updated=now,
         ),
         services.settings.max_queued_jobs,
+        services.quota,
     )
     if record.status == "accepted":
         # also for a job known before: mends one that was recorded but never queued

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 from pathlib import Path
 from typing import Literal
@@ -10,6 +11,7 @@ from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIB = 1024 * 1024
+_RATE_BEYOND_LOOPBACK = 20.0
 
 
 def _default_state_dir() -> Path:
@@ -19,6 +21,14 @@ def _default_state_dir() -> Path:
 
 SECRETS = frozenset({"REGNF_API_TOKENS"})
 """Variables that only the API's process needs to see."""
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach the host. Names other than localhost are not looked up: they are not."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 class Settings(BaseSettings):
@@ -50,6 +60,16 @@ class Settings(BaseSettings):
     upload_stall_s: float = Field(default=30.0, gt=0)
     """An upload that sends nothing for this long is refused with 408."""
     max_queued_jobs: int = Field(default=1000, ge=1)
+    rate_limit_per_s: float | None = Field(default=None, ge=0)
+    """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
+    rate_limit_burst: int = Field(default=100, ge=1)
+    """Calls that a caller may make at once after a pause."""
+    max_uploads_per_caller: int = Field(default=64, ge=2)
+    max_streams_per_caller: int = Field(default=100, ge=1)
+    quota_active_jobs: int | None = Field(default=None, ge=1)
+    quota_fields: int | None = Field(default=None, ge=1)
+    quota_stored_bytes: int | None = Field(default=None, ge=1)
+    """Of each caller's uploads; what the service makes of them is not counted."""
     job_timeout_s: int = Field(default=900, ge=1)
     import_timeout_s: int = Field(default=120, ge=1)
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
@@ -67,6 +87,13 @@ class Settings(BaseSettings):
     def needs_token(self) -> bool:
         """Whether callers must name themselves."""
         return bool(self.api_tokens) or self.api_tokens_file is not None
+
+    @property
+    def calls_per_s(self) -> float:
+        """The rate that holds; 0: none."""
+        if self.rate_limit_per_s is not None:
+            return self.rate_limit_per_s
+        return 0.0 if is_loopback(self.host) else _RATE_BEYOND_LOOPBACK
 
     @property
     def scratch_dir(self) -> Path:

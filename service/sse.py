@@ -6,6 +6,10 @@ import json
 import time
 from collections.abc import AsyncIterator
 
+from starlette.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from service.concurrency import Slots
 from service.dependencies import Services, off_loop
 from service.records import FINISHED, JobEvent
 from service.waiting import pause
@@ -44,3 +48,20 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
             last_sent = time.monotonic()
         if await pause(_POLL_S, services.stopping):
             return
+
+
+class EventStream(StreamingResponse):
+    """A stream as one of those that a caller may read at once: held while it is sent, however that ends.
+
+    Raises Problem TOO_MANY_STREAMS before anything is sent.
+    """
+
+    def __init__(self, slots: Slots, caller: str, stream: AsyncIterator[str]) -> None:
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        super().__init__(stream, media_type=MEDIA_TYPE, headers=headers)
+        self._slots = slots
+        self._caller = caller
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self._slots.held(self._caller):
+            await super().__call__(scope, receive, send)

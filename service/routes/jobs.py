@@ -122,7 +122,7 @@ async def get_job(
             "content": {sse.MEDIA_TYPE: {"schema": {"type": "string"}}},
         },
         204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
-        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED"),
+        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_STREAMS"),
     },
 )
 async def job_events(
@@ -139,9 +139,7 @@ async def job_events(
         raise Problem("INVALID_EVENT_ID") from error
     if last_event_id is not None and record.status not in ACTIVE and not waiting:
         return Response(status_code=204)
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    stream = sse.event_stream(services, id, last_event_id)
-    return StreamingResponse(stream, media_type=sse.MEDIA_TYPE, headers=headers)
+    return sse.EventStream(services.streams, caller, sse.event_stream(services, id, last_event_id))
 
 
 @router.post(

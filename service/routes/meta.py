@@ -57,8 +57,8 @@ def _answers(check: Callable[[], bool]) -> bool:
 
 
 def _storage_writes(services: Services) -> bool:
-    with services.blobs.writer() as writer:
-        return writer.write(b"probe") == len(b"probe")
+    services.blobs.probe()
+    return True
 
 
 @get_and_head(router, "/version", summary="What runs here", response_model=VersionDocument)

@@ -80,6 +80,7 @@ def preferred_wait(prefer: str | None) -> int | None:
             "DETECTION_OUTSIDE_SCENE",
             "IDEMPOTENCY_KEY_REUSED",
             "QUEUE_FULL",
+            "QUOTA_ACTIVE_JOBS",
         ),
     },
     openapi_extra={
@@ -153,7 +154,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     settings = services.settings
     limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
     async with AsyncExitStack() as stack:
-        files = {name: await stack.enter_async_context(services.open_upload()) for name in ("scene", "object")}
+        files = {name: await stack.enter_async_context(services.open_upload(caller)) for name in ("scene", "object")}
         data = body.chunks(request, limit, settings.upload_stall_s)
         parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
         missing = [name for name in ("scene", "object", "request") if name not in parts]

@@ -12,9 +12,9 @@ from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
 from service import body
-from service.dependencies import CallerDep, PrefixDep, Services, ServicesDep
+from service.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
 from service.digests import announced_digest, is_sha256
-from service.intake import Intake, take_in
+from service.intake import Intake, check_room, take_in
 from service.multipart import boundary_of, read_parts
 from service.problems import Problem
 from service.records import FieldRecord
@@ -61,7 +61,8 @@ async def put_field(
     if body.media_type(request).startswith("multipart/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=body.CLOSE)
     digest = announced_digest(content_digest)
-    async with services.open_upload() as upload:
+    await off_loop(check_room, services, caller, sha256, body.declared_length(request))
+    async with services.open_upload(caller) as upload:
         received = await _receive_raw(request, services, upload)
         if received.sha256 != sha256 or digest not in (None, received.sha256):
             raise Problem("DIGEST_MISMATCH")
@@ -97,7 +98,7 @@ async def post_field(
 ) -> JSONResponse:
     """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
     digest = announced_digest(content_digest)
-    async with services.open_upload() as upload:
+    async with services.open_upload(caller) as upload:
         if body.media_type(request) == "multipart/form-data":
             received, description = await _receive_parts(request, services, upload, digest)
         else:

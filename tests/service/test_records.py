@@ -9,7 +9,7 @@ import pytest
 
 from service.memory import InMemoryRecordStore
 from service.ownership import reference_of
-from service.records import FieldRecord, JobRecord, QueueFullError, RecordStore, StaleAttemptError
+from service.records import FieldRecord, JobRecord, QueueFullError, Quota, QuotaError, RecordStore, StaleAttemptError
 from service.redis_client import connect
 from service.redis_records import RedisRecordStore
 from tests.redis_server import private_redis
@@ -527,3 +527,29 @@ def test_an_expired_job_is_so_to_its_owner_alone(redis_url: str) -> None:
         assert store.expire_jobs() == ["j1"]
         assert store.list_jobs(None, 10, None, "alice") == []
         assert not redis.exists("regnf:jobs:created:alice")
+
+
+# how much they may have
+
+
+def test_an_owner_has_no_more_than_its_quota(store: RecordStore) -> None:
+    quota = Quota(active_jobs=1, fields=2, stored_bytes=25)
+    mine = [reference_of("alice", digit * 64) for digit in "1234"]
+    store.create_job(replace(job(store), request={"scene": mine[0]}), 10, quota)
+    with pytest.raises(QuotaError, match="QUOTA_ACTIVE_JOBS"):
+        store.create_job(replace(job(store, "j2"), request={"scene": mine[0]}), 10, quota)
+    assert store.create_job(job(store, "others"), 10, quota)[1]
+    store.create_field(field(store, mine[0]), quota)
+    with pytest.raises(QuotaError, match="QUOTA_STORED_BYTES"):
+        store.create_field(replace(field(store, mine[1]), bytes=16), quota)
+    store.create_field(replace(field(store, mine[1]), bytes=15), quota)
+    with pytest.raises(QuotaError, match="QUOTA_FIELDS"):
+        store.create_field(replace(field(store, mine[2]), bytes=0), quota)
+    assert store.stored("alice") == (2, 25)
+    assert store.create_field(field(store, mine[0]), quota)[1] is False
+    store.update_field(mine[0], state="rejected")
+    assert store.stored("alice") == (1, 15)
+    assert store.create_field(field(store, mine[0]), quota)[1], "tried anew"
+    store.delete_field(mine[1])
+    assert store.stored("alice") == (1, 10)
+    assert store.stored("anonymous") == (0, 0)

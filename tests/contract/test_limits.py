@@ -1,0 +1,176 @@
+"""What a caller may do how often and how much, and what it is told beyond that."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.app import create_app
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.rate_limits import RedisRateLimiter
+from service.redis_client import connect
+from service.settings import Settings
+from tests.contract.asgi import client_of
+from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
+from tests.redis_server import private_redis
+
+ALICE, BOB = {"Authorization": "Bearer one"}, {"Authorization": "Bearer two"}
+TOKENS = frozenset({"alice:one", "bob:two"})
+
+
+@pytest.fixture(scope="module")
+def redis_url() -> Iterator[str]:
+    with private_redis() as url:
+        yield url
+
+
+@pytest.fixture
+def limited(tmp_path: Path) -> Iterator[Callable[..., World]]:
+    made: list[World] = []
+
+    def make(**settings: object) -> World:
+        made.append(make_world(tmp_path, **settings))
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.client.close()
+
+
+def put(client: httpx.Client, name: str, size: int = 600, **headers: str) -> httpx.Response:
+    data = field_bytes(name, size)
+    return client.put(f"/fields/{sha256(data)}", content=data, headers=headers)
+
+
+# rates
+
+
+def test_a_bucket_empties_and_fills(redis_url: str) -> None:
+    with connect(redis_url) as redis:
+        redis.flushall()
+        slow, fast = RedisRateLimiter(redis, 0.01, 3), RedisRateLimiter(redis, 1e6, 1)
+        assert [slow.take("alice") for _ in range(3)] == [0.0, 0.0, 0.0]
+        assert 90 < slow.take("alice") <= 100
+        assert slow.take("bob") == 0.0
+        assert [fast.take("carol") for _ in range(20)] == [0.0] * 20
+        # a minute ago there were none left: what has come in since is rate times a minute
+        redis.hset("regnf:rate:alice", mapping={"tokens": "0.5", "at": f"{redis.time()[0] - 60}"})
+        assert slow.take("alice") == 0.0
+        assert 0.05 < float(redis.hget("regnf:rate:alice", "tokens")) < 0.15  # type: ignore[arg-type]
+        assert 0 < redis.ttl("regnf:rate:alice") <= 301  # type: ignore[operator]
+
+
+def test_calls_at_once_take_no_more_than_there_are(redis_url: str) -> None:
+    with connect(redis_url) as redis, ThreadPoolExecutor(8) as pool:
+        redis.flushall()
+        limiter = RedisRateLimiter(redis, 0.001, 10)
+        assert sum(wait == 0 for wait in pool.map(limiter.take, ["alice"] * 40)) == 10
+
+
+def test_one_callers_haste_is_not_anothers(tmp_path: Path, redis_url: str) -> None:
+    with connect(redis_url) as redis:
+        redis.flushall()
+        stores = InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()
+        settings = Settings(state_dir=tmp_path, api_tokens=TOKENS)
+        app = create_app(settings, *stores, limiter=RedisRateLimiter(redis, 0.01, 2))
+        with client_of(app) as client:
+            assert [client.get("/jobs", headers=ALICE).status_code for _ in range(2)] == [200, 200]
+            refused = client.get("/jobs", headers=ALICE)
+            assert_refused(refused, 429, "RATE_LIMITED")
+            assert 90 < int(refused.headers["retry-after"]) <= 100
+            assert client.get("/jobs", headers=BOB).status_code == 200
+            assert client.get("/healthz").status_code == client.get("/static/js/app.js").status_code == 200
+            assert_refused(client.get("/jobs"), 401, "UNAUTHENTICATED")
+
+
+@pytest.mark.parametrize(
+    ("host", "given", "rate"),
+    [("127.0.0.1", None, 0), ("localhost", None, 0), ("0.0.0.0", None, 20), ("127.0.0.1", 5, 5), ("0.0.0.0", 0, 0)],
+)
+def test_without_a_word_there_is_no_rate_on_loopback(host: str, given: float | None, rate: float) -> None:
+    assert Settings(host=host, rate_limit_per_s=given).calls_per_s == rate
+
+
+# quotas
+
+
+def test_active_jobs(limited: Callable[..., World]) -> None:
+    world = limited(quota_active_jobs=2)
+    first, _ = world.submit(seed=1), world.submit(seed=2)
+    refused = world.client.post("/register", json=world.valid_request() | {"seed": 3})
+    assert_refused(refused, 429, "QUOTA_ACTIVE_JOBS")
+    assert int(refused.headers["retry-after"]) > 0
+    assert world.client.post("/register", json=world.valid_request() | {"seed": 1}).status_code == 202, "known already"
+    world.succeed(first)
+    world.submit(seed=3)
+
+
+def test_fields(limited: Callable[..., World]) -> None:
+    world = limited(quota_fields=2, api_tokens=TOKENS)
+    world.client.headers.update(ALICE)
+    assert [put(world.client, name).status_code for name in "ab"] == [201, 201]
+    assert_refused(put(world.client, "c"), 403, "QUOTA_FIELDS")
+    assert_refused(world.client.post("/fields", content=field_bytes("c")), 403, "QUOTA_FIELDS")
+    assert not [key for key in world.blobs.blobs if sha256(field_bytes("c")) in key], "nothing stays"
+    assert put(world.client, "a").status_code == 200
+    assert put(world.client, "c", **BOB).status_code == 201, "another caller's room is its own"
+    world.client.delete(f"/fields/{sha256(field_bytes('b'))}")
+    assert put(world.client, "c").status_code == 201
+
+
+def test_stored_bytes(limited: Callable[..., World]) -> None:
+    world = limited(quota_stored_bytes=2000)
+    assert put(world.client, "a", 1500).status_code == 201
+    assert_refused(put(world.client, "b", 501), 403, "QUOTA_STORED_BYTES")
+    assert_refused(world.client.post("/fields", content=field_bytes("b", 501)), 403, "QUOTA_STORED_BYTES")
+    assert put(world.client, "b", 500).status_code == 201
+    error = {"reason": "FIELD_SHAPES_MISMATCH", "title": "", "status": 422, "detail": ""}
+    world.records.update_field(sha256(field_bytes("a", 1500)), state="rejected", error=error)
+    assert put(world.client, "c", 1500).status_code == 201, "the bytes of a rejected field were dropped"
+
+
+# at once
+
+
+def test_uploads_at_once(limited: Callable[..., World]) -> None:
+    world = limited(max_uploads_per_caller=2, api_tokens=TOKENS, upload_stall_s=30)
+    begun, may_end = threading.Barrier(3), threading.Event()
+
+    def slowly(name: str) -> Iterator[bytes]:
+        data = field_bytes(name)
+        yield data[:300]
+        begun.wait(20)
+        may_end.wait(20)
+        yield data[300:]
+
+    def upload(name: str) -> int:
+        path = f"/fields/{sha256(field_bytes(name))}"
+        return world.client.put(path, content=slowly(name), headers=ALICE).status_code
+
+    with ThreadPoolExecutor(2) as pool:
+        under_way = [pool.submit(upload, name) for name in "ab"]
+        begun.wait(20)
+        refused = put(world.client, "c", **ALICE)
+        assert put(world.client, "c", **BOB).status_code == 201
+        may_end.set()
+        assert [one.result() for one in under_way] == [201, 201]
+    assert_refused(refused, 429, "TOO_MANY_UPLOADS")
+    assert int(refused.headers["retry-after"]) > 0
+    assert put(world.client, "c", **ALICE).status_code == 201, "places are given back"
+
+
+def test_streams_at_once(limited: Callable[..., World]) -> None:
+    world = limited(max_streams_per_caller=1)
+    job_id = world.submit()
+    services = world.app.state.services
+    with services.streams.held("anonymous"):
+        assert_refused(world.client.get(f"/jobs/{job_id}/events"), 429, "TOO_MANY_STREAMS")
+    world.succeed(job_id)
+    for _ in range(2):
+        assert world.client.get(f"/jobs/{job_id}/events").status_code == 200
+    assert services.streams.taken == services.uploads.taken == 0
