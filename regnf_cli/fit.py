@@ -1,9 +1,10 @@
-"""``regnf fit``: a neural field from a mesh."""
+"""``regnf fit``: a neural field from a mesh or from posed images."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,34 +18,83 @@ from regnf_core.errors import InvalidInputError, InvalidOptionsError
 _LONGEST_LABEL = 200  # of the safe format
 
 
+class StartChoice(StrEnum):
+    """A ball, a hollow ball round the cameras, or what the cameras' places suggest."""
+
+    auto = "auto"
+    object = "object"
+    room = "room"
+
+
+class DeviceChoice(StrEnum):
+    """Where to compute; auto: a GPU if there is one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
 def fit(
-    mesh: Annotated[Path, typer.Argument(help="A mesh: glb, obj, ply, stl.", exists=True, dir_okay=False)],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True
+        ),
+    ],
     output: Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")],
     iterations: Annotated[int, typer.Option(min=1, help="Training steps; more is finer.")] = 3000,
     table_log2: Annotated[int, typer.Option(min=8, max=22, help="log2 of the entries per hash level.")] = 15,
     extent: Annotated[
         float | None,
         typer.Option(
-            help="Centre the mesh and scale its longest edge to this many units (up to 2 always fits). "
+            help="Meshes: centre it and scale its longest edge to this many units (up to 2 always fits). "
             "Else its own frame."
         ),
     ] = None,
     label: Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1)] = 0,
+    hidden_width: Annotated[
+        int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
+    ] = None,
+    snapshots: Annotated[
+        str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
+    ] = None,
+    start: Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")] = StartChoice.auto,
+    device: Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")] = DeviceChoice.auto,
 ) -> None:
-    """Fit a neus-facto field to the exact distance of a mesh: minutes on two cores.
+    """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
 
-    Example: **regnf fit chair.glb chair.safetensors --extent 1.0**
+    A fit to images that was interrupted goes on from OUTPUT's .checkpoint when the same command is given again.
+
+    Examples: **regnf fit chair.glb chair.safetensors --extent 1.0**, **regnf fit images/ chair.safetensors**
     """
     require("engine")
+    _check(output, extent, label)
+    if not source.is_dir():
+        if snapshots is not None or start is not StartChoice.auto or device is not DeviceChoice.auto:
+            raise InvalidOptionsError("--snapshots, --start and --device are for images")
+        settings = {"iterations": iterations} | ({} if hidden_width is None else {"hidden_width": hidden_width})
+        _fit_mesh(source, output, settings, table_log2, extent, {"seed": seed, "label": label})
+        return
+    if extent is not None:
+        raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
+    from regnf_cli.fit_images import fit_images
+
+    choices: dict[str, Any] = {"iterations": iterations, "table_log2": table_log2, "start": start.value}
+    choices |= {} if hidden_width is None else {"hidden_width": hidden_width}
+    fit_images(source, output, choices, snapshots, {"seed": seed, "label": label, "device": device.value})
+
+
+def _fit_mesh(
+    mesh: Path, output: Path, settings: dict[str, Any], table_log2: int, extent: float | None, rest: dict[str, Any]
+) -> None:
     import numpy as np
 
     from regnf_core.fields.mesh import MeshField
     from regnf_core.fitting.fit import fit_field
     from regnf_core.fitting.options import FitOptions
 
-    _check(output, extent, label)
-    options = FitOptions(iterations=iterations)
+    options = FitOptions(**settings)
     options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     target = MeshField.load(mesh)
     source: dict[str, Any] = {"mesh": mesh.name}
@@ -57,7 +107,7 @@ def fit(
         T_field_mesh[:3, 3] = -T_field_mesh[0, 0] * (low + high) / 2
         target = target.transformed(T_field_mesh)
         source["T_field_mesh"] = T_field_mesh.tolist()
-    _fit_with_bar(fit_field, target, output, options, {"seed": seed, "label": label, "source": source})
+    _fit_with_bar(fit_field, target, output, options, rest | {"source": source})
 
 
 def _check(output: Path, extent: float | None, label: str | None) -> None:

@@ -39,10 +39,14 @@ class GeometryMlp:
 
     def __call__(self, features: Tensor) -> Tensor:
         """Signed distance (N,) of features (N, in)."""
+        return self._linear(len(self.weights) - 1, self.hidden(features), features).squeeze(-1)
+
+    def hidden(self, features: Tensor) -> Tensor:
+        """What the last layer is fed (N, width), of features (N, in)."""
         h = features
         for layer in range(len(self.weights) - 1):
             h = self._function.value(self._linear(layer, h, features))
-        return self._linear(len(self.weights) - 1, h, features).squeeze(-1)
+        return h
 
     def with_gradient(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) of features (N, in) and its gradient (N, in) by them, by reverse accumulation."""

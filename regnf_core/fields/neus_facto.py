@@ -48,13 +48,17 @@ class NeusFactoFunction:
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (N,) at points (N, 3)."""
+        return self.mlp(self.encode(points))
+
+    def encode(self, points: Tensor) -> Tensor:
+        """What the network is fed (N, in) at points (N, 3)."""
         z, grid_points = self._coordinates(points)
         parts = [z]
         if self.positional_encoding is not None:
             parts.append(self.positional_encoding.encode(z))
         if self.hash_encoding is not None:
             parts.append(self.hash_encoding.encode(self._to_unit(grid_points)))
-        return self.mlp(torch.cat(parts, dim=-1))
+        return torch.cat(parts, dim=-1)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""

@@ -1,0 +1,57 @@
+"""``regnf fit`` of a folder of posed images."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, Progress, TextColumn
+
+from regnf_cli.console import err, out
+from regnf_core.errors import InvalidOptionsError
+
+
+def fit_images(
+    dataset: Path, output: Path, settings: dict[str, Any], snapshots: str | None, rest: dict[str, Any]
+) -> None:
+    """Fit to the images in ``dataset``.
+
+    settings: of ReconstructionOptions, and ``table_log2`` · snapshots: percents, comma-separated · rest: what
+    ``reconstruct`` takes beside.
+    """
+    from regnf_core.datasets.sdfstudio import load_dataset
+    from regnf_core.reconstruction.fit import FitFiles, reconstruct
+    from regnf_core.reconstruction.options import ReconstructionOptions
+
+    table_log2 = settings.pop("table_log2")
+    options = ReconstructionOptions(**settings)
+    options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
+    files = FitFiles(output, output.with_suffix(".checkpoint"), shares(snapshots))
+    columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
+    with Progress(*columns, console=err) as bar:
+        task = bar.add_task("fitting", total=options.iterations, state="reading the images")
+        images = load_dataset(dataset)
+
+        def report(iteration: int, loss: float, seconds_left: float) -> None:
+            bar.update(task, completed=iteration, state=f"loss {loss:.5f}, {seconds_left:.0f} s left")
+
+        bar.update(task, state="laying out the rays")
+        figures = reconstruct(
+            images, files, options, progress=report, source={"dataset": dataset.resolve().name}, **rest
+        )
+    for name, value in asdict(figures).items():
+        out.print(f"{name:<24} {'none' if value is None else format(value, '.6g')}")
+
+
+def shares(percents: str | None) -> tuple[float, ...]:
+    """Percents such as ``1,3,10`` as shares. Raises InvalidOptionsError."""
+    if not percents:
+        return ()
+    try:
+        values = tuple(float(part) / 100.0 for part in percents.split(","))
+    except ValueError as error:
+        raise InvalidOptionsError(f"snapshots are percents such as 1,3,10, not {percents:.40}") from error
+    if not all(0.0 < value < 1.0 for value in values):
+        raise InvalidOptionsError("snapshots lie between 0 and 100 percent")
+    return values

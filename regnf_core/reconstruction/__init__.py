@@ -1,0 +1,1 @@
+"""Fitting a neus-facto field to posed images, with or without depth."""

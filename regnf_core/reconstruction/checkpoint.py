@@ -1,0 +1,44 @@
+"""A fit's state on disk, so that an interrupted fit goes on as if it had not been."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import secrets
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from regnf_core.errors import InvalidInputError
+
+_VERSION = 1
+
+
+def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:
+    """Write a trainer's state, whole or not at all. key: of the data and options that it belongs to."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    try:
+        with temporary.open("xb") as file:
+            torch.save({"version": _VERSION, "key": key, "state": state}, file)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
+    """The state in ``path``. Raises InvalidInputError (CHECKPOINT_INVALID, CHECKPOINT_OF_ANOTHER_FIT)."""
+    try:
+        content = torch.load(path, weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
+        raise InvalidInputError(f"{path.name} is no checkpoint of a fit", reason="CHECKPOINT_INVALID") from error
+    if not isinstance(content, dict) or content.get("version") != _VERSION:
+        raise InvalidInputError(f"{path.name} is no checkpoint of a fit", reason="CHECKPOINT_INVALID")
+    if content.get("key") != key:
+        raise InvalidInputError(
+            f"{path.name} belongs to a fit of other data or options", reason="CHECKPOINT_OF_ANOTHER_FIT"
+        )
+    state: dict[str, Any] = content["state"]
+    return state

@@ -1,0 +1,157 @@
+"""Fitting a neus-facto field to posed images."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from regnf_core.datasets.posed_images import PosedImages
+from regnf_core.errors import InvalidOptionsError, RegnfError
+from regnf_core.fields.safe_format import write_safe_field
+from regnf_core.reconstruction.checkpoint import read_checkpoint, write_checkpoint
+from regnf_core.reconstruction.depth_terms import supervise
+from regnf_core.reconstruction.held_out import judge
+from regnf_core.reconstruction.network import DEGREE, RadianceField
+from regnf_core.reconstruction.options import ReconstructionOptions, ReconstructionProgress, ReconstructionReport
+from regnf_core.reconstruction.preparation import prepare
+from regnf_core.reconstruction.trainer import Trainer
+
+_REPORT_EVERY = 25
+_CHECKPOINTS = 10
+
+
+class FitDivergedError(RegnfError):
+    """The loss is no longer a number; the last checkpoint is kept."""
+
+    reason = "FIT_DIVERGED"
+
+
+@dataclass(frozen=True)
+class FitFiles:
+    """Where a fit writes. snapshots: shares of the iterations, in (0, 1), after which the field is written as
+    NAME-after-3-percent beside ``output`` · checkpoint: kept until the fit is done, and gone on from if it is there."""
+
+    output: Path
+    checkpoint: Path | None = None
+    snapshots: tuple[float, ...] = ()
+
+
+def reconstruct(
+    images: PosedImages,
+    files: FitFiles,
+    options: ReconstructionOptions | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: ReconstructionProgress | None = None,
+    label: str | None = None,
+    source: dict[str, Any] | None = None,
+) -> ReconstructionReport:
+    """Fit a field to ``images``, write it in the safe format, and say how well it agrees with pixels held out.
+
+    The field's frame is the images' world frame, its bounds are theirs. Deterministic for ``seed`` on one machine's
+    CPU, interrupted or not. Raises DatasetError, FitDivergedError and InvalidInputError (CHECKPOINT_...).
+    """
+    options = options or ReconstructionOptions()
+    started = time.monotonic()
+    torch_device = pick_device(device)
+    rng = np.random.default_rng(seed)
+    prepared = prepare(images, options.start, rng)
+    supervision = supervise(prepared.training, prepared.size, options, rng)
+    trainer = Trainer(supervision, prepared.bounds, options, prepared.start, seed, torch_device)
+    write = _Writer(options, prepared.bounds, label, source or {})
+    key = _key(images, options, seed)
+    if files.checkpoint is not None and files.checkpoint.exists():
+        trainer.resume(read_checkpoint(files.checkpoint, key))
+    loss = _train(trainer, files, key, write, progress)
+    write(trainer.field, files.output)
+    if files.checkpoint is not None:
+        files.checkpoint.unlink(missing_ok=True)
+    figures = judge(trainer.field, prepared.held_out.to(torch_device), prepared.size)
+    return ReconstructionReport(
+        loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(figures)
+    )
+
+
+def pick_device(name: str) -> torch.device:
+    """``auto``: an NVIDIA GPU where there is one. Raises InvalidOptionsError."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InvalidOptionsError("there is no CUDA device")
+    if name not in ("cpu", "cuda"):
+        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {name:.40}")
+    return torch.device(name)
+
+
+def _train(
+    trainer: Trainer,
+    files: FitFiles,
+    key: str,
+    write: _Writer,
+    progress: ReconstructionProgress | None,
+) -> float:
+    """Run the iterations that are left; the mean loss of the last ones."""
+    total = trainer.options.iterations
+    snapshots = {max(1, round(share * total)): share for share in files.snapshots}
+    interval = max(1, total // _CHECKPOINTS)
+    started, first = time.monotonic(), trainer.iteration
+    recent = math.nan
+    while trainer.iteration < total:
+        trainer.step()
+        done = trainer.iteration
+        if done in snapshots:
+            write(trainer.field, snapshot_path(files.output, snapshots[done]))
+        if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
+            recent = trainer.mean_loss()
+            if not math.isfinite(recent):
+                raise FitDivergedError(f"the fit diverged about iteration {done}")
+            if files.checkpoint is not None and done % interval == 0 and done < total:
+                write_checkpoint(files.checkpoint, trainer.state(), key)
+            if progress is not None:
+                progress(done, recent, (time.monotonic() - started) / (done - first) * (total - done))
+    return recent
+
+
+def snapshot_path(output: Path, share: float) -> Path:
+    """Where the field after a share of the iterations goes: NAME-after-3-percent.safetensors."""
+    return output.with_name(f"{output.stem}-after-{100.0 * share:g}-percent{output.suffix}")
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """Writes fields of one fit."""
+
+    options: ReconstructionOptions
+    bounds: torch.Tensor
+    label: str | None
+    source: dict[str, Any]
+
+    def __call__(self, field: RadianceField, path: Path) -> None:
+        description = {
+            "family": "neus_facto",
+            "hash": asdict(self.options.grid),
+            "positional_encoding": {"degree": DEGREE, "two_pi": False},
+            "use_grid": True,
+            "contraction": "none",
+            "level_mask": None,
+            "bounds": self.bounds.tolist(),
+            "label": self.label,
+            "source": self.source,
+        }
+        write_safe_field(path, description, field.tensors())
+
+
+def _key(images: PosedImages, options: ReconstructionOptions, seed: int) -> str:
+    """Tells one fit from another: of the pixels, cameras, options and seed."""
+    digest = hashlib.sha256(repr((options, seed)).encode())
+    for array in (images.colours, images.depths, images.masks, images.intrinsics, images.T_world_camera, images.bounds):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -1,0 +1,127 @@
+"""One fit: the field, what it is fitted to, and the state between two iterations."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_core.reconstruction.colour_terms import render_rays, samples_about_depth
+from regnf_core.reconstruction.depth_terms import DepthSupervision, depth_terms
+from regnf_core.reconstruction.network import RadianceField, StartShape
+from regnf_core.reconstruction.opacity import least_sharpness
+from regnf_core.reconstruction.options import ReconstructionOptions
+
+_SHARPEST = 50.0
+"""How far above the least sharpness the learnt one may rise."""
+_SHARPNESS_RATE = 5.0
+"""The sharpness learns so much faster than the networks: it is one number with far to go."""
+
+
+class Trainer:
+    """Fits a :class:`RadianceField`; everything random comes from one generator, so that a state can be resumed."""
+
+    def __init__(
+        self,
+        data: DepthSupervision,
+        bounds: Tensor,
+        options: ReconstructionOptions,
+        start: StartShape,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.options = options
+        self.iteration = 0
+        self._losses: list[Tensor] = []
+        self.generator = torch.Generator().manual_seed(seed)
+        self.field = RadianceField(options, start, self.generator).to(device)
+        self._data = data.to(device)
+        self._bounds = bounds.float().to(device)
+        self._device = device
+        field = self.field
+        networks = [*field.weights, *field.biases, *field.colour_weights, *field.colour_biases]
+        networks += [field.feature_weight, field.feature_bias]
+        self.optimiser = torch.optim.Adam(
+            [
+                {"params": [field.table], "lr": options.table_rate, "eps": 1e-15},
+                {"params": networks, "lr": options.network_rate},
+                {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate},
+            ],
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+        self._rates = [group["lr"] for group in self.optimiser.param_groups]
+
+    def mean_loss(self) -> float:
+        """Of the iterations since the last call; NaN before the first."""
+        losses, self._losses = self._losses, []
+        return float(torch.stack(losses).mean()) if losses else math.nan
+
+    def step(self) -> None:
+        """One iteration."""
+        share = self.options.rate_share(self.iteration)
+        for group, rate in zip(self.optimiser.param_groups, self._rates, strict=True):
+            group["lr"] = rate * share
+        loss = self._loss()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self.optimiser.step()
+        with torch.no_grad():
+            self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
+        self.iteration += 1
+        self._losses.append(loss.detach())
+
+    def sharpness(self) -> Tensor:
+        """The opacity's sharpness now, per field unit."""
+        least = least_sharpness(self.iteration / self.options.iterations, self._data.size)
+        return least * self.field.log_sharpness.exp()
+
+    def _loss(self) -> Tensor:
+        weights = self.options.weights
+        function = self.field.function()
+        surface, free_space, near = depth_terms(function, self._data, self.options, self.generator)
+        loss = weights.surface * surface + weights.free_space * free_space
+        loss = loss + weights.eikonal * self._eikonal(function, near)
+        if self.options.colour_rays > 0:
+            loss = loss + self._colour()
+        return loss
+
+    def _eikonal(self, function: NeusFactoFunction, near: Tensor) -> Tensor:
+        half = self.options.eikonal_points // 2
+        chosen = torch.randint(len(near), (half,), generator=self.generator).to(self._device)
+        anywhere = torch.rand(half, 3, generator=self.generator).to(self._device)
+        anywhere = self._bounds[0] + anywhere * (self._bounds[1] - self._bounds[0])
+        _, gradient = function.value_and_gradient(torch.cat((near[chosen], anywhere)))
+        loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
+        return loss
+
+    def _colour(self) -> Tensor:
+        """Colour and rendered depth of rays with depth, L1 both."""
+        options, data = self.options, self._data
+        index = torch.randint(len(data.rays), (options.colour_rays,), generator=self.generator).to(self._device)
+        rays = data.rays.take(index)
+        depths = samples_about_depth(rays, 2.0 * options.band * data.size, self.generator)
+        black = torch.zeros(3, device=self._device)
+        rendered = render_rays(self.field, rays, depths, self.sharpness(), black)
+        colour = (rendered.colours - rays.colours).abs().mean()
+        depth = (rendered.depths - rays.depths).abs().mean() / data.size
+        return options.weights.colour * colour + options.weights.rendered_depth * depth
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next iteration depends on."""
+        return {
+            "iteration": self.iteration,
+            "field": self.field.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from a :meth:`state`."""
+        self.iteration = state["iteration"]
+        self.field.load_state_dict(state["field"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
