@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -138,30 +137,18 @@ def test_stored_bytes(limited: Callable[..., World]) -> None:
 
 
 def test_uploads_at_once(limited: Callable[..., World]) -> None:
-    world = limited(max_uploads_per_caller=2, api_tokens=TOKENS, upload_stall_s=30)
-    begun, may_end = threading.Barrier(3), threading.Event()
-
-    def slowly(name: str) -> Iterator[bytes]:
-        data = field_bytes(name)
-        yield data[:300]
-        begun.wait(20)
-        may_end.wait(20)
-        yield data[300:]
-
-    def upload(name: str) -> int:
-        path = f"/fields/{sha256(field_bytes(name))}"
-        return world.client.put(path, content=slowly(name), headers=ALICE).status_code
-
-    with ThreadPoolExecutor(2) as pool:
-        under_way = [pool.submit(upload, name) for name in "ab"]
-        begun.wait(20)
-        refused = put(world.client, "c", **ALICE)
-        assert put(world.client, "c", **BOB).status_code == 201
-        may_end.set()
-        assert [one.result() for one in under_way] == [201, 201]
-    assert_refused(refused, 429, "TOO_MANY_UPLOADS")
-    assert int(refused.headers["retry-after"]) > 0
-    assert put(world.client, "c", **ALICE).status_code == 201, "places are given back"
+    world = limited(max_uploads_per_caller=2, api_tokens=TOKENS)
+    uploads = world.app.state.services.uploads
+    with uploads.held("alice"):
+        assert put(world.client, "a", **ALICE).status_code == 201
+        with uploads.held("alice"):
+            refused = put(world.client, "b", **ALICE)
+            assert_refused(refused, 429, "TOO_MANY_UPLOADS")
+            assert (int(refused.headers["retry-after"]) > 0, refused.headers["connection"]) == (True, "close")
+            assert put(world.client, "b", **BOB).status_code == 201
+    odd = world.client.put("/fields/" + "0" * 64, content=b"x" * 600, headers=ALICE)
+    assert_refused(odd, 415, "FIELD_NOT_RECOGNISED")
+    assert uploads.taken == 0, "places are given back, by a refused upload too"
 
 
 def test_streams_at_once(limited: Callable[..., World]) -> None:
