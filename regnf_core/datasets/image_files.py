@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tokenize
 import zlib
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ _FAULTS_OF_CONTENT = (
     ValueError,
     EOFError,
     struct.error,
+    tokenize.TokenError,
     zlib.error,
     Image.DecompressionBombError,
     Image.DecompressionBombWarning,
@@ -40,7 +42,7 @@ def resolve(folder: Path, name: Any, what: str) -> Path:
         path = (folder / name).resolve()
         inside = path.is_relative_to(folder.resolve())
         exists = inside and path.is_file()
-    except (OSError, RuntimeError) as error:  # a name too long, or links in a circle
+    except (OSError, RuntimeError, ValueError) as error:  # too long, links in a circle, half a character
         raise DatasetError(f"{what} cannot be followed: {name!r:.200}", reason="DATASET_METADATA_INVALID") from error
     if not inside:
         raise DatasetError(f"{what} leaves the dataset's folder: {name!r:.200}", reason="DATASET_PATH_OUTSIDE")

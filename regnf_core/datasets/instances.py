@@ -88,7 +88,7 @@ def _read(entry: Any, name: str | None) -> Instance:
     if not isinstance(entry, dict):
         raise DatasetError("an instance is no JSON object", reason=_REASON)
     label = str(next((entry[key] for key in _LABELS if entry.get(key) is not None), name or "instance"))
-    label = label[:_LONGEST_LABEL]
+    label = "".join(letter if letter.isprintable() else "?" for letter in label[:_LONGEST_LABEL])
     object_world = entry.get("T_object_world")
     poses = {key: entry.get(key) for key in ("world_pose", "gt_pose")}
     return Instance(

@@ -13,15 +13,22 @@ _RIGID_TOLERANCE = 1e-3
 """Of rotations and scales: files are often written with few digits."""
 
 
+_LARGEST = 1e9
+"""Larger numbers are no places and no pixels, and their products overflow."""
+
+
 def array(value: Any, shapes: tuple[tuple[int, ...], ...], what: str, reason: str) -> NDArray[np.float64]:
-    """``value`` as finite float64 numbers of one of the shapes. Raises DatasetError with the given reason."""
+    """``value`` as float64 numbers of one of the shapes, finite and up to 1e9.
+
+    Raises DatasetError with the given reason.
+    """
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         numbers = np.zeros(0)
-    if numbers.shape not in shapes or not np.isfinite(numbers).all():
+    if numbers.shape not in shapes or not (np.abs(numbers) <= _LARGEST).all():  # NaN is not either
         wanted = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
-        raise DatasetError(f"{what} is not {wanted} finite numbers", reason=reason)
+        raise DatasetError(f"{what} is not {wanted} finite numbers, none beyond {_LARGEST:g}", reason=reason)
     return numbers
 
 

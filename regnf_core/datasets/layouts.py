@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 _REASON = "DATASET_LAYOUT_INVALID"
 _USUAL_UNITS_PER_METRE = 0.5
+_LONGEST_NAME = 200
 _USUAL_ORIGIN_M = (0.0, 0.0, 1.0)
 
 
@@ -76,6 +77,8 @@ def _furnishing(instance: Any, meshes: Path) -> Furnishing:
     if not isinstance(instance, dict) or not all(isinstance(instance.get(key), str) for key in ("id", "mesh")):
         raise DatasetError("an instance has no id or no mesh", reason=_REASON)
     name = instance["id"]
+    if not name.isprintable() or len(name) > _LONGEST_NAME:
+        raise DatasetError("an instance's id has control characters or is too long", reason=_REASON)
     mesh = meshes / Path(instance["mesh"]).name
     if "\0" in instance["mesh"] or not mesh.is_file():
         raise DatasetError(f"{name}: no such mesh: {mesh.name!r:.200}", reason="DATASET_MESH_MISSING")

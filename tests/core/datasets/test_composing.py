@@ -146,6 +146,8 @@ def test_refused_requests(tmp_path: Path) -> None:
         ({"walls": [{}]}, "DATASET_LAYOUT_INVALID"),
         ({"instances": []}, "DATASET_LAYOUT_INVALID"),
         ({"instances": [{"id": "a"}]}, "DATASET_LAYOUT_INVALID"),
+        ({"instances": [{"id": "a\n", "mesh": "chest.ply"}]}, "DATASET_LAYOUT_INVALID"),
+        ({"instances": [{"id": "a", "mesh": "\ud800"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "absent.glb"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "../../etc/passwd"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "a\0b"}]}, "DATASET_MESH_MISSING"),

@@ -152,13 +152,13 @@ def test_instances_as_other_files_tell_them(folder: Path) -> None:
         del metadata["worldtogt"]
         metadata["instances"] = {
             "c": {"box_corners": corners.tolist(), "worldtogt": np.diag([3.0, 3.0, 3.0, 1.0]).tolist()},
-            "7": {"name": "et", "box_min": [0, 0, 0], "box_max": [1, 2, 3]},
+            "7": {"name": "e\nt", "box_min": [0, 0, 0], "box_max": [1, 2, 3]},
             "t": {"box_corners": OrientedBox.from_corners([0, 0, 0], [1, 2, 3]).corners().tolist()},
         }
 
     change(folder, use)
     read = load_dataset(folder)
-    assert [instance.label for instance in read.instances] == ["c", "et", "t"]
+    assert [instance.label for instance in read.instances] == ["c", "e?t", "t"]
     for point in corners:  # the same box, whatever its axes are called
         assert (read.instances[0].box.corners() - point).norm(dim=1).min() < 1e-12
     for instance in read.instances[1:]:
@@ -210,6 +210,7 @@ CUBE_BUT_ONE = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1]
         (set_frame(camtoworld=MIRRORED), "DATASET_POSE_NOT_RIGID"),
         (set_frame(camtoworld=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "DATASET_POSE_NOT_RIGID"),
         (set_frame(camtoworld=[[float("nan")] * 4] * 4), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=np.diag([1e200, 1.0, 1.0, 1.0]).tolist()), "DATASET_POSE_NOT_RIGID"),
         (set_frame(camtoworld=None), "DATASET_METADATA_INVALID"),
         (set_frame(intrinsics=None), "DATASET_INTRINSICS_INVALID"),
         (set_frame(intrinsics=np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()), "DATASET_INTRINSICS_INVALID"),
@@ -218,6 +219,7 @@ CUBE_BUT_ONE = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1]
         (set_frame(rgb_path="."), "DATASET_IMAGE_MISSING"),
         (set_frame(rgb_path="x" * 5000), "DATASET_METADATA_INVALID"),
         (set_frame(rgb_path=7), "DATASET_METADATA_INVALID"),
+        (set_frame(rgb_path="\ud800"), "DATASET_METADATA_INVALID"),
         (set_frame(rgb_path="a\0b"), "DATASET_METADATA_INVALID"),
         (set_frame(rgb_path="../secret.png"), "DATASET_PATH_OUTSIDE"),
         (set_frame(rgb_path="/etc/hostname"), "DATASET_PATH_OUTSIDE"),
@@ -227,6 +229,7 @@ CUBE_BUT_ONE = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1]
         (set_frame(rgb_path="cut.png"), "DATASET_IMAGE_INVALID"),
         (set_frame(sensor_depth_path="000000_rgb.png"), "DATASET_DEPTH_UNIT_MISSING"),
         (set_frame(sensor_depth_path="pickle.npy"), "DATASET_IMAGE_INVALID"),
+        (set_frame(sensor_depth_path="header.npy"), "DATASET_IMAGE_INVALID"),
         (set_frame(sensor_depth_path="text.npy"), "DATASET_IMAGE_INVALID"),
         (set_frame(sensor_depth_path="flat.npy"), "DATASET_SIZES_DIFFER"),
         (set_frame(foreground_mask="large.png"), "DATASET_SIZES_DIFFER"),
@@ -239,6 +242,7 @@ def test_refused(mend: Change, reason: str, folder: Path) -> None:
     (folder / "link.png").symlink_to(folder.parent / "secret.png")
     (folder / "cut.png").write_bytes((folder / "000000_rgb.png").read_bytes()[:60])
     np.save(folder / "pickle.npy", np.array([{}]), allow_pickle=True)
+    (folder / "header.npy").write_bytes((folder / "000000_depth.npy").read_bytes().replace(b"(4, 6)", b"\xb74, 6)"))
     np.save(folder / "text.npy", np.full((4, 6), "x"))
     np.save(folder / "flat.npy", np.zeros(24))
     change(folder, mend)
