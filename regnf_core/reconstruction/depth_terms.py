@@ -23,8 +23,6 @@ from regnf_core.reconstruction.rays import PixelRays
 _FREE_POOL = 400_000
 _VOXEL = 0.008
 """Diagonals: measured points closer together than this are averaged before distances to them are taken."""
-_UNSEEN_NEARER = 0.3
-"""What it counts when a free point is nearer to matter than to any measured surface: one not seen may be nearer."""
 _MORE_MATTER = 0.3
 """The same behind a surface, when a point is less deep than the ray says: the part may be thin."""
 _PLACES_BEHIND = 0.25
@@ -87,8 +85,7 @@ def depth_terms(
     # where no plane could be laid, only the surface itself is believed
     weight = torch.where((rays.cosines[:, None] <= 0.0) & (offsets != 0.0), 0.0, weight)
     surface = (weight * error.abs()).mean() / data.size
-    error = beyond - data.clearances[free]
-    free_space = (torch.where(error > 0.0, 1.0, _UNSEEN_NEARER) * error.abs()).mean() / data.size
+    free_space = (beyond - data.clearances[free]).abs().mean() / data.size
     return surface, free_space, near.flatten(0, 1)
 
 

@@ -61,9 +61,9 @@ class ReconstructionOptions:
     """Rays an iteration for colour and opacity, where there is depth."""
     rays_without_depth: int = 384
     """The same where there is none: colour is all there is to learn from."""
-    band: float = 0.02
+    band: float = 0.012
     """How far before a measured surface the distance along the ray is believed."""
-    band_behind: float = 0.01
+    band_behind: float = 0.006
     """The same behind it: half of the thinnest part worth having."""
     weights: LossWeights = field(default_factory=LossWeights)
     table_rate: float = 1e-2
