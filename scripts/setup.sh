@@ -22,6 +22,9 @@ echo "Installing into .venv (the first time takes a few minutes) ..."
 # torch first and by its pinned version: an open range may resolve to a build with gigabytes of GPU libraries.
 "${pip[@]}" install -c constraints.txt torch
 "${pip[@]}" install -c constraints.txt -e '.[dev]'
+# The benchmark's peers weigh 2 MB, but not every machine has wheels of them: without them their tests are skipped.
+"${pip[@]}" install -c constraints.txt --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
+    echo "The benchmark's optional packages do not install here; tests of them will be skipped." >&2
 if ! .venv/bin/python -c 'import open3d' 2>.venv/open3d-error.txt; then
     echo "open3d does not load; a system library is missing:" >&2
     tail -n 1 .venv/open3d-error.txt >&2
