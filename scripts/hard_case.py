@@ -22,12 +22,12 @@ from benchmarks.robust.one_view_field import DepthImage, OneViewField, direction
 from regnf_core import OrientedBox, RegistrationResult, Sim3, open_field, register
 from regnf_core.cameras import Rays
 from regnf_core.diagnostics.preview import OBJECT_COLOUR, SCENE_COLOUR
-from regnf_core.diagnostics.splats import Surfels, render, view_from
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.metrics import errors_against_truth
 from regnf_core.nearest import gaps
+from regnf_core.pictures.splats import Surfels, render, view_from
 from regnf_core.tracing import clip_to_region, first_hits
 
 ROOT = Path(__file__).resolve().parents[1]

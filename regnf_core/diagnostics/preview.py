@@ -9,8 +9,8 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from regnf_core.cameras import axis_vector
-from regnf_core.diagnostics.splats import Floats, Surfels, View, render, view_from
 from regnf_core.nearest import gaps
+from regnf_core.pictures.splats import Floats, Surfels, View, render, view_from
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import INLIER_DISTANCE

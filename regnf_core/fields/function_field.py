@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Generic, Protocol, Self, TypeVar
 
 import torch
@@ -64,14 +65,27 @@ class FunctionField(Generic[F]):
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
         """Signed distance (N,) float32 at points (N, 3)."""
-        return torch.cat([self.function.value(part) for part in self._chunks(points)])
+        distance = self._empty(len(points))
+        for at, part in self._chunks(points):
+            distance[at] = self.function.value(part)
+        return distance
 
     @torch.no_grad()
     def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
-        parts = [self.function.value_and_gradient(part) for part in self._chunks(points)]
-        return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
+        distance, gradient = self._empty(len(points)), self._empty(len(points), 3)
+        for at, part in self._chunks(points):
+            distance[at], gradient[at] = self.function.value_and_gradient(part)
+        return distance, gradient
 
-    def _chunks(self, points: Tensor) -> tuple[Tensor, ...]:
+    def _empty(self, *shape: int) -> Tensor:
+        """For the results: a chunk's own may be a view that keeps all of the last layer's output."""
+        return torch.empty(shape, dtype=torch.float32, device=self.device)
+
+    def _chunks(self, points: Tensor) -> Iterator[tuple[slice, Tensor]]:
+        """Where each chunk lies, and its points."""
         size = self.chunk or (_CHUNK if self.device.type == "cpu" else _CHUNK_ACCELERATOR)
-        return torch.split(points.to(device=self.device, dtype=torch.float32), size)
+        points = points.to(device=self.device, dtype=torch.float32)
+        for start in range(0, len(points), size):
+            at = slice(start, start + size)
+            yield at, points[at]

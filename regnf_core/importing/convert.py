@@ -78,7 +78,7 @@ def convert_file(
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
     """A picture, if one can be made: it is no condition of the import."""
-    from regnf_core.diagnostics.field_picture import field_picture
+    from regnf_core.pictures.field_picture import field_picture
 
     with contextlib.suppress(RegnfError, MemoryError):
         field_picture(field, up_axis).save(path)

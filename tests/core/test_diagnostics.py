@@ -15,9 +15,9 @@ from PIL import Image
 
 from regnf_core.diagnostics import ranking_document, result_document, write_artifacts
 from regnf_core.diagnostics.preview import _up_axis, residual_colours
-from regnf_core.diagnostics.splats import Surfels, View, render
 from regnf_core.library import Candidate
 from regnf_core.options import RegistrationOptions
+from regnf_core.pictures.splats import Surfels, View, render
 from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.sim3 import Sim3
 from regnf_core.verdicts import VERDICT_REASONS

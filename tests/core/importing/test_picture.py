@@ -13,10 +13,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from regnf_core.diagnostics.field_picture import PANEL, field_picture
 from regnf_core.importing import gate
 from regnf_core.importing.gate import import_field
 from regnf_core.importing.picture import PICTURE_NAME, is_sound_picture
+from regnf_core.pictures.field_picture import PANEL, field_picture
 from tests.core.importing.archives import saved
 from tests.core.test_isosurface import Formula, ball
 

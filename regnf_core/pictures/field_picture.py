@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from PIL import Image
 
-from regnf_core.diagnostics.splats import Floats, Surfels, render, view_from
 from regnf_core.fields.base import SdfField
 from regnf_core.isosurface import Lattice, Surface, extract_surface
+from regnf_core.pictures.splats import Floats, Surfels, render, view_from
 
 PANEL = 320
 _RESOLUTION = 72
@@ -87,4 +87,6 @@ def _shades(distance: Floats, pixel: float) -> Floats:
 
 
 def _image(picture: Floats) -> Image.Image:
-    return Image.fromarray((255 * np.clip(picture, 0.0, 1.0)).round().astype(np.uint8))
+    levels = np.clip(picture, 0.0, 1.0)
+    levels *= 255.0  # in place: the import's memory has its peak here
+    return Image.fromarray(np.rint(levels, out=levels).astype(np.uint8))
