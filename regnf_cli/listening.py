@@ -8,6 +8,8 @@ import socket
 from regnf_cli.start_errors import StartError
 from service.settings import Settings, is_loopback
 from service.tokens import TokensError, read_callers
+from service.webhooks.signing import read_secrets
+from service.webhooks.targets import AllowList
 
 _BACKLOG = 2048
 
@@ -26,6 +28,8 @@ def open_socket(settings: Settings) -> socket.socket:
         )
     try:
         read_callers(settings.api_tokens, settings.api_tokens_file)
+        read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
+        AllowList(settings.webhook_hosts)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason) from error
     try:

@@ -36,6 +36,7 @@ from service.settings import Settings
 from service.shutdown import stopping_on_signals
 from service.tokens import read_callers
 from service.waiting import pause
+from service.webhooks.service import deliver_until_stopped, webhooks_of
 
 logger = logging.getLogger(__name__)
 _REAP_EVERY_S = 15.0
@@ -73,7 +74,7 @@ def create_app(
         queue = queue or RqJobQueue(redis)
         if limiter is None and settings.calls_per_s:
             limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
-    services = Services(settings, records, blobs or LocalBlobStore(settings.blob_dir), queue)
+    services = Services(settings, records, blobs or LocalBlobStore(settings.blob_dir), queue, webhooks_of(settings, redis))
     app = FastAPI(
         title="regnf",
         version=__version__,
@@ -114,9 +115,12 @@ def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI],
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.openapi()  # takes a while, so not while somebody waits for an answer
         reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
+        delivering = asyncio.create_task(deliver_until_stopped(services, redis)) if redis is not None else None
         with stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
+        if delivering is not None:
+            await delivering
         if reaping is not None:
             await reaping
         if redis is not None:

@@ -24,8 +24,11 @@ def canonical_request(
 
     The order of candidates says nothing, so they are sorted.
     """
-    start, truth = question.initial_transform, question.ground_truth
-    return {
+    start, truth, hook = question.initial_transform, question.ground_truth, question.webhook
+    told = (
+        {} if hook is None else {"webhook": {"url": hook.url}}
+    )  # none leaves a request as it was before there were any
+    return told | {
         "scene": scene,
         "object": object_,
         "candidates": None if candidates is None else sorted(candidates),

@@ -19,6 +19,7 @@ from service.queue import JobQueue
 from service.records import Quota, RecordStore
 from service.settings import Settings
 from service.uploads import Upload, open_upload
+from service.webhooks.policy import Webhooks
 
 _UPLOAD_THREADS = 4
 _Result = TypeVar("_Result")
@@ -32,6 +33,7 @@ class Services:
     records: RecordStore
     blobs: BlobStore
     queue: JobQueue
+    webhooks: Webhooks = field(default_factory=Webhooks)
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     # threads of their own: uploads to a slow disk must not keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))

@@ -103,6 +103,10 @@ REASONS: dict[str, Reason] = {
     "DETECTION_OUTSIDE_SCENE": Reason(
         422, "Detection outside the scene", "The box and the scene's bounds do not overlap. Check frame and unit."
     ),
+    "INVALID_WEBHOOK": Reason(422, "Invalid webhook", 'Send `{"url": ...}`, a URL of 8 to 2000 characters.'),
+    "WEBHOOK_NOT_ALLOWED": Reason(
+        422, "Webhook not allowed", "Its host is none that the service allows, or the service has no secret of yours."
+    ),
     "QUEUE_FULL": Reason(503, "Queue full", "As many jobs are active as the service takes. Retry after `Retry-After`."),
     "QUOTA_ACTIVE_JOBS": Reason(429, "Quota of jobs used up", "As many of your jobs are active as may be."),
     # jobs

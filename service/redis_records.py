@@ -22,6 +22,7 @@ from service.ownership import ANONYMOUS
 from service.records import ACTIVE, NO_QUOTA, JobEvent, JobRecord, QueueFullError, Quota, QuotaError, StaleAttemptError
 from service.redis_documents import PREFIX, Cap, Command, text
 from service.redis_fields import RedisFieldRecords
+from service.webhooks import outbox
 
 _CREATED = f"{PREFIX}jobs:created"
 _ACTIVE = f"{PREFIX}jobs:active"
@@ -97,8 +98,10 @@ class RedisRecordStore(RedisFieldRecords):
             gone = str(int((expires + self._retention_s) * 1000))
             commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
             commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
+            commands += outbox.entering(after, expires)
         else:
             commands += [("PERSIST", each) for each in (key, events)]
+            commands += outbox.forgetting(before) if before is not None else []
             commands += [("ZREM", _EXPIRING, after.id), ("DEL", _gone_key(after.id))]
         return commands
 
@@ -183,7 +186,9 @@ class RedisRecordStore(RedisFieldRecords):
             commands: list[Command] = [("DEL", _key(job_id), _events_key(job_id), _gone_key(job_id))]
             indexes = [_CREATED, _WAITING, _EXPIRING]
             if document is not None:
-                indexes.append(_created_keys(JobRecord(**document))[1])
+                known = JobRecord(**document)
+                indexes.append(_created_keys(known)[1])
+                commands += outbox.forgetting(known)
             commands += [("ZREM", index, job_id) for index in indexes]
             if self._compare_and_set(_key(job_id), version, commands) == "OK":
                 return document is not None

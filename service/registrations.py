@@ -26,8 +26,10 @@ def check_fields(services: Services, caller: str, request: dict[str, Any], named
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
-    Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE.
+    Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
     """
+
+    services.webhooks.check(caller, request)
 
     def field(sha256: str) -> FieldRecord | None:
         return services.records.get_field(reference_of(caller, sha256))

@@ -19,7 +19,7 @@ def _default_state_dir() -> Path:
     return (Path(base) if base else Path.home() / ".local" / "state") / "regnf"
 
 
-SECRETS = frozenset({"REGNF_API_TOKENS"})
+SECRETS = frozenset({"REGNF_API_TOKENS", "REGNF_WEBHOOK_SECRETS"})
 """Variables that only the API's process needs to see."""
 
 
@@ -70,6 +70,12 @@ class Settings(BaseSettings):
     quota_fields: int | None = Field(default=None, ge=1)
     quota_stored_bytes: int | None = Field(default=None, ge=1)
     """Of each caller's uploads; what the service makes of them is not counted."""
+    webhook_hosts: frozenset[str] = frozenset()
+    """JSON list of the hosts that messages about jobs may go to: `host`, `host:port`, `http://host:port`."""
+    webhook_secrets: frozenset[str] = Field(default=frozenset(), repr=False)
+    """JSON list of `caller:whsec_<base64>`."""
+    webhook_secrets_file: Path | None = None
+    """More of them, one a line."""
     job_timeout_s: int = Field(default=900, ge=1)
     import_timeout_s: int = Field(default=120, ge=1)
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import APIRouter, Header, Query
 from starlette.responses import JSONResponse, Response, StreamingResponse
@@ -26,6 +27,7 @@ from service.records import ACTIVE, JobRecord
 from service.routes.documentation import header, refusals
 from service.schemas.jobs import JobDocument, JobPage, Status, job_document
 from service.waiting import wait_for
+from service.webhooks.outbox import Delivery
 
 router = APIRouter(tags=["jobs"])
 _RETRY_AFTER_S = "1"
@@ -33,25 +35,37 @@ _RETRY_AFTER_S = "1"
 
 async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
     """The job's document, with the headers that tell a poller when to come back."""
-    position = await off_loop(_position, services, record)
-    return _answer(services, record, position, prefix, status)
+    return _answer(services, await off_loop(_seen, services, record), prefix, status)
 
 
-def _position(services: Services, record: JobRecord) -> int | None:
-    return services.records.queue_position(record.id) if record.status == "accepted" else None
+class _Seen(NamedTuple):
+    """A job with what its document shows beside the record."""
+
+    record: JobRecord
+    position: int | None
+    delivery: Delivery | None
 
 
-def _answer(services: Services, record: JobRecord, position: int | None, prefix: str, status: int) -> JSONResponse:
-    headers = {"ETag": _etag(record, position), "Cache-Control": "no-cache"}
+def _seen(services: Services, record: JobRecord) -> _Seen:
+    position = services.records.queue_position(record.id) if record.status == "accepted" else None
+    return _Seen(record, position, services.webhooks.delivery(record))
+
+
+def _answer(services: Services, seen: _Seen, prefix: str, status: int) -> JSONResponse:
+    record, position, delivery = seen
+    headers = {"ETag": _etag(seen), "Cache-Control": "no-cache"}
     if record.status in ACTIVE:
         headers["Retry-After"] = _RETRY_AFTER_S
-    document = job_document(record, position, services.settings.retention_s, prefix)
+    document = job_document(record, position, services.settings.retention_s, prefix, delivery)
     return JSONResponse(document, status_code=status, headers=headers)
 
 
-def _etag(record: JobRecord, position: int | None) -> str:
+def _etag(seen: _Seen) -> str:
     # by what the document shows, not by the version: heartbeats change that every few seconds
-    shown = (record.attempt, record.status, record.phase, record.progress, record.updated, position)
+    record, position, delivery = seen
+    shown: list[Any] = [record.attempt, record.status, record.phase, record.progress, record.updated, position]
+    if delivery is not None:
+        shown.append(asdict(delivery))
     return f'"{digest(shown)[:24]}"'
 
 
@@ -97,15 +111,14 @@ async def get_job(
 ) -> Response:
     """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
 
-    def look() -> tuple[JobRecord, int | None]:
-        record = find_job(services, id, caller)
-        return record, _position(services, record)
+    def look() -> _Seen:
+        return _seen(services, find_job(services, id, caller))
 
-    def is_news(seen: tuple[JobRecord, int | None]) -> bool:
-        return seen[0].status not in ACTIVE or (if_none_match is not None and _etag(*seen) != if_none_match)
+    def is_news(seen: _Seen) -> bool:
+        return seen.record.status not in ACTIVE or (if_none_match is not None and _etag(seen) != if_none_match)
 
-    record, position = await wait_for(look, is_news, wait, services.stopping)
-    response = _answer(services, record, position, prefix, 200)
+    seen = await wait_for(look, is_news, wait, services.stopping)
+    response = _answer(services, seen, prefix, 200)
     if if_none_match is not None and response.headers["ETag"] == if_none_match:
         return Response(status_code=304, headers={"ETag": if_none_match})
     return response

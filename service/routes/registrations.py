@@ -77,6 +77,8 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INITIAL_TRANSFORM_UNSUPPORTED",
             "LIBRARY_SEARCH_UNSUPPORTED",
             "FIELD_REJECTED",
+            "INVALID_WEBHOOK",
+            "WEBHOOK_NOT_ALLOWED",
             "DETECTION_OUTSIDE_SCENE",
             "IDEMPOTENCY_KEY_REUSED",
             "QUEUE_FULL",

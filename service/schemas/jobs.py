@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any, Literal
 
 from pydantic import Field
 
 from service.records import ACTIVE, JobRecord
 from service.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem, rfc3339
+from service.webhooks.outbox import Delivery
 
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+
+
+class WebhookDocument(Outgoing):
+    """How the message about the job's end fares."""
+
+    url: str
+    state: Literal["waiting", "pending", "delivered", "failed"] | None = Field(
+        None, description="Waiting for the job's end; to be sent, again perhaps; received; given up. Null in lists."
+    )
+    sends: int = 0
+    last_status: int | None = Field(None, description="What the receiver answered last.")
+    last_error: str | None = Field(None, description="A word for why there was no answer.")
+    next_at: str | None = None
+    delivered_at: str | None = None
 
 
 class JobDocument(Outgoing):
@@ -36,6 +52,7 @@ class JobDocument(Outgoing):
     )
     engine: dict[str, Any] = Field({}, description="Version and device.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
+    webhook: WebhookDocument | None = None
     links: Links
 
 
@@ -46,7 +63,9 @@ class JobPage(Outgoing):
     next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
 
 
-def job_document(record: JobRecord, queue_position: int | None, retention_s: float, prefix: str) -> dict[str, Any]:
+def job_document(
+    record: JobRecord, queue_position: int | None, retention_s: float, prefix: str, delivery: Delivery | None = None
+) -> dict[str, Any]:
     """The job as it travels; ``prefix`` is what the API's paths begin with."""
     return {
         "id": record.id,
@@ -65,8 +84,19 @@ def job_document(record: JobRecord, queue_position: int | None, retention_s: flo
         "inputs": record.inputs,
         "engine": record.engine,
         "error": outgoing_problem(record.error),
+        "webhook": _webhook(record, delivery),
         "links": _links(record, f"{prefix}/jobs/{record.id}"),
     }
+
+
+def _webhook(record: JobRecord, delivery: Delivery | None) -> dict[str, Any] | None:
+    if "webhook" not in record.request:
+        return None
+    document: dict[str, Any] = {"url": record.request["webhook"]["url"], "state": None}
+    if delivery is not None:
+        times = {"next_at": rfc3339(delivery.next_at), "delivered_at": rfc3339(delivery.delivered_at)}
+        document |= asdict(delivery) | times
+    return document
 
 
 def _links(record: JobRecord, address: str) -> Links:

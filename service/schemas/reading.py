@@ -17,6 +17,7 @@ _REASONS = {
     "options": "INVALID_OPTIONS",
     "initial_transform": "INVALID_TRANSFORM",
     "ground_truth": "INVALID_TRANSFORM",
+    "webhook": "INVALID_WEBHOOK",
 }
 _REASONS_OF_FAULTS = {
     START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED",

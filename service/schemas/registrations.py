@@ -9,6 +9,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    StringConstraints,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -61,6 +62,12 @@ class GroundTruth(Incoming):
     T_object_scene: Similarity
 
 
+class Webhook(Incoming):
+    """Where to send a signed message once the job has ended."""
+
+    url: Annotated[str, StringConstraints(min_length=8, max_length=2000)]
+
+
 class Question(Incoming):
     """What a registration asks, apart from the fields: the part `request` of a one-shot upload."""
 
@@ -73,6 +80,9 @@ class Question(Incoming):
         "For the preset `robust`.",
     )
     ground_truth: GroundTruth | None = None
+    webhook: Webhook | None = Field(
+        None, description="Told of the job's end. Only hosts that the service allows; another webhook is another job."
+    )
 
     @field_validator("initial_transform")
     @classmethod

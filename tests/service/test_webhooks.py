@@ -1,0 +1,311 @@
+"""Webhooks: where they may go, how they are signed, and that each arrives, with a real receiver and a real Redis."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+from redis import Redis
+
+from service.ownership import reference_of
+from service.records import JobRecord
+from service.redis_client import connect
+from service.redis_records import RedisRecordStore
+from service.tokens import TokensError
+from service.webhooks.deliverer import Deliverer
+from service.webhooks.outbox import RedisOutbox
+from service.webhooks.sender import HttpSender
+from service.webhooks.signing import read_secrets, signed_headers
+from service.webhooks.targets import AllowList, is_public
+from tests.redis_server import private_redis
+
+KEY = bytes(range(24))
+SECRET = f"whsec_{base64.b64encode(KEY).decode()}"
+
+
+def hmac_by_hand(key: bytes, message: bytes) -> bytes:
+    """HMAC-SHA256 from its definition (RFC 2104), for keys of at most 64 bytes."""
+    padded = key.ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(byte ^ 0x36 for byte in padded) + message).digest()
+    return hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
+
+
+class Receiver:
+    """Answers with the statuses it is given, the last one for ever; keeps what it was sent."""
+
+    def __init__(self) -> None:
+        self.statuses = [200]
+        self.location = ""
+        self.received: list[tuple[str, dict[str, str], bytes]] = []
+        self.address = ""
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            made.received.append((self.path, {name.lower(): value for name, value in self.headers.items()}, body))
+            self.send_response(made.statuses.pop(0) if len(made.statuses) > 1 else made.statuses[0])
+            if made.location:
+                self.send_header("Location", made.location)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        made.address = f"http://127.0.0.1:{server.server_port}"
+        yield made
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def redis_url() -> Iterator[str]:
+    with private_redis() as url:
+        yield url
+
+
+@pytest.fixture
+def redis(redis_url: str) -> Iterator[Redis]:
+    with connect(redis_url) as made:
+        made.flushall()
+        yield made
+
+
+def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> Deliverer:
+    hosts = AllowList(allowed)
+    secrets = read_secrets([f"alice:{SECRET}"], None)
+    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    return Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s)
+
+
+def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1") -> JobRecord:
+    """A job of alice's with a webhook, ended."""
+    store = RedisRecordStore(redis)
+    request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
+    now = store.now()
+    record, _ = store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)
+    error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "text"} if status == "failed" else None
+    store.update_job(name, record.attempt, status="running")
+    return store.update_job(name, record.attempt, status=status, error=error)
+
+
+# signatures
+
+
+def test_the_signature_is_that_of_the_specification() -> None:
+    body = b'{"event_type":"ping","data":{"success":true}}'
+    headers = signed_headers([KEY, b"k" * 64], "msg_1", 1731705121, body)
+    expected = [hmac_by_hand(key, b"msg_1.1731705121." + body) for key in (KEY, b"k" * 64)]
+    assert [base64.b64decode(one.removeprefix("v1,")) for one in headers["webhook-signature"].split(" ")] == expected
+    assert (headers["webhook-id"], headers["webhook-timestamp"]) == ("msg_1", "1731705121")
+
+
+NO_SECRETS = ["", SECRET, "alice:", "alice:whsec_", "alice:whsec_AAAA", f"Alice:{SECRET}", f"alice:{SECRET}!",
+              "alice:whsec_" + "A" * 92, "alice:" + SECRET[6:]]  # fmt: skip
+
+
+@pytest.mark.parametrize("entry", NO_SECRETS)
+def test_secrets_that_are_none_are_refused_without_repeating_them(entry: str) -> None:
+    with pytest.raises(TokensError) as refused:
+        read_secrets([entry], None)
+    assert SECRET[6:] not in str(refused.value)
+
+
+# where to
+
+
+@pytest.mark.parametrize(
+    ("url", "allowed"),
+    [
+        ("https://hooks.example.org/a?b=c", True),
+        ("https://HOOKS.example.org.:443/", True),
+        ("http://hooks.example.org/", False),
+        ("https://hooks.example.org:8443/", False),
+        ("https://evil.example.org/", False),
+        ("https://hooks.example.org.evil.org/", False),
+        ("https://hooks.example.org@evil.org/", False),
+        ("https://user@hooks.example.org/", False),
+        ("https://hooks.example.org/#part", False),
+        ("https://evil.org\\@hooks.example.org/", False),
+        ("https://hooks.example.org/\r\nX: y", False),
+        ("https://hooks.example.org:99999/", False),
+        ("https://hooks.example.org/" + "a" * 2000, False),
+        ("ftp://hooks.example.org/", False),
+        ("//hooks.example.org/", False),
+        ("http://127.0.0.1:9000/x", True),
+        ("http://127.1:9000/x", False),
+        ("http://[::ffff:127.0.0.1]:9000/x", True),
+        ("https://127.0.0.1:9000/x", False),
+        ("https://[::1", False),
+    ],
+)
+def test_only_hosts_on_the_list(url: str, allowed: bool) -> None:
+    assert AllowList(["hooks.example.org", "http://127.0.0.1:9000"]).allows(url) is allowed
+
+
+@pytest.mark.parametrize("entry", ["", "a b", "ftp://x", "https://x/path", "user@x", "x:notaport"])
+def test_entries_that_are_no_hosts(entry: str) -> None:
+    with pytest.raises(TokensError):
+        AllowList([entry])
+
+
+PRIVATE = ["127.0.0.1", "10.1.2.3", "172.16.0.1", "192.168.0.1", "169.254.169.254", "0.0.0.0", "100.64.0.1",
+           "224.0.0.1", "255.255.255.255", "::1", "::", "fe80::1%eth0", "fc00::1", "::ffff:10.0.0.1", "64:ff9b::a00:1",
+           "2002:a00:1::1", "ff02::1"]  # fmt: skip
+
+
+@pytest.mark.parametrize("address", PRIVATE)
+def test_addresses_that_are_not_public(address: str) -> None:
+    assert not is_public(address)
+    assert is_public("93.184.215.14")
+    assert is_public("2606:2800:21f:cb07:6820:80da:af6b:8b2c")
+
+
+def test_a_name_that_resolves_to_a_private_address_is_not_followed(redis: Redis, receiver: Receiver) -> None:
+    named = receiver.address.replace("127.0.0.1", "localhost")
+    finish(redis, f"{named}/x")
+    assert deliverer(redis, [named]).run_once()
+    assert (receiver.received, RedisOutbox(redis).delivery("j1").last_error) == ([], "ADDRESS_NOT_ALLOWED")
+    # the list names the address itself, though with another port: then it is followed there
+    assert deliverer(redis, [named, "127.0.0.1", "[::1]"]).run_once()
+    assert RedisOutbox(redis).delivery("j1").state == "delivered"
+
+
+# what arrives
+
+
+@pytest.mark.parametrize("status", ["successful", "failed", "dismissed"])
+def test_a_message_arrives_signed(redis: Redis, receiver: Receiver, status: str) -> None:
+    record = finish(redis, f"{receiver.address}/hook?x=1", status)
+    sent = deliverer(redis, [receiver.address])
+    assert (sent.run_once(), sent.run_once()) == (True, False)
+    (path, headers, body) = receiver.received[0]
+    assert (path, headers["content-type"], len(receiver.received)) == ("/hook?x=1", "application/json", 1)
+    signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
+    assert headers["webhook-signature"] == "v1," + base64.b64encode(hmac_by_hand(KEY, signed)).decode()
+    assert abs(int(headers["webhook-timestamp"]) - RedisRecordStore(redis).now()) < 60
+    assert "." not in headers["webhook-id"]
+    message = json.loads(body)
+    assert message["type"] == f"job.{status}"
+    assert message["data"]["reason"] == ("NO_SURFACE_IN_DETECTION" if status == "failed" else None)
+    assert (message["data"]["id"], message["data"]["attempt"]) == (record.id, 1)
+    found = RedisOutbox(redis).delivery("j1")
+    assert (found.state, found.sends, found.last_status) == ("delivered", 1, 200)
+    assert found.delivered_at is not None
+    assert 0 < redis.ttl("regnf:webhook:j1") <= 7 * 24 * 3600  # type: ignore[operator]
+
+
+def test_sends_are_repeated_with_the_same_id_and_body(redis: Redis, receiver: Receiver) -> None:
+    receiver.statuses = [500, 429, 204]
+    finish(redis, receiver.address)
+    sent = deliverer(redis, [receiver.address])
+    assert [sent.run_once() for _ in range(4)] == [True, True, True, False]
+    assert len({(headers["webhook-id"], body) for _, headers, body in receiver.received}) == 1
+    found = RedisOutbox(redis).delivery("j1")
+    assert (found.state, found.sends, found.last_status) == ("delivered", 3, 204)
+
+
+def test_pauses_grow_and_end(redis: Redis, receiver: Receiver) -> None:
+    receiver.statuses = [500]
+    finish(redis, receiver.address)
+    sent, outbox = deliverer(redis, [receiver.address], (60.0, 3600.0)), RedisOutbox(redis)
+    for sends, pause in ((1, 60), (2, 3600)):
+        now = RedisRecordStore(redis).now()
+        assert sent.run_once()
+        found = outbox.delivery("j1")
+        assert (found.state, found.sends, found.next_at is not None) == ("pending", sends, True)
+        assert found.next_at == pytest.approx(now + pause, abs=20)
+        assert not sent.run_once(), "not before its time"
+        redis.zadd("regnf:webhooks:due", {"j1-1": 0})
+    assert sent.run_once()
+    found = outbox.delivery("j1")
+    assert (found.state, found.sends, found.next_at, outbox.waiting()) == ("failed", 3, None, 0)
+
+
+@pytest.mark.parametrize(("status", "state"), [(410, "failed"), (302, "pending"), (404, "pending"), (307, "pending")])
+def test_redirects_are_not_followed_and_gone_is_gone(redis: Redis, receiver: Receiver, status: int, state: str) -> None:
+    receiver.statuses, receiver.location = [status, 200], f"{receiver.address}/elsewhere"
+    finish(redis, f"{receiver.address}/here")
+    deliverer(redis, [receiver.address], (60.0,)).run_once()
+    assert [path for path, _, _ in receiver.received] == ["/here"]
+    found = RedisOutbox(redis).delivery("j1")
+    assert (found.state, found.last_status) == (state, status)
+
+
+def test_a_receiver_that_is_not_there(redis: Redis, receiver: Receiver) -> None:
+    finish(redis, "http://127.0.0.1:1/x")
+    deliverer(redis, ["http://127.0.0.1:1"], (60.0,)).run_once()
+    assert RedisOutbox(redis).delivery("j1").last_error == "CONNECTION_FAILED"
+
+
+def test_a_host_that_was_struck_off_the_list_is_told_nothing(redis: Redis, receiver: Receiver) -> None:
+    finish(redis, receiver.address)
+    deliverer(redis, ["hooks.example.org"], (60.0,)).run_once()
+    assert (receiver.received, RedisOutbox(redis).delivery("j1").last_error) == ([], "WEBHOOK_NOT_ALLOWED")
+
+
+# that none is lost
+
+
+def test_a_message_outlives_who_took_it(redis: Redis, receiver: Receiver) -> None:
+    """A process that dies after it took a message: another sends it once a minute is over, not before."""
+    finish(redis, receiver.address)
+    assert RedisOutbox(redis).claim() == "j1-1"
+    assert not deliverer(redis, [receiver.address]).run_once()
+    score = float(redis.zscore("regnf:webhooks:due", "j1-1"))  # type: ignore[arg-type]
+    assert score == pytest.approx(RedisRecordStore(redis).now() + 60, abs=20)
+    redis.zadd("regnf:webhooks:due", {"j1-1": 0})
+    assert deliverer(redis, [receiver.address]).run_once()
+    assert len(receiver.received) == 1
+
+
+def test_many_deliverers_send_each_message_once(redis: Redis, redis_url: str, receiver: Receiver) -> None:
+    for number in range(12):
+        finish(redis, receiver.address, name=f"job{number}")
+
+    @contextmanager
+    def one() -> Iterator[Deliverer]:
+        with connect(redis_url) as own:
+            yield deliverer(own, [receiver.address])
+
+    def work() -> None:
+        with one() as mine:
+            while mine.run_once():
+                pass
+
+    threads = [threading.Thread(target=work) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len({headers["webhook-id"] for _, headers, _ in receiver.received}) == len(receiver.received) == 12
+
+
+def test_a_job_that_is_deleted_or_started_anew_takes_its_message_along(redis: Redis, receiver: Receiver) -> None:
+    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    finish(redis, receiver.address, "failed")
+    record = store.get_job("j1")
+    assert record is not None
+    again, _ = store.create_job(record, 10)
+    assert (again.attempt, outbox.waiting(), outbox.delivery("j1").state) == (2, 0, "waiting")
+    store.update_job("j1", 2, status="dismissed")
+    assert (outbox.waiting(), outbox.delivery("j1").state) == (1, "pending")
+    store.delete_job("j1")
+    assert (outbox.waiting(), redis.exists("regnf:webhook:j1")) == (0, 0)
+    redis.zadd("regnf:webhooks:due", {"gone-1": 0})
+    assert deliverer(redis, [receiver.address]).run_once()
+    assert (receiver.received, outbox.waiting()) == ([], 0)
