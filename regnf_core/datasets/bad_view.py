@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.datasets.mesh_scene import MeshScene
+from regnf_core.datasets.mesh_scene import MeshScene, Thing
 from regnf_core.datasets.rendering import Size
 from regnf_core.datasets.trajectories import CLEARANCE_M, framing_distance, look_at
 from regnf_core.errors import DatasetError
@@ -23,7 +23,7 @@ _LEAST_SHOWN = 0.8
 _LEAST_SEEN = 0.02
 
 
-def bad_view(scene: MeshScene, thing: int, size: Size, intrinsics: Array, floor: float) -> Array:
+def bad_view(scene: MeshScene, thing: Thing, size: Size, intrinsics: Array, floor: float) -> Array:
     """(4, 4): of all views that show the thing, the one that sees the least of its surface.
 
     Candidates stand in free space at 16 azimuths, 35 cm and 1.3 m above the floor, where the thing just fills the
@@ -31,10 +31,10 @@ def bad_view(scene: MeshScene, thing: int, size: Size, intrinsics: Array, floor:
     of what it would show of it alone. So the camera ends up behind a back or low at a side, the first of equals.
     Raises DatasetError (DATASET_NO_VIEW).
     """
-    solid = scene.things[thing].solid
+    solid = thing.solid
     assert isinstance(solid, SurfaceSource)
     samples = solid.sample_surface(_SAMPLES, np.random.default_rng(0))
-    alone = MeshScene([scene.things[thing]])
+    alone = MeshScene([thing])
     bounds = solid.bounds.numpy()
     for nearer in _NEARER:
         best, least = None, np.inf
@@ -46,7 +46,7 @@ def bad_view(scene: MeshScene, thing: int, size: Size, intrinsics: Array, floor:
                 best, least = pose, seen
         if best is not None:
             return best
-    raise DatasetError(f"{scene.things[thing].name} is hidden from everywhere", reason="DATASET_NO_VIEW")
+    raise DatasetError(f"{thing.name} is hidden from everywhere", reason="DATASET_NO_VIEW")
 
 
 def seen_points(scene: MeshScene, pose: Array, size: Size, intrinsics: Array, points: Array) -> NDArray[np.bool_]:

@@ -78,31 +78,23 @@ def render_room(
     FieldFormatError (MESH_INVALID) and OSError.
     """
     count = options.count("room")
+    units = layout.units_per_metre if units_per_metre is None else units_per_metre
+    T_world_metric = scale_and_shift(units, layout.origin_m)
     scene = room_scene(layout)
-    names = [thing.name for thing in scene.things]
-    wanted = layout.furnishings
-    bounds = scene.bounds
+    pieces = list(zip(layout.furnishings, scene.things[-len(layout.furnishings) :], strict=True))
     if options.trajectory == "single":
-        wanted = tuple(piece for piece in layout.furnishings if piece.name == instance)
-        if not wanted:
+        pieces = [pair for pair in pieces if pair[0].name == instance][:1]
+        if not pieces:
             raise DatasetError(f"{layout.name} has no instance {instance!r}", reason="DATASET_NO_INSTANCE")
-        shown = names.index(instance)
-        poses = bad_view(scene, shown, options.size, options.intrinsics, float(layout.floor[1, 2]))[None]
-        around = scene.things[shown].solid.bounds.numpy() + np.array([[-_SINGLE_MARGIN_M], [_SINGLE_MARGIN_M]])
-        bounds = np.stack((np.maximum(around[0], bounds[0]), np.minimum(around[1], bounds[1])))
+        poses, bounds = _single_view(layout, scene, pieces[0][1], options)
     else:
-        ground = WalkingGround(scene, layout.floor)
-        boxes = [scene.things[names.index(piece.name)].solid.bounds.numpy() for piece in layout.furnishings]
         walk = long_walk if options.trajectory == "long" else short_walk
-        poses = walk(ground, boxes, count)
-    T_world_metric = scale_and_shift(units_per_metre or layout.units_per_metre, layout.origin_m)
+        boxes = [thing.solid.bounds.numpy() for _, thing in pieces]
+        poses, bounds = walk(WalkingGround(scene, layout.floor), boxes, count), scene.bounds
     images = _taken(scene, poses, bounds, T_world_metric, options, progress)
-    units = object_units_per_metre or {}
-    instances = tuple(
-        _instance(piece.name, scene.things[names.index(piece.name)], piece, T_world_metric, units.get(piece.name, 1.0))
-        for piece in wanted
-    )
-    return replace(images, instances=instances, masks=None)
+    of_object = object_units_per_metre or {}
+    instances = [_instance(thing, piece, T_world_metric, of_object.get(piece.name, 1.0)) for piece, thing in pieces]
+    return replace(images, instances=tuple(instances), masks=None)
 
 
 def render_object(
@@ -125,7 +117,7 @@ def render_object(
     if not (bounds[1] > bounds[0]).any():
         raise DatasetError("the mesh is a single point", reason="DATASET_NO_VIEW")
     if options.trajectory == "single":
-        poses = bad_view(scene, 0, options.size, options.intrinsics, floor)[None]
+        poses = bad_view(scene, thing, options.size, options.intrinsics, floor)[None]
     else:
         circle = orbit if options.trajectory == "long" else pass_by
         poses = circle(bounds, count, half_view(options.size, options.intrinsics), floor)
@@ -133,7 +125,7 @@ def render_object(
     T_world_metric = scale_and_shift(units_per_metre, bounds.mean(axis=0))
     images = _taken(scene, poses, bounds + np.array([[-margin], [margin]]), T_world_metric, options, progress)
     whole = Furnishing(name, Path(mesh), np.eye(4), None)
-    return replace(images, instances=(_instance(name, thing, whole, T_world_metric, units_per_metre),))
+    return replace(images, instances=(_instance(thing, whole, T_world_metric, units_per_metre),))
 
 
 def room_scene(layout: Layout) -> MeshScene:
@@ -151,6 +143,15 @@ def scale_and_shift(units_per_metre: float, origin_m: tuple[float, float, float]
     matrix = np.diag([units_per_metre] * 3 + [1.0])
     matrix[:3, 3] = -units_per_metre * np.asarray(origin_m)
     return matrix
+
+
+def _single_view(layout: Layout, scene: MeshScene, thing: Thing, options: RenderOptions) -> tuple[Array, Array]:
+    """The pose (1, 4, 4), metric, and the bounds (2, 3): the thing's with a margin, within the scene's."""
+    floor = float(layout.floor[1, 2])
+    pose = bad_view(scene, thing, options.size, options.intrinsics, floor)
+    lower, upper = thing.solid.bounds.numpy()
+    low, high = scene.bounds
+    return pose[None], np.stack((np.maximum(lower - _SINGLE_MARGIN_M, low), np.minimum(upper + _SINGLE_MARGIN_M, high)))
 
 
 def _taken(
@@ -188,15 +189,15 @@ def _taken(
     )
 
 
-def _instance(name: str, thing: Thing, piece: Furnishing, T_world_metric: Array, object_units: float) -> Instance:
+def _instance(thing: Thing, piece: Furnishing, T_world_metric: Array, object_units: float) -> Instance:
     """The stated bounds if there are any: detections elsewhere are made of them."""
     metric = thing.solid.bounds.numpy() if piece.bounds is None else piece.bounds
     lower, upper = metric @ T_world_metric[:3, :3].T + T_world_metric[:3, 3]
     mesh_bounds = load_thing(piece.mesh).solid.bounds.numpy()
     T_world_mesh = T_world_metric @ piece.T_room_mesh
     return Instance(
-        name,
-        OrientedBox.from_corners(lower.tolist(), upper.tolist(), name),
+        piece.name,
+        OrientedBox.from_corners(lower.tolist(), upper.tolist(), piece.name),
         T_object_world=scale_and_shift(object_units, mesh_bounds.mean(axis=0)) @ np.linalg.inv(T_world_mesh),
         world_pose=T_world_mesh,
         gt_pose=piece.T_room_mesh,

@@ -84,6 +84,16 @@ def test_single_views_are_about_one_instance(tmp_path: Path) -> None:
     assert int(chest.box.contains(points_of(images), margin=0.01).sum()) > 100
 
 
+def test_two_pieces_of_one_name_keep_their_places(tmp_path: Path) -> None:
+    path = write_room(tmp_path)
+    path.write_text(path.read_text().replace('"id": "b"', '"id": "a"'))
+    images = render_room(read_layout(path, tmp_path), RenderOptions("short", frames=1, **SMALL), instance="a")
+    assert len(images) == 1
+    first, second = (instance.box.centre.numpy() for instance in images.instances)
+    np.testing.assert_allclose(first[:2], [-0.4, -0.35], atol=1e-6)
+    np.testing.assert_allclose(second[:2], [0.45, 0.3], atol=1e-6)
+
+
 def test_noise_is_told_in_metres_and_decided_by_the_seed(tmp_path: Path) -> None:
     write_chest(tmp_path / "chest.ply")
 
@@ -131,6 +141,7 @@ def test_refused_requests(tmp_path: Path) -> None:
         (RenderOptions("single", frames=2, **SMALL), {"instance": "a"}, "DATASET_FRAMES_INVALID"),
         (RenderOptions("long", frames=0, **SMALL), {}, "DATASET_FRAMES_INVALID"),
         (RenderOptions("short", frames=1, **SMALL), {"units_per_metre": -1.0}, "DATASET_SCALE_INVALID"),
+        (RenderOptions("short", frames=1, **SMALL), {"units_per_metre": 0.0}, "DATASET_SCALE_INVALID"),
     ):
         with pytest.raises(DatasetError) as refused:
             render_room(layout, options, **given)  # type: ignore[arg-type]

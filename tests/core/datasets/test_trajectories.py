@@ -115,9 +115,9 @@ def test_orbits_have_four_heights_and_go_all_round() -> None:
 
 
 def test_a_bad_view_is_free_shows_the_thing_and_sees_less_of_it_than_others() -> None:
-    pose = bad_view(furnished(), 2, SIZE, INTRINSICS, 0.0)
-    assert furnished().signed_distance(pose[None, :3, 3]).min() >= 0.15
     thing = furnished().things[2]
+    pose = bad_view(furnished(), thing, SIZE, INTRINSICS, 0.0)
+    assert furnished().signed_distance(pose[None, :3, 3]).min() >= 0.15
     share = seen_share(pose[None], thing)
     centre = BOXES[0].mean(axis=0)
     distance = float(np.linalg.norm(pose[:3, 3] - centre))
