@@ -21,25 +21,28 @@ from service import problems
 from service.blobs import BlobStore
 from service.contract import build_contract
 from service.dependencies import Services, off_loop
-from service.local_blobs import LocalBlobStore
+from service.housekeeping import Housekeeper
+from service.journaled_records import JournaledRecordStore
 from service.middleware import RequestContext, TokenGate
 from service.query import refuse_unknown_parameters
 from service.queue import JobQueue
 from service.rate_limits import RateGate, RateLimiter, RedisRateLimiter
 from service.reaper import Reaper
+from service.rebuild import Rebuilder
 from service.records import RecordStore
 from service.redis_client import connect
 from service.redis_queue import RqJobQueue
-from service.redis_records import RedisRecordStore
 from service.routes import fields, jobs, meta, pages, registrations, results, uploads
 from service.settings import Settings
 from service.shutdown import stopping_on_signals
+from service.storage import open_blobs
 from service.tokens import read_callers
 from service.waiting import pause
 from service.webhooks.service import deliver_until_stopped, webhooks_of
 
 logger = logging.getLogger(__name__)
 _REAP_EVERY_S = 15.0
+_STORAGE_PATIENCE_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
 _ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
 # links that people pass on and probes gather parameters that nobody meant
@@ -70,11 +73,14 @@ def create_app(
         if settings.redis_url is None:
             raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
         redis = connect(settings.redis_url)
-        records = records or RedisRecordStore(redis, settings.retention_s)
+        blobs = blobs or open_blobs(settings, _STORAGE_PATIENCE_S)
+        records = records or JournaledRecordStore(redis, settings.retention_s, blobs)
         queue = queue or RqJobQueue(redis)
         if limiter is None and settings.calls_per_s:
             limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
-    services = Services(settings, records, blobs or LocalBlobStore(settings.blob_dir), queue, webhooks_of(settings, redis))
+    services = Services(
+        settings, records, blobs or open_blobs(settings, _STORAGE_PATIENCE_S), queue, webhooks_of(settings, redis)
+    )
     app = FastAPI(
         title="regnf",
         version=__version__,
@@ -131,7 +137,11 @@ def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI],
 
 async def _reap(services: Services, redis: Redis) -> None:
     """Look after lost jobs every fifteen seconds until the service stops."""
-    reaper = Reaper(services.records, services.queue, redis, services.settings, services.blobs)
+    records, rebuilder, housekeeper = services.records, None, None
+    if isinstance(records, JournaledRecordStore):
+        rebuilder = Rebuilder(records, services.queue, services.blobs)
+        housekeeper = Housekeeper(records, services.blobs, redis, services.settings)
+    reaper = Reaper(records, services.queue, redis, services.settings, services.blobs, rebuilder, housekeeper)
     while not services.stopping.is_set():
         try:
             await off_loop(reaper.run_once)

@@ -1,13 +1,14 @@
 """Blobs as objects of an S3-compatible store: what several machines share besides Redis.
 
-A blob of up to eight mebibytes is one request under its own key. A larger one streams to a temporary key as a multipart
-upload, which becomes an object whole or not at all, and is then copied to its key within the store, which is atomic too.
+A blob of up to eight mebibytes is one request under its own key. A larger one streams to a temporary key, a multipart
+upload that becomes an object whole or not at all, and is copied to its key within the store, which is atomic too.
 Do not use a store in a process that forks afterwards: the client's threads do not survive a fork.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ from service.file_cache import FileCache
 _TEMPORARY = ".tmp"
 _PART_BYTES = 8 << 20
 _PAGE = 1000
+_ENDPOINTS = ("AWS_ENDPOINT", "AWS_ENDPOINT_URL")
 _REQUEST_TIMEOUT_S = 20.0
 _CONNECT_TIMEOUT_S = 5.0
 _LONGEST_WAIT_S = 2.0
@@ -132,6 +134,8 @@ class ObjectBlobStore:
             client_options={
                 "timeout": timedelta(seconds=_REQUEST_TIMEOUT_S),
                 "connect_timeout": timedelta(seconds=_CONNECT_TIMEOUT_S),
+                # whoever names an endpoint without TLS means it
+                "allow_http": any(os.environ.get(name, "").startswith("http://") for name in _ENDPOINTS),
             },
             retry_config={
                 "max_retries": 1000,
@@ -192,7 +196,7 @@ class ObjectBlobStore:
         found = self.tried(whole)
         if isinstance(found, bytes):
             return io.BytesIO(found)
-        return io.BufferedReader(_RangedReader(self, key, found), buffer_size=1 << 20)
+        return io.BufferedReader(_RangedReader(self, key, found), buffer_size=4 << 20)
 
     @contextmanager
     def local_copy(self, key: str) -> Iterator[Path]:

@@ -1,19 +1,24 @@
-"""Finds what died without a word: jobs without a heartbeat, work that no queue holds, results past their time."""
+"""Finds what died without a word: jobs without a heartbeat, work that no queue holds, results past their time.
+
+Every change of a record is fenced off by its attempt, whoever makes it; what cannot be undone is done only by a leader
+that has made sure that it still leads.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
-from uuid import uuid4
 
 from redis import Redis
 
 from service.blobs import BlobStore
+from service.housekeeping import Housekeeper
+from service.lease import Lease, LeaseLostError, Term
 from service.queue import JobQueue
 from service.reasons import REASONS
+from service.rebuild import Rebuilder
 from service.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
 from service.redis_documents import PREFIX
 from service.settings import Settings
@@ -23,7 +28,6 @@ _LEADS_FOR_S = 60
 _UNHELD_FOR_S = 15.0
 """Work that was recorded this long ago and is in no queue was lost between the two."""
 _IMPORT_RETRIES = 2
-_RELEASE = "if redis.call('GET', KEYS[1]) == ARGV[1] then return redis.call('DEL', KEYS[1]) end return 0"
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
@@ -37,43 +41,67 @@ class Reaped:
     dismissed: tuple[str, ...] = ()
     enqueued: tuple[str, ...] = ()
     expired: tuple[str, ...] = ()
+    recalled: tuple[str, ...] = ()
+    """Jobs and fields whose records were made anew from the journal."""
 
 
 class Reaper:
     """Call ``run_once`` every fifteen seconds or so, from as many processes as like: one at a time does the work."""
 
     def __init__(
-        self, records: RecordStore, queue: JobQueue, redis: Redis, settings: Settings, blobs: BlobStore | None = None
+        self,
+        records: RecordStore,
+        queue: JobQueue,
+        redis: Redis,
+        settings: Settings,
+        blobs: BlobStore | None = None,
+        rebuilder: Rebuilder | None = None,
+        housekeeper: Housekeeper | None = None,
     ) -> None:
         self._records = records
         self._queue = queue
-        self._redis = redis
         self._lost_after_s = settings.lost_after_s
         self._blobs = blobs
-        self._release = redis.register_script(_RELEASE)
+        self._rebuilder = rebuilder
+        self._housekeeper = housekeeper
+        self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
     def run_once(self) -> Reaped:
         """One round; nothing when another process is at it. Raises RedisError when Redis cannot be reached."""
-        with self._leading() as leads:
-            if not leads:
-                return Reaped()
-            deeds: dict[str, list[str]] = {"requeued": [], "failed": [], "dismissed": [], "enqueued": []}
-            now = self._records.now()
-            for job in self._records.active_jobs():
-                _note(deeds, job.id, self._look_after_job, job, now)
-            for field in self._records.validating_fields():
-                _note(deeds, field.sha256, self._look_after_import, field, now)
-            return Reaped(**{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(self._expire()))
+        recalled = self._rebuild()
+        with self._lease.held() as term:
+            if term is None:
+                return Reaped(recalled=recalled)
+            deeds: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}
+            try:
+                expired = self._lead(term, deeds)
+            except LeaseLostError as error:
+                logger.warning("the round ends early: %s", error)
+                expired = []
+            return Reaped(
+                **{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(expired), recalled=recalled
+            )
 
-    @contextmanager
-    def _leading(self) -> Iterator[bool]:
-        token = uuid4().hex
-        leads = bool(self._redis.set(_LEADER_KEY, token, nx=True, ex=_LEADS_FOR_S))
-        try:
-            yield leads
-        finally:
-            if leads:
-                self._release(keys=[_LEADER_KEY], args=[token])
+    def _rebuild(self) -> tuple[str, ...]:
+        """Whoever finds Redis emptied mends it, leader or not: reading the journal takes longer than a term."""
+        if self._rebuilder is None:
+            return ()
+        rebuilt = self._rebuilder.run_if_needed()
+        return rebuilt.jobs + rebuilt.fields
+
+    def _lead(self, term: Term, deeds: dict[str, list[str]]) -> list[str]:
+        """Look after everything; the ids of what has expired. Raises LeaseLostError."""
+        now = self._records.now()
+        for job in self._records.active_jobs():
+            term.confirm()
+            _note(deeds, job.id, self._look_after_job, job, now)
+        for field in self._records.validating_fields():
+            term.confirm()
+            _note(deeds, field.sha256, self._look_after_import, field, now)
+        expired = self._expire(term)
+        if self._housekeeper is not None:
+            self._housekeeper.run_if_due(term)
+        return expired
 
     def _look_after_job(self, job: JobRecord, now: float) -> str | None:
         """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
@@ -106,7 +134,8 @@ class Reaper:
             self._blobs.delete_prefix(f"fields/{field.sha256}")
         return "failed"
 
-    def _expire(self) -> list[str]:
+    def _expire(self, term: Term) -> list[str]:
+        term.confirm()
         expired = self._records.expire_jobs()
         if self._blobs is not None:
             for job_id in expired:

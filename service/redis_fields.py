@@ -92,6 +92,10 @@ class RedisFieldRecords(RedisDocuments):
         sizes: Any = self._redis.hvals(_stored_key(owner))
         return len(sizes), sum(map(int, sizes))
 
+    def restore_field(self, record: FieldRecord) -> bool:
+        """Put a record that was lost back as it is; False when the field is known."""
+        return self._save_field(0, record) == "OK"
+
     def get_field(self, sha256: str) -> FieldRecord | None:
         document, _ = self._read(_key(sha256))
         return FieldRecord(**document) if document is not None else None

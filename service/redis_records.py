@@ -139,6 +139,11 @@ class RedisRecordStore(RedisFieldRecords):
             if answer == "OK":
                 return fresh, True
 
+    def restore_job(self, record: JobRecord) -> bool:
+        """Put a record that was lost back as it is; False when the job is known."""
+        commands = self._commands(None, record)
+        return self._compare_and_set(_key(record.id), 0, commands, asdict(record)) == "OK"
+
     def get_job(self, job_id: str) -> JobRecord | None:
         document, _ = self._read(_key(job_id))
         return JobRecord(**document) if document is not None else None

@@ -86,6 +86,14 @@ class Settings(BaseSettings):
     """How long a worker that is told to stop lets its job go on before it gives the job back to the queue."""
     retention_s: int = Field(default=7 * 24 * 3600, ge=60)
     """How long finished jobs and their artifacts are kept."""
+    unused_field_retention_s: int | None = Field(default=None, ge=60)
+    """How long a field is kept that no job has used since. Unset: until somebody deletes it."""
+    storage_cap_bytes: int | None = Field(default=None, ge=1)
+    """Beyond this the oldest finished jobs and unused fields go, before their time."""
+    storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")
+    """An object store for several machines; unset: a folder below state_dir."""
+    field_cache_bytes: int = Field(default=16384 * MIB, ge=0)
+    """With an object store: how much of it a worker's machine keeps copies of, beside those in use."""
 
     log_format: Literal["text", "json"] = "text"
 
@@ -109,3 +117,7 @@ class Settings(BaseSettings):
     @property
     def blob_dir(self) -> Path:
         return self.state_dir / "blobs"
+
+    @property
+    def field_cache_dir(self) -> Path:
+        return self.state_dir / "field-cache"

@@ -121,11 +121,16 @@ def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> 
     return replace(record, version=record.version + 1, updated=now, attempt=attempt + 1, requeues=requeues)
 
 
-def uses_field(record: JobRecord, sha256: str) -> bool:
-    """Whether the job reads this field."""
+def fields_of(record: JobRecord) -> list[str]:
+    """The fields that the job reads."""
     request = record.request
     named = (request.get("scene"), request.get("object"), *(request.get("candidates") or ()))
-    return sha256 in named or sha256 in record.inputs.values()
+    return [name for name in named if name]
+
+
+def uses_field(record: JobRecord, sha256: str) -> bool:
+    """Whether the job reads this field."""
+    return sha256 in fields_of(record) or sha256 in record.inputs.values()
 
 
 def event_of(before: JobRecord | None, after: JobRecord) -> tuple[str, dict[str, object]] | None:

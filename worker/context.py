@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.blobs import BlobStore
-from service.local_blobs import LocalBlobStore
+from service.journaled_records import JournaledRecordStore
 from service.queue import JobQueue
 from service.records import RecordStore
 from service.redis_client import connect
 from service.redis_queue import RqJobQueue
-from service.redis_records import RedisRecordStore
 from service.settings import Settings
+from service.storage import open_blobs
 
 _RETRIES = 20
 """About eighteen seconds: a job outlives a restart of Redis."""
+_STORAGE_PATIENCE_S = 120.0
 
 
 class NoRedisError(RuntimeError):
@@ -34,13 +35,10 @@ class Context:
 
     @classmethod
     def from_settings(cls, settings: Settings) -> Context:
-        """Stores over Redis and a local folder. Raises NoRedisError."""
+        """Stores over Redis and the storage that the settings name. Raises NoRedisError."""
         if settings.redis_url is None:
             raise NoRedisError("set REGNF_REDIS_URL")
         redis = connect(settings.redis_url, retries=_RETRIES)
-        return cls(
-            settings,
-            RedisRecordStore(redis, settings.retention_s),
-            LocalBlobStore(settings.blob_dir),
-            RqJobQueue(redis),
-        )
+        blobs = open_blobs(settings, _STORAGE_PATIENCE_S)
+        records = JournaledRecordStore(redis, settings.retention_s, blobs)
+        return cls(settings, records, blobs, RqJobQueue(redis))

@@ -97,13 +97,20 @@ class RegnfWorker(PatientWorker):
             given_back=self._given_back,
         )
         settle = self._settlers[queue.name]
-        try:
-            self._patiently(
-                f"settling job {job.id}",
-                lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
-            )
-        except (RedisError, OSError) as error:
-            self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
+
+        def write_down() -> None:
+            try:
+                self._patiently(
+                    f"settling job {job.id}",
+                    lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
+                )
+            except (RedisError, OSError) as error:
+                self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
+
+        if self._context.settings.storage_url is None:
+            write_down()
+        elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
+            self.log.error("job %s could not be settled: the process that should have has died", job.id)
 
     def fork_work_horse(self, job: Any, queue: Any) -> None:
         parent = os.getpid()

@@ -4,6 +4,7 @@ import errno
 import multiprocessing
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ import pytest
 from service.blobs import BlobStore, StorageFullError
 from service.local_blobs import LocalBlobStore
 from service.memory import InMemoryBlobStore
+from service.object_blobs import ObjectBlobStore
+from tests.object_store import ObjectServer, environment
 
 BAD_KEYS = [
     "",
@@ -31,9 +34,16 @@ BAD_KEYS = [
 BAD_KEYS += ["a" * 201, "/".join(["a" * 100] * 6)]
 
 
-@pytest.fixture(params=["memory", "local"])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> BlobStore:
-    return InMemoryBlobStore() if request.param == "memory" else LocalBlobStore(tmp_path / "blobs")
+@pytest.fixture(params=["memory", "local", "objects"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[BlobStore]:
+    if request.param == "memory":
+        yield InMemoryBlobStore()
+    elif request.param == "local":
+        yield LocalBlobStore(tmp_path / "blobs")
+    else:
+        server: ObjectServer = request.getfixturevalue("objects")
+        with environment(server.environment):
+            yield ObjectBlobStore(f"s3://{server.new_bucket()}/some/prefix")
 
 
 def test_what_is_put_is_read(store: BlobStore) -> None:
@@ -88,6 +98,40 @@ def test_listing_and_deleting_by_folder(store: BlobStore) -> None:
     assert list(store.list("jobs")) == ["jobs/ab/1/x"]
     store.delete("jobs/ab/1/x")
     assert list(store.list("jobs")) == []
+
+
+def test_large_blobs_are_written_and_read_in_parts(store: BlobStore) -> None:
+    block = bytes(range(256)) * 4096
+    with store.writer() as writer:
+        for number in range(10):
+            writer.write(block + bytes([number]))
+        writer.commit("fields/f/original")
+    whole = b"".join(block + bytes([number]) for number in range(10))
+    assert store.size("fields/f/original") == len(whole)
+    assert [(entry.key, entry.bytes) for entry in store.entries("")] == [("fields/f/original", len(whole))]
+    with store.open("fields/f/original") as file:
+        assert file.read(10) == whole[:10]
+        assert file.seek(-5, os.SEEK_END) == len(whole) - 5
+        assert file.read(100) == whole[-5:]
+        assert file.seek(len(block) - 3) == len(block) - 3
+        assert file.read(8) == whole[len(block) - 3 : len(block) + 5]
+        file.seek(0)
+        assert file.read() == whole
+    with store.local_copy("fields/f/original") as path:
+        assert path.read_bytes() == whole
+
+
+def test_a_large_blob_that_breaks_off_leaves_nothing(store: BlobStore) -> None:
+    with pytest.raises(TypeError), store.writer() as writer:  # noqa: PT012
+        writer.write(bytes(9 << 20))
+        writer.write(b"broken off" + None)  # type: ignore[operator]
+    assert list(store.list("")) == []
+    assert store.sweep(0.0) == 0
+
+
+def test_a_store_that_takes_bytes_says_so(store: BlobStore) -> None:
+    store.probe()
+    assert list(store.list("")) == []
 
 
 @pytest.mark.parametrize("key", BAD_KEYS)
