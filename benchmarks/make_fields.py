@@ -5,7 +5,7 @@
 MESHES holds the meshes (glb, metres, z up), ROOMS the layouts ac-room.json, atbl-room.json and mix-room.json; the
 held-out scenes are laid out in benchmarks/layouts. Writes a safe field a scene and an object, the scene's exact surface
 beside its field (NAME.surface.npz), and for each set a list of detections with their true transforms. What exists
-already is kept. On one core: main 20 minutes, held-out 15, under-trained 8, full-size 15.
+already is kept. On one core: main 20 minutes, held-out 15, under-trained 25, full-size 15.
 """
 
 from __future__ import annotations
@@ -64,13 +64,14 @@ def field_sets(rooms: Path) -> dict[str, list[FieldSet]]:
         "held-out": [FieldSet("pairs-held-out.json", held_out)],
         "under-trained": [
             FieldSet(
-                f"pairs-after-{percent}-percent.json",
-                main,
+                f"{pairs}-after-{percent}-percent.json",
+                layouts,
                 replace(ROOM_OPTIONS, iterations=ROOM_OPTIONS.iterations * percent // 100),
                 replace(OBJECT_OPTIONS, iterations=OBJECT_OPTIONS.iterations * percent // 100),
                 f"-after-{percent}-percent",
             )
-            for percent in (3, 10)
+            for pairs, layouts in (("pairs", main), ("pairs-held-out", held_out))
+            for percent in (1, 3, 10)
         ],
         "full-size": [FieldSet("pairs-full-size.json", main[2:], full_room, full_object, "-full-size", "fc")],
     }

@@ -1,0 +1,96 @@
+"""Supports of rough surfaces, and how rough a surface is found to be: against made-up samples of known shape."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from regnf_core.robust.residuals import Samples
+from regnf_core.robust.smoothing import smoothed
+from regnf_core.robust.support import support
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def sheet(count: int, z: float, normal: float, seed: int) -> Samples:
+    """A unit square's points at a height, facing up or down."""
+    points = torch.rand(count, 3, generator=generator(seed)) - 0.5
+    points[:, 2] = z
+    return Samples(points, torch.zeros(count), torch.tensor([0.0, 0.0, normal]).expand(count, 3))
+
+
+def crate(count: int) -> Samples:
+    """The four sides and the lid of a box that stands on z = 0."""
+    draw = generator(7)
+    sides = torch.randint(5, (count,), generator=draw)
+    normals = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])[sides]
+    points = torch.rand(count, 3, generator=draw) - 0.5
+    points = torch.where(normals != 0, 0.5 * normals, points) * torch.tensor([0.4, 0.4, 0.5])
+    return Samples(points + torch.tensor([0.0, 0.0, 0.25]), torch.zeros(count), normals)
+
+
+def together(*parts: Samples) -> Samples:
+    return Samples(
+        torch.cat([part.points for part in parts]),
+        torch.cat([part.values for part in parts]),
+        torch.cat([part.normals for part in parts]),
+    )
+
+
+def roughened(samples: Samples, height: float, tilt: float) -> Samples:
+    """The samples moved along their normals and their normals tilted, by random amounts of these sizes."""
+    draw = generator(3)
+    shift = height * torch.randn(len(samples), 1, generator=draw)
+    normals = samples.normals + tilt * torch.randn(len(samples), 3, generator=draw)
+    return Samples(
+        samples.points + shift * samples.normals, samples.values, torch.nn.functional.normalize(normals, dim=-1)
+    )
+
+
+def floor_with_crumbs() -> tuple[Samples, Tensor]:
+    """A floor, scattered crumbs beneath it that face all ways, a crate; and which samples are the crate's."""
+    crumbs = sheet(100, -0.06, 1.0, 2)
+    sideways = torch.nn.functional.normalize(torch.randn(100, 3, generator=generator(5)), dim=-1)
+    crumbs = Samples(crumbs.points, crumbs.values, sideways)
+    rough = roughened(together(sheet(900, 0.0, 1.0, 1), crumbs, crate(1000)), 0.006, 0.35)
+    return rough, torch.arange(2000) >= 1000
+
+
+def test_a_rough_floor_with_crumbs_beneath_is_set_aside_and_the_crate_is_kept() -> None:
+    samples, of_crate = floor_with_crumbs()
+    aside = support(samples, generator())
+    assert aside[~of_crate].float().mean() > 0.95
+    assert aside[of_crate & (samples.points[:, 2] > 0.06)].sum() == 0
+
+
+def test_the_same_crumbs_beneath_an_accurate_plane_are_the_rest_of_an_object() -> None:
+    draw = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator(5)), dim=-1)
+    below = sheet(200, -0.06, 1.0, 2)
+    samples = together(
+        sheet(900, 0.0, 1.0, 1), Samples(below.points, below.values, draw.abs() * torch.tensor([1, 1, 0]))
+    )
+    assert not support(samples, generator()).any()
+
+
+def test_a_crate_in_the_air_has_no_support() -> None:
+    assert not support(roughened(crate(1500), 0.006, 0.35), generator()).any()
+
+
+@pytest.mark.parametrize("height", [0.0, 0.01])
+def test_roughness_is_the_height_of_the_bumps(height: float) -> None:
+    found = smoothed(roughened(sheet(4000, 0.0, 1.0, 1), height, 0.0))
+    assert found.roughness == pytest.approx(height, rel=0.15, abs=1e-6)
+    assert found.incoherence == pytest.approx(0.0, abs=1e-6)
+    assert found.points[:, 2].std() <= 0.5 * height + 1e-6
+
+
+def test_incoherence_is_the_tilt_of_the_normals_and_thin_parts_keep_their_sides() -> None:
+    both = roughened(together(sheet(2000, 0.0, 1.0, 1), sheet(2000, -0.02, -1.0, 2)), 0.0, 0.3)
+    found = smoothed(both)
+    # Tilted by 0.3 along both tangents: 1 - cos of the median angle, 0.3 sqrt(2 ln 2) = 0.353 in the tangent, 0.059.
+    assert found.incoherence == pytest.approx(0.059, abs=0.012)
+    assert (found.normals[:2000, 2] > 0.9).float().mean() > 0.99
+    assert (found.normals[2000:, 2] < -0.9).float().mean() > 0.99
