@@ -23,6 +23,7 @@ from service.contract import build_contract
 from service.dependencies import Services, off_loop
 from service.housekeeping import Housekeeper
 from service.journaled_records import JournaledRecordStore
+from service.metrics import Measured, Metrics, served
 from service.middleware import RequestContext, TokenGate
 from service.query import refuse_unknown_parameters
 from service.queue import JobQueue
@@ -81,6 +82,7 @@ def create_app(
     services = Services(
         settings, records, blobs or open_blobs(settings, _STORAGE_PATIENCE_S), queue, webhooks_of(settings, redis)
     )
+    metrics = Metrics(services, redis)
     app = FastAPI(
         title="regnf",
         version=__version__,
@@ -88,9 +90,10 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
-        lifespan=_lifespan_of(services, redis),
+        lifespan=_lifespan_of(services, redis, metrics),
         middleware=[
             Middleware(RequestContext),
+            Middleware(Measured, metrics=metrics),
             Middleware(
                 TokenGate,
                 callers=callers,
@@ -101,6 +104,7 @@ def create_app(
         ],
     )
     app.state.services = services
+    app.state.metrics = metrics
     _include_routers(app)
     app.openapi = cache(lambda: build_contract(app))  # type: ignore[method-assign]
     _include_routers(app, prefix="/v1", include_in_schema=False)
@@ -116,13 +120,16 @@ def _include_routers(app: FastAPI, **how: Any) -> None:
         app.include_router(router, **how)
 
 
-def _lifespan_of(services: Services, redis: Redis | None) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+def _lifespan_of(
+    services: Services, redis: Redis | None, metrics: Metrics
+) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.openapi()  # takes a while, so not while somebody waits for an answer
         reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
         delivering = asyncio.create_task(deliver_until_stopped(services, redis)) if redis is not None else None
-        with stopping_on_signals(services.stopping):
+        at = services.settings
+        with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
         if delivering is not None:

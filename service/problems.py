@@ -151,7 +151,9 @@ async def _answer(request: Request, error: Exception) -> JSONResponse:
     request_id = getattr(request.state, "request_id", None)
     if problem.reason == "INTERNAL":
         logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error)
-    elif problem.status >= 500:
+    elif problem.reason == "STORE_UNAVAILABLE":
+        request.app.state.metrics.redis_errors.inc()
+    if problem.reason != "INTERNAL" and problem.status >= 500:
         logger.warning("%s request_id=%s: %s", problem.reason, request_id, type(error).__name__)
     if problem.reason == "METHOD_NOT_ALLOWED":
         # the framework names the methods of the first route that fits, not of the address

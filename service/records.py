@@ -76,6 +76,9 @@ class JobRecord:
     """How often this request was handed out again because its worker vanished, since it was last asked for."""
     worker: str | None = None
     """Who claimed the attempt."""
+    phase_since: float | None = None
+    verdict: str | None = None
+    """Of a successful job: what its result says."""
 
     @property
     def owner(self) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-from service import transitions
+from service import figures, transitions
 from service.ownership import owner_of
 from service.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError
 from service.redis_documents import PREFIX, Cap, Command, RedisDocuments, text
@@ -47,12 +47,15 @@ def _attempts_key(sha256: str) -> str:
 class RedisFieldRecords(RedisDocuments):
     """The half of the record store that is about fields."""
 
-    def _save_field(self, expected_version: int, record: FieldRecord, caps: Sequence[Cap] = ()) -> str:
+    def _save_field(
+        self, expected_version: int, record: FieldRecord, more: Sequence[Command] = (), caps: Sequence[Cap] = ()
+    ) -> str:
         index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
         indexes = [
             index,
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
         ]
+        indexes += more
         if record.state == "rejected":
             indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
@@ -66,7 +69,7 @@ class RedisFieldRecords(RedisDocuments):
                 raise StaleAttemptError("there is no such field")
             known = FieldRecord(**document)
             changed = change(known, now)
-            if self._save_field(known.version, changed) == "OK":
+            if self._save_field(known.version, changed, figures.of_field(known, changed)) == "OK":
                 return changed
 
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
@@ -77,7 +80,7 @@ class RedisFieldRecords(RedisDocuments):
             if fresh is None:
                 assert known is not None
                 return known, False
-            answer = self._save_field(known.version if known is not None else 0, fresh, _caps(fresh, quota))
+            answer = self._save_field(known.version if known is not None else 0, fresh, caps=_caps(fresh, quota))
             if answer.startswith("QUOTA"):
                 raise QuotaError(answer)
             if answer == "OK":

@@ -17,7 +17,7 @@ from typing import Any
 
 from redis import Redis
 
-from service import transitions
+from service import figures, transitions
 from service.ownership import ANONYMOUS
 from service.records import ACTIVE, NO_QUOTA, JobEvent, JobRecord, QueueFullError, Quota, QuotaError, StaleAttemptError
 from service.redis_documents import PREFIX, Cap, Command, text
@@ -88,6 +88,7 @@ class RedisRecordStore(RedisFieldRecords):
             commands.append(("ZREM", _WAITING, after.id))
         elif before is None or before.status != "accepted":
             commands.append(("ZADD", _WAITING, repr(after.updated), after.id))
+        commands += figures.of_job(before, after)
         event = transitions.event_of(before, after)
         if event is not None:
             name, data = event

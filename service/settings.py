@@ -95,6 +95,9 @@ class Settings(BaseSettings):
     field_cache_bytes: int = Field(default=16384 * MIB, ge=0)
     """With an object store: how much of it a worker's machine keeps copies of, beside those in use."""
 
+    metrics_host: str = "127.0.0.1"
+    metrics_port: int | None = Field(default=None, ge=0, le=65535)
+    """Where Prometheus finds `/metrics`, a port of its own without tokens; unset: nowhere."""
     log_format: Literal["text", "json"] = "text"
 
     @property

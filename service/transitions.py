@@ -11,7 +11,7 @@ _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
-_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker"})
+_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker", "verdict"})
 _CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes", "symmetry"})
 
 
@@ -41,6 +41,8 @@ def changed_job(record: JobRecord, attempt: int, changes: dict[str, Any], now: f
     derived: dict[str, Any] = {}
     if "progress" in changes:
         derived["progress"] = max(record.progress, min(1.0, float(changes["progress"])))
+    if changes.get("phase", record.phase) != record.phase:
+        derived["phase_since"] = now
     if "status" in changes:
         if status == "running":
             derived |= {"started": now, "heartbeat": now}

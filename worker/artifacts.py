@@ -20,6 +20,7 @@ _MEDIA_TYPES = {
     ".png": "image/png",
 }
 
+_VERDICTS = ("registered", "ambiguous", "rejected")
 Manifest = dict[str, Any]
 
 
@@ -35,6 +36,16 @@ def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
     except FileNotFoundError:
         return None
     return manifest
+
+
+def verdict_of(blobs: BlobStore, job_id: str, manifest: Manifest) -> str | None:
+    """What the result that the manifest lists says of itself; None for one that says nothing that is known."""
+    try:
+        with blobs.open(f"jobs/{job_id}/{manifest['attempt']}/result.json") as file:
+            verdict = json.load(file).get("verdict")
+    except (FileNotFoundError, ValueError, AttributeError):
+        return None
+    return verdict if verdict in _VERDICTS else None
 
 
 def store_artifacts(blobs: BlobStore, job_id: str, attempt: int, folder: Path, names: list[str]) -> Manifest:

@@ -14,7 +14,7 @@ from redis.exceptions import RedisError
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from service.ownership import sha256_of
 from service.records import FieldRecord, JobRecord, StaleAttemptError
-from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts
+from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts, verdict_of
 from worker.context import Context
 from worker.engine import Candidate, RegistrationEngine
 from worker.fields import Fields, FieldsNotReadyError
@@ -58,7 +58,7 @@ def run_attempt(
             logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
             _fail(context, job_id, attempt, fault(error, incident))
         else:
-            _end(context, job_id, attempt, status="successful")
+            _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, job_id, manifest))
             discard_others(context.blobs, job_id, manifest)
 
 

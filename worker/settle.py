@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.records import ACTIVE, JobRecord, StaleAttemptError
-from worker.artifacts import discard, read_manifest
+from worker.artifacts import discard, read_manifest, verdict_of
 from worker.context import Context
 from worker.imports import claim_import, reject
 from worker.problems import problem
@@ -59,8 +59,10 @@ def settle_registration(context: Context, job_id: str, attempt: int, worker: str
 
 def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
     job_id, attempt = record.id, record.attempt
-    if read_manifest(context.blobs, job_id) is not None:
-        context.records.update_job(job_id, attempt, status="successful")
+    manifest = read_manifest(context.blobs, job_id)
+    if manifest is not None:
+        verdict = verdict_of(context.blobs, job_id, manifest)
+        context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
         return
     discard(context.blobs, job_id, attempt)
     by_itself = end.signal is None and not end.late

@@ -51,6 +51,7 @@ class JobDocument(Outgoing):
         "the full options."
     )
     engine: dict[str, Any] = Field({}, description="Version and device.")
+    verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     webhook: WebhookDocument | None = None
     links: Links
@@ -83,6 +84,7 @@ def job_document(
         "expires_at": None if record.finished is None else rfc3339(record.finished + retention_s),
         "inputs": record.inputs,
         "engine": record.engine,
+        "verdict": record.verdict,
         "error": outgoing_problem(record.error),
         "webhook": _webhook(record, delivery),
         "links": _links(record, f"{prefix}/jobs/{record.id}"),

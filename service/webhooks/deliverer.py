@@ -79,7 +79,8 @@ class Deliverer:
         logger.info(
             "webhook %s, send %d: %s", message, sent.sends, sent.state, extra={"status": status, "error": error}
         )
-        self._outbox.settle(message, sent)
+        outcome = "delivered" if sent.state == "delivered" else error or f"status_{(status or 0) // 100}xx"
+        self._outbox.settle(message, sent, outcome)
 
 
 def message_id(record: JobRecord) -> str:

@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol, cast
 
 from redis import Redis
 
+from service.figures import count
 from service.records import JobRecord
 from service.redis_documents import PREFIX, Command, text
 
@@ -91,7 +92,7 @@ class RedisOutbox:
         message: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
         return None if message is None else text(message)
 
-    def settle(self, message: str, delivery: Delivery) -> None:
+    def settle(self, message: str, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""
         job_id = message.rpartition("-")[0]
         shown: dict[str, Any] = {"state": delivery.state, "sends": delivery.sends}
@@ -101,6 +102,7 @@ class RedisOutbox:
         due = "" if delivery.next_at is None else repr(delivery.next_at)
         fields = [part for pair in shown.items() for part in pair]
         self._settle(keys=[_DUE, _state_key(job_id)], args=[due, message, *fields])
+        count(self._redis, "webhook_sends", outcome)
 
     def delivery(self, job_id: str) -> Delivery:
         held: Any = self._redis.hgetall(_state_key(job_id))

@@ -1,0 +1,99 @@
+"""Board and alerts name metrics that exist, and every alert has its section in the runbook."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from prometheus_client import generate_latest
+
+from service.dependencies import Services
+from service.memory import InMemoryBlobStore
+from service.metrics import Metrics
+from service.records import FieldRecord, JobRecord
+from service.redis_client import connect
+from service.redis_queue import RqJobQueue
+from service.redis_records import RedisRecordStore
+from service.settings import Settings
+from service.webhooks.outbox import Delivery, RedisOutbox
+from tests.redis_server import private_redis
+
+ROOT = Path(__file__).resolve().parents[2]
+RULES: list[dict[str, Any]] = yaml.safe_load((ROOT / "deploy/prometheus/regnf.rules.yaml").read_text())["groups"][0][
+    "rules"
+]
+BOARD: dict[str, Any] = json.loads((ROOT / "deploy/grafana/regnf.json").read_text())
+RUNBOOK = (ROOT / "docs/runbook.md").read_text()
+QUERIES = [rule["expr"] for rule in RULES] + [one["expr"] for panel in BOARD["panels"] for one in panel["targets"]]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
+    """Every metric of a service in which everything has happened once, with its labels."""
+    with private_redis() as url, connect(url) as redis:
+        store = RedisRecordStore(redis)
+        for name in ("ended", "waits"):
+            store.create_job(JobRecord(name, "registration", "accepted", {}, {}, store.now(), store.now()), 10)
+        store.update_job("ended", 1, status="running", phase="loading")
+        store.update_job("ended", 1, status="successful", verdict="registered")
+        store.create_field(FieldRecord("a" * 64, "validating", 1, store.now(), store.now()))
+        store.update_field("a" * 64, state="ready")
+        RedisOutbox(redis).settle("ended-1", Delivery("delivered"))
+        settings = Settings(state_dir=tmp_path_factory.mktemp("state"))
+        metrics = Metrics(Services(settings, store, InMemoryBlobStore(), RqJobQueue(redis)), redis)
+        metrics.requests.labels("GET", "/", "200").inc()
+        metrics.seconds.labels("/").observe(1)
+        metrics.received.labels("/").inc()
+        text = generate_latest(metrics.registry).decode()
+    found: dict[str, set[str]] = {}
+    for line in text.splitlines():
+        match = re.match(r"(\w+)(?:\{(.*)\})? ", line)
+        if match:
+            found.setdefault(match[1], set()).update(re.findall(r'(\w+)="', match[2] or ""))
+    return found
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_every_metric_named_exists_with_its_labels(query: str, shown: dict[str, set[str]]) -> None:
+    names = set(re.findall(r"\bregnf_\w+", query))
+    assert names <= shown.keys()
+    held = set().union(*(shown[name] for name in names)) | {"instance", "job"}
+    grouped = re.findall(r"\b(?:by|on) ?\(([^)]*)\)", query)
+    selected = re.findall(r"(\w+) ?(?:=~|!=|=)\"", query)
+    assert {label.strip() for group in grouped for label in group.split(",")} | set(selected) <= held
+    assert query.count("(") == query.count(")")
+    assert names or query.startswith("up{")
+
+
+def test_every_metric_is_on_the_board(shown: dict[str, set[str]]) -> None:
+    ours = {name for name in shown if name.startswith("regnf_")}
+    bare = {re.sub(r"_(bucket|sum|count|created|total)$", "", name) for name in ours}
+    on_board = {
+        re.sub(r"_(bucket|count|total)$", "", name) for query in QUERIES for name in re.findall(r"\bregnf_\w+", query)
+    }
+    assert bare <= on_board
+
+
+def test_every_alert_has_its_section_and_every_section_its_alert() -> None:
+    sections = set(re.findall(r"^## (\w+)$", RUNBOOK, re.MULTILINE)) - {"Scraping"}
+    assert {rule["alert"] for rule in RULES} == sections
+    for rule in RULES:
+        assert rule["labels"]["severity"] in ("page", "ticket")
+        assert rule["annotations"]["summary"]
+
+
+def test_what_the_runbook_names_exists(shown: dict[str, set[str]]) -> None:
+    named = set(re.findall(r"`(regnf_\w+)`", RUNBOOK))
+    assert named - shown.keys() <= {name.removesuffix("_bucket") for name in shown}
+    settings = {f"REGNF_{name.upper()}" for name in Settings.model_fields}
+    assert set(re.findall(r"REGNF_[A-Z_]+[A-Z]", RUNBOOK)) <= settings
+
+
+def test_panels_do_not_overlap() -> None:
+    places = [tuple(panel["gridPos"].values()) for panel in BOARD["panels"]]
+    assert len(set(places)) == len(places) == len({panel["id"] for panel in BOARD["panels"]})
+    assert all(panel["gridPos"]["x"] + panel["gridPos"]["w"] <= 24 for panel in BOARD["panels"])
