@@ -57,6 +57,7 @@ class Housekeeper:
         self._blobs = blobs
         self._redis = redis
         self._keep_unused_s = settings.unused_field_retention_s
+        self._keep_rejected_s = settings.retention_s
         self._cap = settings.storage_cap_bytes
 
     def run_if_due(self, term: Term) -> Removed:
@@ -74,11 +75,17 @@ class Housekeeper:
         orphans = tuple(self._drop_orphans(term, folders))
         fields = self._unused_fields()
         now = self._records.now()
-        old = [field for used, field in fields if self._keep_unused_s is not None and used + self._keep_unused_s <= now]
-        dropped = [field.sha256 for field in old if self._drop_field(term, field)]
+        dropped = [
+            field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
+        ]
         total = sum(kept.bytes for kept in self._folders().values()) if self._cap is not None else 0
         more_jobs, more_fields = self._drop_beyond_cap(term, total, folders, now)
         return Removed((*dropped, *more_fields), tuple(more_jobs), orphans, temporary)
+
+    def _is_old(self, used: float, field: FieldRecord, now: float) -> bool:
+        if field.state == "rejected":
+            return field.updated + self._keep_rejected_s <= now
+        return self._keep_unused_s is not None and used + self._keep_unused_s <= now
 
     def _folders(self) -> dict[str, Kept]:
         """Everything below jobs/ and fields/, by folder."""

@@ -57,9 +57,10 @@ class Live:
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
 
     def files(self) -> set[str]:
-        """Every file in the blob store, unfinished ones included."""
+        """Every file in the blob store, unfinished ones included; not what the journal says of them."""
         root = self.folder / "blobs"
-        return {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+        names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+        return {name for name in names if not name.startswith("journal/")}
 
     def log(self) -> str:
         return "\n".join(path.read_text() for path in sorted(self.folder.glob("*.log")))

@@ -1,0 +1,102 @@
+"""API and worker as two machines would run them: nothing between them but Redis and an object store."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.devdata import ROOT
+from tests.object_store import ObjectServer
+from tests.redis_server import private_redis
+from tests.worker.bench import eventually
+
+DATA = ROOT / "examples" / "data"
+
+
+@contextmanager
+def process(module: list[str], environment: dict[str, str], log: Path, *passed: int) -> Iterator[None]:
+    with log.open("wb") as file:
+        started = subprocess.Popen([sys.executable, "-m", *module], env=environment, stderr=file, pass_fds=passed)
+    try:
+        yield
+    finally:
+        started.terminate()
+        try:
+            started.wait(20)
+        except subprocess.TimeoutExpired:
+            started.kill()
+            started.wait()
+
+
+@pytest.fixture
+def client(tmp_path: Path, objects: ObjectServer) -> Iterator[httpx.Client]:
+    """A client of the API; the worker's folder is `worker`, the API's `api`."""
+    with ExitStack() as stack:
+        url = stack.enter_context(private_redis())
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+        shared = {
+            "REGNF_REDIS_URL": url,
+            "REGNF_STORAGE_URL": f"s3://{objects.new_bucket()}/two/hosts",
+            "REGNF_DEVICE": "cpu",
+            "REGNF_THREADS": "1",
+        }
+        for name, module in (("api", ["regnf_cli.api_process", str(listener.fileno())]), ("worker", ["worker.main"])):
+            environment = plain | shared | objects.environment | {"REGNF_STATE_DIR": str(tmp_path / name)}
+            stack.enter_context(process(module, environment, tmp_path / f"{name}.log", listener.fileno()))
+        address = f"http://127.0.0.1:{listener.getsockname()[1]}"
+        made = stack.enter_context(httpx.Client(base_url=address, timeout=60))
+        eventually(lambda: made.get("/readyz").status_code == 200, lambda: logs(tmp_path))
+        yield made
+
+
+def logs(folder: Path) -> str:
+    return "\n".join(path.read_text() for path in folder.glob("*.log"))
+
+
+def upload(client: httpx.Client, name: str) -> str:
+    content = (DATA / name).read_bytes()
+    sha256 = hashlib.sha256(content).hexdigest()
+    client.put(f"/fields/{sha256}", content=content).raise_for_status()
+    return sha256
+
+
+def finished(client: httpx.Client, job_id: str) -> dict[str, Any]:
+    def look() -> dict[str, Any] | None:
+        job: dict[str, Any] = client.get(f"/jobs/{job_id}", params={"wait": 10}).json()
+        return job if job["status"] in ("successful", "failed", "dismissed") else None
+
+    return eventually(look, f"the end of job {job_id}", 120.0)
+
+
+def test_a_registration_between_two_machines(client: httpx.Client, tmp_path: Path) -> None:
+    scene, object_ = upload(client, "mix-room.safetensors"), upload(client, "armchair.safetensors")
+    request = {"scene": scene, "object": object_, "detection": json.loads((DATA / "detection.json").read_text())}
+    answer = client.post("/register", json=request)
+    assert answer.status_code == 202, answer.text
+    job_id = answer.json()["id"]
+    assert finished(client, job_id)["status"] == "successful", logs(tmp_path)
+    result = client.get(f"/jobs/{job_id}/result").json()
+    assert result["verdict"] == "registered"
+    for artifact in result["artifacts"]:
+        address = f"/jobs/{job_id}/artifacts/{artifact['name']}"
+        content = client.get(address).content
+        assert hashlib.sha256(content).hexdigest() == artifact["sha256"]
+        middle = len(content) // 2
+        part = client.get(address, headers={"Range": f"bytes={middle}-{middle + 9}"})
+        assert (part.status_code, part.content) == (206, content[middle : middle + 10])
+    assert client.get(f"/fields/{scene}/preview.png").content.startswith(b"\x89PNG")
+    assert len(list((tmp_path / "worker" / "field-cache").iterdir())) >= 2, "the fields stay with the worker"
+    assert not (tmp_path / "api" / "blobs").exists()
+    assert not (tmp_path / "worker" / "blobs").exists()
