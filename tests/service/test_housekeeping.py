@@ -1,0 +1,192 @@
+"""What goes from the store because nobody needs it, and what stays because somebody does."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pytest
+from redis import Redis
+
+from service.housekeeping import Housekeeper, Removed
+from service.journaled_records import JournaledRecordStore
+from service.lease import Lease, LeaseLostError
+from service.memory import InMemoryBlobStore, InMemoryJobQueue
+from service.rebuild import Rebuilder
+from service.records import FieldRecord, JobRecord
+from service.redis_client import connect
+from service.settings import Settings
+from tests.redis_server import private_redis
+
+DAY_S = 24 * 3600.0
+
+
+@pytest.fixture(scope="module")
+def redis() -> Iterator[Redis]:
+    with private_redis() as url, connect(url) as client:
+        yield client
+
+
+class ShiftedRecords(JournaledRecordStore):
+    """Their clock is ahead of Redis' own by ``ahead_s``."""
+
+    ahead_s = 0.0
+
+    def now(self) -> float:
+        return super().now() + self.ahead_s
+
+    def _read(self, key: str) -> tuple[dict[str, Any] | None, float]:
+        document, now = super()._read(key)
+        return document, now + self.ahead_s
+
+
+@dataclass
+class World:
+    redis: Redis
+    settings: Settings = field(default_factory=Settings)
+    blobs: InMemoryBlobStore = field(default_factory=InMemoryBlobStore)
+
+    def __post_init__(self) -> None:
+        self.records = ShiftedRecords(self.redis, 7 * 24 * 3600, self.blobs)
+        Rebuilder(self.records, InMemoryJobQueue(), self.blobs).run_if_needed()
+        self.lease = Lease(self.redis, "lease", 30.0)
+
+    def add_field(self, letter: str, size: int = 100, state: str = "ready") -> str:
+        now = self.records.now()
+        sha256 = letter * 64
+        self.records.create_field(FieldRecord(sha256, "validating", size, now, now))
+        self.blobs.put(f"fields/{sha256}/field.safetensors", bytes(size))
+        self.records.update_field(sha256, state=state)
+        return sha256
+
+    def add_job(self, job_id: str, scene: str, object_: str, size: int = 0, ended: bool = True) -> None:
+        now = self.records.now()
+        request = {"scene": scene, "object": object_}
+        self.records.create_job(JobRecord(job_id, "registration", "accepted", request, {}, now, now), 100)
+        if ended:
+            self.records.update_job(job_id, 1, status="running")
+            self.blobs.put(f"jobs/{job_id}/1/result.json", bytes(size))
+            self.records.update_job(job_id, 1, status="successful")
+
+    def tidy(self, later_s: float = 0.0, **settings: object) -> Removed:
+        self.records.ahead_s += later_s
+        keeper = Housekeeper(self.records, self.blobs, self.redis, self.settings.model_copy(update=settings))
+        with self.lease.held() as term:
+            assert term is not None
+            return keeper.run(term)
+
+    def fields(self) -> set[str]:
+        return {key.split("/")[1][0] for key in self.blobs.list("fields")}
+
+
+@pytest.fixture
+def world(redis: Redis) -> World:
+    redis.flushall()
+    return World(redis)
+
+
+def test_by_default_fields_stay(world: World) -> None:
+    world.add_field("a")
+    assert world.tidy(1000 * DAY_S) == Removed()
+    assert world.fields() == {"a"}
+
+
+def test_a_field_goes_once_nobody_has_used_it_for_long(world: World) -> None:
+    keep = {"unused_field_retention_s": 10 * DAY_S}
+    a, b, c = (world.add_field(letter) for letter in "abc")
+    assert world.tidy(**keep) == Removed(), "from now on they count as unused"
+    world.records.ahead_s += 8 * DAY_S
+    world.add_job("j", a, b)
+    assert world.tidy(3 * DAY_S, **keep) == Removed(fields=(c,))
+    assert world.records.get_field(c) is None
+    assert world.fields() == {"a", "b"}
+    assert sorted(world.tidy(8 * DAY_S, **keep).fields) == [a, b]
+    assert list(world.records.journal.fields()) == []
+
+
+def test_what_a_live_job_needs_stays(world: World) -> None:
+    a, b = world.add_field("a"), world.add_field("b")
+    world.tidy()
+    world.add_job("j", a, b, ended=False)
+    assert world.tidy(100 * DAY_S, unused_field_retention_s=60, storage_cap_bytes=1) == Removed()
+    assert world.fields() == {"a", "b"}
+
+
+def test_a_field_that_is_asked_for_while_it_goes_comes_back(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    a = world.add_field("a")
+    world.tidy()
+    known = world.records.get_field(a)
+    delete: Callable[[str], bool] = world.records.delete_field
+
+    def and_somebody_asks(sha256: str) -> bool:
+        world.add_job("j", sha256, sha256, ended=False)
+        return delete(sha256)
+
+    monkeypatch.setattr(world.records, "delete_field", and_somebody_asks)
+    assert world.tidy(100 * DAY_S, unused_field_retention_s=60) == Removed()
+    assert world.records.get_field(a) == known
+    assert world.records.journal.recall_field(a) == replace(known, version=1) if known else None
+    assert world.fields() == {"a"}
+
+
+def test_rejected_fields_are_forgotten_after_a_while(world: World) -> None:
+    a = world.add_field("a", state="rejected")
+    assert world.tidy(6 * DAY_S) == Removed()
+    assert world.tidy(2 * DAY_S) == Removed(fields=(a,))
+
+
+def test_beyond_the_cap_the_oldest_go_and_the_youngest_stay(world: World) -> None:
+    a, b = world.add_field("a", 100), world.add_field("b", 100)
+    world.add_job("old", a, a, size=300)
+    world.tidy()
+    world.records.ahead_s += DAY_S / 2
+    world.add_job("new", b, b, size=300)
+    world.records.ahead_s += DAY_S / 2
+    removed = world.tidy(storage_cap_bytes=450)
+    assert (removed.jobs, removed.fields) == (("old",), (a,))
+    assert world.records.get_job("old") is None
+    assert sum(map(len, (data for key, data in world.blobs.blobs.items() if not key.startswith("journal/")))) == 400
+    world.add_job("fresh", b, b, size=300)
+    assert world.tidy(60.0, storage_cap_bytes=1).jobs == ("new",), "what is an hour old at most is not taken"
+
+
+def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
+    a = world.add_field("a")
+    world.add_job("j", a, a, size=10)
+    world.blobs.put("jobs/unknown/1/result.json", b".")
+    world.blobs.put(f"fields/{'c' * 64}/original", b".")
+    assert set(world.tidy().orphans) == {"jobs/unknown", f"fields/{'c' * 64}"}
+    assert world.fields() == {"a"}
+    assert list(world.blobs.list("jobs")) == ["jobs/j/1/result.json"]
+
+
+def test_nothing_goes_while_redis_has_lost_the_records(world: World) -> None:
+    world.add_job("j", world.add_field("a"), world.add_field("b"), size=10)
+    before = dict(world.blobs.blobs)
+    world.redis.flushall()
+    assert world.tidy(100 * DAY_S, unused_field_retention_s=60, storage_cap_bytes=1) == Removed()
+    assert world.blobs.blobs == before
+
+
+def test_a_leader_that_no_longer_leads_deletes_nothing(world: World) -> None:
+    a = world.add_field("a")
+    world.tidy()
+    world.records.ahead_s += 100 * DAY_S
+    keeper = Housekeeper(
+        world.records, world.blobs, world.redis, world.settings.model_copy(update={"unused_field_retention_s": 60})
+    )
+    with world.lease.held() as term:
+        assert term is not None
+        world.redis.delete("lease")
+        with pytest.raises(LeaseLostError):
+            keeper.run(term)
+    assert world.records.get_field(a) is not None
+
+
+def test_once_an_hour_is_enough(world: World) -> None:
+    world.blobs.put("jobs/unknown/1/result.json", b".")
+    keeper = Housekeeper(world.records, world.blobs, world.redis, world.settings)
+    with world.lease.held() as term:
+        assert term is not None
+        assert keeper.run_if_due(term).orphans == ("jobs/unknown",)
+        world.blobs.put("jobs/unknown/1/result.json", b".")
+        assert keeper.run_if_due(term) == Removed()
