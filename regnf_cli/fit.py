@@ -59,6 +59,10 @@ def fit(
     snapshots: Annotated[
         str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
     ] = None,
+    sdfstudio: Annotated[
+        Path | None,
+        typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colours included (.ckpt)."),
+    ] = None,
     start: Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")] = StartChoice.auto,
     device: Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")] = DeviceChoice.auto,
 ) -> None:
@@ -71,8 +75,13 @@ def fit(
     require("engine")
     _check(output, extent, label)
     if not source.is_dir():
-        if snapshots is not None or start is not StartChoice.auto or device is not DeviceChoice.auto:
-            raise InvalidOptionsError("--snapshots, --start and --device are for images")
+        if (
+            snapshots is not None
+            or sdfstudio is not None
+            or start is not StartChoice.auto
+            or device is not DeviceChoice.auto
+        ):
+            raise InvalidOptionsError("--snapshots, --sdfstudio, --start and --device are for images")
         settings = {"iterations": iterations} | ({} if hidden_width is None else {"hidden_width": hidden_width})
         _fit_mesh(source, output, settings, table_log2, extent, {"seed": seed, "label": label})
         return
@@ -82,7 +91,8 @@ def fit(
 
     choices: dict[str, Any] = {"iterations": iterations, "table_log2": table_log2, "start": start.value}
     choices |= {} if hidden_width is None else {"hidden_width": hidden_width}
-    fit_images(source, output, choices, snapshots, {"seed": seed, "label": label, "device": device.value})
+    files = {"snapshots": snapshots, "sdfstudio": sdfstudio}
+    fit_images(source, output, choices, files, {"seed": seed, "label": label, "device": device.value})
 
 
 def _fit_mesh(

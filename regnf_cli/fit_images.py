@@ -13,11 +13,12 @@ from regnf_core.errors import InvalidOptionsError
 
 
 def fit_images(
-    dataset: Path, output: Path, settings: dict[str, Any], snapshots: str | None, rest: dict[str, Any]
+    dataset: Path, output: Path, settings: dict[str, Any], extra: dict[str, Any], rest: dict[str, Any]
 ) -> None:
     """Fit to the images in ``dataset``.
 
-    settings: of ReconstructionOptions, and ``table_log2`` · snapshots: percents, comma-separated · rest: what
+    settings: of ReconstructionOptions, and ``table_log2`` · extra: ``snapshots``, percents between commas, and
+    ``sdfstudio``, a path, or None each · rest: what
     ``reconstruct`` takes beside.
     """
     from regnf_core.datasets.sdfstudio import load_dataset
@@ -27,7 +28,7 @@ def fit_images(
     table_log2 = settings.pop("table_log2")
     options = ReconstructionOptions(**settings)
     options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
-    files = FitFiles(output, output.with_suffix(".checkpoint"), shares(snapshots))
+    files = FitFiles(output, output.with_suffix(".checkpoint"), shares(extra["snapshots"]), extra["sdfstudio"])
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
     with Progress(*columns, console=err) as bar:
         task = bar.add_task("fitting", total=options.iterations, state="reading the images")

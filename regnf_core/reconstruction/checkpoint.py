@@ -12,7 +12,7 @@ import torch
 
 from regnf_core.errors import InvalidInputError
 
-_VERSION = 1
+_VERSION = 2
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:

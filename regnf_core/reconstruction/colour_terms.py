@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.fields.neus_facto import NeusFactoFunction
 from regnf_core.reconstruction.network import RadianceField
 from regnf_core.reconstruction.opacity import render_weights
 from regnf_core.reconstruction.rays import PixelRays
@@ -15,6 +16,7 @@ _COLOURED_SECTIONS = 3
 """On each ray the colour is evaluated in so many sections, those that count most."""
 _FREE_SAMPLES = 5
 _BAND_SAMPLES = 9
+_EVEN_SAMPLES = 24
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,27 @@ def samples_about_depth(rays: PixelRays, band: float, generator: torch.Generator
     free = start + (measured - half - start) * _stratified(len(rays), _FREE_SAMPLES, generator).to(half.device)
     close = measured - half + 2.0 * half * _stratified(len(rays), _BAND_SAMPLES, generator).to(half.device)
     return torch.cat((free, close), dim=1)
+
+
+@torch.no_grad()
+def samples_by_weight(
+    function: NeusFactoFunction, rays: PixelRays, sharpness: Tensor, generator: torch.Generator
+) -> Tensor:
+    """(R, S) ascending depths within the bounds: an even half, and a half where the field's own weights are large.
+
+    Importance sampling as in NeuS: the field is its own proposal.
+    """
+    span = (rays.far - rays.near)[:, None]
+    even = rays.near[:, None] + span * _stratified(len(rays), _EVEN_SAMPLES, generator).to(span.device)
+    weights, _ = render_weights(function.value(rays.at(even).flatten(0, 1)).view_as(even), sharpness)
+    edges = torch.nn.functional.pad(torch.cumsum(weights + 1e-4, dim=1), (1, 0))
+    edges = edges / edges[:, -1:]
+    places = _stratified(len(rays), _EVEN_SAMPLES, generator).to(span.device)
+    section = (torch.searchsorted(edges, places, right=True) - 1).clamp(0, weights.shape[1] - 1)
+    low, high = edges.gather(1, section), edges.gather(1, section + 1)
+    start, end = even.gather(1, section), even.gather(1, section + 1)
+    chosen = start + (places - low) / (high - low).clamp_min(1e-9) * (end - start)
+    return torch.cat((even, chosen), dim=1).sort(dim=1).values
 
 
 def _stratified(rays: int, count: int, generator: torch.Generator) -> Tensor:

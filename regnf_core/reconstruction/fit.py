@@ -16,11 +16,11 @@ from regnf_core.datasets.posed_images import PosedImages
 from regnf_core.errors import InvalidOptionsError, RegnfError
 from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.reconstruction.checkpoint import read_checkpoint, write_checkpoint
-from regnf_core.reconstruction.depth_terms import supervise
 from regnf_core.reconstruction.held_out import judge
 from regnf_core.reconstruction.network import DEGREE, RadianceField
 from regnf_core.reconstruction.options import ReconstructionOptions, ReconstructionProgress, ReconstructionReport
 from regnf_core.reconstruction.preparation import prepare
+from regnf_core.reconstruction.sdfstudio_export import write_sdfstudio
 from regnf_core.reconstruction.trainer import Trainer
 
 _REPORT_EVERY = 25
@@ -41,6 +41,8 @@ class FitFiles:
     output: Path
     checkpoint: Path | None = None
     snapshots: tuple[float, ...] = ()
+    sdfstudio: Path | None = None
+    """The field with its colours in the layout of sdfstudio's checkpoints, if wanted."""
 
 
 def reconstruct(
@@ -63,14 +65,15 @@ def reconstruct(
     torch_device = pick_device(device)
     rng = np.random.default_rng(seed)
     prepared = prepare(images, options.start, rng)
-    supervision = supervise(prepared.training, prepared.size, options, rng)
-    trainer = Trainer(supervision, prepared.bounds, options, prepared.start, seed, torch_device)
+    trainer = Trainer(prepared, options, seed, torch_device, rng)
     write = _Writer(options, prepared.bounds, label, source or {})
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
     write(trainer.field, files.output)
+    if files.sdfstudio is not None:
+        write_sdfstudio(trainer.field, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
     figures = judge(trainer.field, prepared.held_out.to(torch_device), prepared.size)

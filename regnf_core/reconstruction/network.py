@@ -64,6 +64,8 @@ class RadianceField(nn.Module):
         widths = [COLOUR_INPUTS + options.feature_width] + [options.hidden_width] * _COLOUR_LAYERS + [3]
         weights, biases = _random_layers(widths, generator)
         self.colour_weights, self.colour_biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        self.background = nn.Parameter(torch.zeros(3))
+        """Logit of the colour behind everything."""
         self.log_sharpness = nn.Parameter(torch.zeros(()))
         """Logarithm of the sharpness over the least one that the schedule allows."""
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from regnf_core.fields.neus_facto import NeusFactoFunction
-from regnf_core.reconstruction.colour_terms import render_rays, samples_about_depth
-from regnf_core.reconstruction.depth_terms import DepthSupervision, depth_terms
-from regnf_core.reconstruction.network import RadianceField, StartShape
+from regnf_core.reconstruction.colour_terms import render_rays, samples_about_depth, samples_by_weight
+from regnf_core.reconstruction.depth_terms import DepthSupervision, depth_terms, supervise
+from regnf_core.reconstruction.network import RadianceField
 from regnf_core.reconstruction.opacity import least_sharpness
 from regnf_core.reconstruction.options import ReconstructionOptions
+from regnf_core.reconstruction.preparation import PreparedImages
 
 _SHARPEST = 50.0
 """How far above the least sharpness the learnt one may rise."""
@@ -26,24 +28,28 @@ class Trainer:
 
     def __init__(
         self,
-        data: DepthSupervision,
-        bounds: Tensor,
+        prepared: PreparedImages,
         options: ReconstructionOptions,
-        start: StartShape,
         seed: int,
         device: torch.device,
+        rng: np.random.Generator,
     ) -> None:
         self.options = options
         self.iteration = 0
         self._losses: list[Tensor] = []
         self.generator = torch.Generator().manual_seed(seed)
-        self.field = RadianceField(options, start, self.generator).to(device)
-        self._data = data.to(device)
-        self._bounds = bounds.float().to(device)
+        self.field = RadianceField(options, prepared.start, self.generator).to(device)
+        self._size = prepared.size
+        self._rays = prepared.training.to(device)
+        self._data: DepthSupervision | None = None
+        if prepared.has_depth:
+            self._data = supervise(prepared.training, prepared.size, options, rng).to(device)
+        self._masked = bool(prepared.training.background.any())
+        self._bounds = prepared.bounds.float().to(device)
         self._device = device
         field = self.field
         networks = [*field.weights, *field.biases, *field.colour_weights, *field.colour_biases]
-        networks += [field.feature_weight, field.feature_bias]
+        networks += [field.feature_weight, field.feature_bias, field.background]
         self.optimiser = torch.optim.Adam(
             [
                 {"params": [field.table], "lr": options.table_rate, "eps": 1e-15},
@@ -76,17 +82,20 @@ class Trainer:
 
     def sharpness(self) -> Tensor:
         """The opacity's sharpness now, per field unit."""
-        least = least_sharpness(self.iteration / self.options.iterations, self._data.size)
+        least = least_sharpness(self.iteration / self.options.iterations, self._size)
         return least * self.field.log_sharpness.exp()
 
     def _loss(self) -> Tensor:
         weights = self.options.weights
         function = self.field.function()
+        if self._data is None:
+            loss, near = self._colour_alone()
+            return loss + weights.eikonal * self._eikonal(function, near)
         surface, free_space, near = depth_terms(function, self._data, self.options, self.generator)
         loss = weights.surface * surface + weights.free_space * free_space
         loss = loss + weights.eikonal * self._eikonal(function, near)
         if self.options.colour_rays > 0:
-            loss = loss + self._colour()
+            loss = loss + self._colour(self._data)
         return loss
 
     def _eikonal(self, function: NeusFactoFunction, near: Tensor) -> Tensor:
@@ -98,17 +107,32 @@ class Trainer:
         loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
         return loss
 
-    def _colour(self) -> Tensor:
+    def _colour(self, data: DepthSupervision) -> Tensor:
         """Colour and rendered depth of rays with depth, L1 both."""
-        options, data = self.options, self._data
+        options = self.options
         index = torch.randint(len(data.rays), (options.colour_rays,), generator=self.generator).to(self._device)
         rays = data.rays.take(index)
         depths = samples_about_depth(rays, 2.0 * options.band * data.size, self.generator)
-        black = torch.zeros(3, device=self._device)
-        rendered = render_rays(self.field, rays, depths, self.sharpness(), black)
+        rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
         colour = (rendered.colours - rays.colours).abs().mean()
         depth = (rendered.depths - rays.depths).abs().mean() / data.size
         return options.weights.colour * colour + options.weights.rendered_depth * depth
+
+    def _colour_alone(self) -> tuple[Tensor, Tensor]:
+        """The terms of rays without depth, and points (N, 3) close to where they end."""
+        weights = self.options.weights
+        index = torch.randint(len(self._rays), (self.options.rays_without_depth,), generator=self.generator)
+        rays, sharpness = self._rays.take(index.to(self._device)), self.sharpness()
+        depths = samples_by_weight(self.field.function(), rays, sharpness.detach(), self.generator)
+        rendered = render_rays(self.field, rays, depths, sharpness, self.field.background.sigmoid())
+        error = (rendered.colours - rays.colours).abs().mean(dim=1)
+        # what lies behind a masked thing has no colour of its own
+        loss = weights.colour * error[~rays.background].sum() / len(rays)
+        if self._masked:
+            wanted = (~rays.background).float()
+            opacity = rendered.opacity.clamp(1e-4, 1.0 - 1e-4)
+            loss = loss + weights.opacity * torch.nn.functional.binary_cross_entropy(opacity, wanted)
+        return loss, rays.at(rendered.depths.detach()[:, None])[:, 0]
 
     def state(self) -> dict[str, Any]:
         """Everything that the next iteration depends on."""
