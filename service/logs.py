@@ -5,15 +5,30 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any, Literal
 
+ACCESS_LOGGER = "service.access"
+_context: ContextVar[dict[str, Any]] = ContextVar("log_context")
 _PLAIN = "%(asctime)s %(levelname)-7s %(name)s %(message)s"
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}
 
 
+@contextmanager
+def log_context(**members: Any) -> Iterator[None]:
+    """Entries written meanwhile, in threads started meanwhile too, bear these members: request_id, job_id, caller."""
+    token = _context.set(_context.get({}) | members)
+    try:
+        yield
+    finally:
+        _context.reset(token)
+
+
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, whatever was given as ``extra``, and a traceback."""
+    """One JSON object a line: time, level, logger, message, its context, what was given as ``extra``, a traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
         entry = {
@@ -23,6 +38,7 @@ class JsonFormatter(logging.Formatter):
             "process": record.process,
             "message": record.getMessage(),
         }
+        entry |= _context.get({})
         entry |= {name: value for name, value in record.__dict__.items() if name not in _STANDARD}
         if record.exc_info:
             entry["traceback"] = self.formatException(record.exc_info)
@@ -36,6 +52,8 @@ def configure_logging(log_format: Literal["text", "json"], level: int = logging.
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level)
+    # a line for every request is for collectors; people look at what goes wrong
+    logging.getLogger(ACCESS_LOGGER).setLevel(logging.NOTSET if log_format == "json" else logging.WARNING)
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "rq.worker", "rq.job"):
         logger = logging.getLogger(name)
         logger.handlers = []

@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.dependencies import Services
 from service.figures import Figures
+from service.middleware import route_of
 from service.webhooks.outbox import RedisOutbox
 
 _COUNTS = {
@@ -156,9 +157,3 @@ class Measured:
             self._metrics.seconds.labels(route).observe((answered or time.perf_counter()) - began)
             if received:
                 self._metrics.received.labels(route).inc(received)
-
-
-def route_of(scope: Scope) -> str:
-    """The template of the route that answered, without the prefix; "other" where none did."""
-    template = str(getattr(scope.get("route"), "path", "")) or "other"
-    return template.removeprefix("/v1") or "/"

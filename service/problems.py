@@ -150,7 +150,9 @@ async def _answer(request: Request, error: Exception) -> JSONResponse:
     problem = problem_of(error)
     request_id = getattr(request.state, "request_id", None)
     if problem.reason == "INTERNAL":
-        logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error)
+        # written outside of everything that gives entries their context
+        told = {"request_id": request_id, "caller": getattr(request.state, "caller", None)}
+        logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error, extra=told)
     elif problem.reason == "STORE_UNAVAILABLE":
         request.app.state.metrics.redis_errors.inc()
     if problem.reason != "INTERNAL" and problem.status >= 500:

@@ -12,6 +12,7 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
+from service.logs import log_context
 from service.ownership import sha256_of
 from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts, verdict_of
@@ -40,6 +41,12 @@ def run_attempt(
     except StaleAttemptError as error:
         logger.info("job %s attempt %d is not run: %s", job_id, attempt, error)
         return
+    with log_context(job_id=job_id, attempt=attempt, caller=record.owner):
+        _run(context, record, make_engine)
+
+
+def _run(context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine]) -> None:
+    job_id, attempt = record.id, record.attempt
     logger.info("job %s attempt %d runs", job_id, attempt)
     with Pulse(context.records, job_id, attempt, context.settings.heartbeat_s) as pulse:
         try:

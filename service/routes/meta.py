@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import platform
 from collections.abc import Callable
+from typing import Annotated
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from redis.exceptions import RedisError
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
@@ -21,6 +22,7 @@ from service.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, V
 
 router = APIRouter(tags=["service"])
 logger = logging.getLogger(__name__)
+WorkerQuery = Annotated[bool, Query(description="Whether a live worker is asked for too.")]
 
 
 @get_and_head(router, "/healthz", summary="Whether the process answers", response_model=HealthDocument)
@@ -34,17 +36,21 @@ async def healthz() -> dict[str, str]:
     "/readyz",
     summary="Whether a registration would run",
     response_model=ReadyDocument,
-    responses=refusals("NOT_READY"),
+    responses=refusals("INVALID_QUERY", "NOT_READY"),
 )
-def readyz(services: ServicesDep) -> dict[str, object]:
-    """Records, storage and at least one live worker. A 503 has the same `checks`."""
+def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
+    """Records, storage and at least one live worker. A 503 has the same `checks`, and its detail names what is missing.
+
+    With `worker=false` no worker is asked for: whether uploads and requests would be taken, to wait for one.
+    """
     checks = {
         "records": _answers(services.records.ping),
         "storage": _answers(lambda: _storage_writes(services)),
         "worker": _answers(lambda: services.queue.live_workers() > 0),
     }
-    if not all(checks.values()):
-        raise Problem("NOT_READY", headers=RETRY_LATER, extra={"checks": checks})
+    missing = [name for name, there in checks.items() if not there and (worker or name != "worker")]
+    if missing:
+        raise Problem("NOT_READY", f"Missing: {', '.join(missing)}.", headers=RETRY_LATER, extra={"checks": checks})
     return {"status": "ready", "checks": checks}
 
 

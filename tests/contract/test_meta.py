@@ -49,7 +49,7 @@ def test_not_ready_when_something_is_missing(world: World, monkeypatch: pytest.M
     with monkeypatch.context() as patch:
         patch.setattr(world.records, "ping", away if missing == "records" else lambda: True)
         if missing == "storage":
-            patch.setattr(world.blobs, "writer", broken)
+            patch.setattr(world.blobs, "probe", broken)
         patch.setattr(world.queue, "workers", 0 if missing == "worker" else 1)
         answer = world.client.get("/readyz")
     problem = assert_refused(answer, 503, "NOT_READY")
@@ -101,3 +101,14 @@ def test_the_page_of_a_job(world: World) -> None:
     for address in loaded:
         assert world.client.get(address).status_code == 200
     assert_refused(world.client.get("/jobs/nobody/view"), 404, "JOB_NOT_FOUND")
+
+
+def test_what_takes_requests_needs_no_worker(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(world.queue, "workers", 0)
+    assert assert_refused(world.client.get("/readyz"), 503, "NOT_READY")["detail"] == "Missing: worker."
+    answer = world.client.get("/readyz", params={"worker": "false"})
+    assert (answer.status_code, answer.json()["checks"]["worker"]) == (200, False)
+    monkeypatch.setattr(world.records, "ping", lambda: False)
+    answer = world.client.get("/readyz", params={"worker": "false"})
+    assert assert_refused(answer, 503, "NOT_READY")["detail"] == "Missing: records."
+    assert_refused(world.client.get("/readyz", params={"worker": "maybe"}), 400, "INVALID_QUERY")

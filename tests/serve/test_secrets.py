@@ -1,0 +1,60 @@
+"""Tokens and webhook secrets are in no process' arguments, no log and no answer, and workers are not given them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from pathlib import Path
+
+import httpx
+
+from regnf_cli.local_service import running_service
+
+TOKEN, FILED = "token-in-the-environment-1f9c", "token-in-the-file-77aa"
+SECRET = base64.b64encode(b"a webhook secret, 26 bytes").decode()
+
+
+def descendants() -> dict[int, list[str]]:
+    """The command line of every process below this one."""
+    parents, commands = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            commands[int(folder.name)] = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
+        except OSError:  # it has just ended
+            continue
+    found, fresh = set[int](), {os.getpid()}
+    while fresh:
+        fresh = {child for child, parent in parents.items() if parent in fresh} - found
+        found |= fresh
+    return {child: commands[child] for child in found if child in commands}
+
+
+def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
+    file = tmp_path / "tokens"
+    file.write_text(f"bob:{FILED}\n")
+    state = tmp_path / "state"
+    settings = {
+        "api_tokens": json.dumps([f"alice:{TOKEN}"]),
+        "api_tokens_file": file,
+        "webhook_secrets": json.dumps([f"alice:whsec_{SECRET}"]),
+        "webhook_hosts": '["http://127.0.0.1:1"]',
+        "log_format": "json",
+    }
+    with running_service(state, **settings) as address, httpx.Client(base_url=address, timeout=30) as client:
+        texts = []
+        for token in (TOKEN, FILED, "wrong"):
+            headers = {"Authorization": f"Bearer {token}"}
+            for method, path in (("GET", "/jobs"), ("POST", "/register"), ("PUT", "/fields/x"), ("GET", "/nowhere")):
+                texts.append(client.request(method, path, headers=headers, content=b"x").text)
+        assert client.get("/jobs", headers={"Authorization": f"Bearer {FILED}"}).status_code == 200
+        running = descendants()
+        texts += [" ".join(command) for command in running.values()]
+        workers = {pid for pid, command in running.items() if "worker.main" in command}
+        assert workers
+        environments = [(Path("/proc") / str(pid) / "environ").read_bytes().decode() for pid in workers]
+    texts += [path.read_text(errors="replace") for path in state.rglob("*.log")]
+    assert any('"caller": "bob"' in text for text in texts), "the log was looked at"
+    for secret in (TOKEN, FILED, SECRET):
+        assert not [text for text in texts + environments if secret in text]
