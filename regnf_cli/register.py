@@ -102,6 +102,7 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
             request["seed"],
             lambda phase, share: bar.update(task, description=phase, completed=share),
             start,
+            clouds=output is not None,
         )
         bar.update(task, description="exporting", completed=1.0)
     write_into(output, result, truth=truth, object_name=str(object_))

@@ -15,8 +15,8 @@ from regnf_core.options import SamplingOptions
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sampling import in_detection
 
-_DENSE = 10_000
-_COARSE = 30_000
+_DENSE = 4_200
+_COARSE = 5_500
 _MARGIN = 0.02  # of the object's extent: how far beyond the samples new ones may lie
 
 

@@ -13,7 +13,7 @@ from regnf_core.result import SurfaceSamples
 
 _REACH = 1.5  # new points lie up to this many gaps from an old one
 _LARGEST_GAP = 4.0  # typical gaps; a lone stray point must not draw all new ones
-_NEWTON_STEPS = 2
+_NEWTON_STEPS = 1  # new points start within a gap of the surface
 _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
 _MIN_SLOPE = 0.25  # squared gradient below which a Newton step is not trusted to its full length
 

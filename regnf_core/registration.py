@@ -23,13 +23,16 @@ def register(
     progress: ProgressCallback | None = None,
     T_object_scene_start: Sim3 | None = None,
     object_model: ObjectModel | None = None,
+    clouds: bool = True,
 ) -> RegistrationResult:
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
     raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, anything else
     is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.object_model.model_object` made of
-    ``obj`` earlier. Deterministic for a seed, on one machine and with the same number of threads.
+    ``obj`` earlier. Without ``clouds`` the result has the engine's own samples alone, and neither residuals nor
+    surroundings: for who draws no pictures.
+    Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()
@@ -38,8 +41,9 @@ def register(
         result = register_robust(scene, obj, detection, options, seed, run, T_object_scene_start, object_model)
     else:
         result = register_paper(scene, obj, detection, options, seed, run)
-    with run.phase("exporting"):
-        result = with_clouds(result, scene, obj, detection, options.sampling)
+    if clouds:
+        with run.phase("exporting"):
+            result = with_clouds(result, scene, obj, detection, options.sampling)
     run.report("exporting", 1.0)
     result.metrics.update(run.seconds)
     return result

@@ -58,7 +58,7 @@ def run_one(job: Job, measure: Callable[[Case, RegistrationResult], dict[str, An
     begun = time.perf_counter()
     found: Run
     try:
-        result = register(case.scene, case.obj, case.detection, job.options, job.seed)
+        result = register(case.scene, case.obj, case.detection, job.options, job.seed, clouds=False)
     except RegnfError as error:
         found = {"seconds": time.perf_counter() - begun, **judge_error(error)}
     else:

@@ -38,6 +38,21 @@ def test_any_scale_and_orientation(ratio: float) -> None:
     assert result.metrics["field_evaluations"] <= 150_000
 
 
+def test_clouds_are_dense_cheap_and_left_out_when_nobody_asks() -> None:
+    scene, obj = room(chair_pose()), chair()
+    plain = register(scene, obj, detection(), ROBUST, clouds=False)
+    shown = register(scene, obj, detection(), ROBUST)
+    torch.testing.assert_close(plain.T_object_scene.matrix(), shown.T_object_scene.matrix(), rtol=0, atol=0)
+    assert plain.surroundings is None
+    assert plain.residuals == {}
+    assert "field_evaluations_clouds" not in plain.metrics
+    assert shown.metrics["field_evaluations_clouds"] <= 40_000
+    assert len(shown.scene_samples.points) > 3000
+    assert len(shown.object_samples.points) > 3000
+    off_surface = obj.signed_distance(shown.object_samples.points).abs().max()
+    assert off_surface < 0.005 * shown.metrics["object_diameter"]
+
+
 def test_upside_down() -> None:
     over = Sim3.from_quaternion(1.0, [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     scene, obj, box, truth = reframed(over, Sim3.identity())
