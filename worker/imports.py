@@ -13,6 +13,7 @@ from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import RegnfError
 from regnf_core.importing.picture import PICTURE_NAME
+from service.blobs import StorageUnavailableError
 from service.records import FieldRecord, StaleAttemptError
 from worker.context import Context
 from worker.engine import Importer
@@ -33,7 +34,7 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
 
     The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
     record, or one that has ended and an original of their own. Writes that Redis refuses for a while are waited for,
-    until the import's time is over. Raises RedisError when the end cannot be written down.
+    until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down.
     """
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
@@ -44,7 +45,7 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         return
     try:
         report = _standing_report(context, field) or _work(context, field, importer)
-    except RedisError:
+    except (RedisError, StorageUnavailableError):
         raise
     except RegnfError as error:
         _refuse(context, sha256, attempt, problem(error.reason, str(error)))

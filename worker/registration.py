@@ -13,6 +13,7 @@ from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from service.logs import log_context
+from service.blobs import StorageUnavailableError
 from service.ownership import sha256_of
 from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts, verdict_of
@@ -33,8 +34,8 @@ def run_attempt(
     """Claim the attempt, do its work with the engine, write down how it ended.
 
     Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
-    refuses for a while are waited for, until the job's time is over. Raises RedisError and OSError of the network kind
-    when the end cannot be written down; the worker's parent process then sees to it.
+    refuses for a while are waited for, until the job's time is over. Raises RedisError, StorageUnavailableError and
+    OSError of the network kind when the end cannot be written down; the worker's parent process then sees to it.
     """
     try:
         record = _update(context, job_id, attempt, status="running", phase="loading", worker=worker)
@@ -56,7 +57,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
             _end(context, job_id, attempt, status="dismissed")
         except FieldsNotReadyError:
             _give_back(context, job_id, attempt)
-        except RedisError:
+        except (RedisError, StorageUnavailableError):
             raise
         except RegnfError as error:
             _fail(context, job_id, attempt, problem(error.reason, str(error)))

@@ -30,6 +30,11 @@ class HorseEnd:
     given_back: bool = False
     """The worker itself was told to stop and took its job down with it."""
 
+    @property
+    def by_itself(self) -> bool:
+        """Neither killed nor too slow: for want of Redis or storage, as a rule."""
+        return self.signal is None and not self.late
+
     def reason(self) -> str:
         if self.late:
             return "JOB_TIMEOUT"
@@ -65,11 +70,10 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
         context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
         return
     discard(context.blobs, job_id, attempt)
-    by_itself = end.signal is None and not end.late
     changes: dict[str, Any]
     if record.cancel_requested:
         changes = {"status": "dismissed"}
-    elif end.given_back or (by_itself and record.requeues == 0):
+    elif end.given_back or (end.by_itself and record.requeues == 0):
         again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
         context.queue.enqueue_registration(job_id, again.attempt)
         logger.warning("job %s attempt %d is to be run again", job_id, attempt)
@@ -81,15 +85,15 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
 
 
 def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: HorseEnd) -> None:
-    """The same for an import: one that was given back starts anew, everything else has the field rejected."""
+    """The same for an import: one that was given back, or ended by itself, starts anew; others have it rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         return
     if not claim_import(context, sha256, attempt, worker):
         return
-    if end.given_back:
+    if end.given_back or (end.by_itself and field.requeues == 0):
         try:
-            again = context.records.retry_import(sha256, attempt, lost=False)
+            again = context.records.retry_import(sha256, attempt, lost=not end.given_back)
         except StaleAttemptError:
             return
         context.queue.enqueue_import(sha256, again.attempt)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from service.blobs import BlobStore, StorageFullError
+from service.blobs import BlobStore, StorageFullError, StorageUnavailableError
+from service.file_cache import FileCache
 from service.local_blobs import LocalBlobStore
 from service.memory import InMemoryBlobStore
 from service.object_blobs import ObjectBlobStore
@@ -127,6 +128,34 @@ def test_a_large_blob_that_breaks_off_leaves_nothing(store: BlobStore) -> None:
         writer.write(b"broken off" + None)  # type: ignore[operator]
     assert list(store.list("")) == []
     assert store.sweep(0.0) == 0
+
+
+def test_copies_of_fields_are_kept_until_the_field_changes(objects: ObjectServer, tmp_path: Path) -> None:
+    cache = FileCache(tmp_path / "cache", 100)
+    with environment(objects.environment):
+        store = ObjectBlobStore(f"s3://{objects.new_bucket()}", cache=cache)
+        for data in (b"first", b"first", b"another"):
+            store.put("fields/f/field.safetensors", data)
+            with store.local_copy("fields/f/field.safetensors") as path:
+                assert path.read_bytes() == data
+                assert path.parent == tmp_path / "cache"
+        store.delete("fields/f/field.safetensors")
+        with pytest.raises(FileNotFoundError), store.local_copy("fields/f/field.safetensors"):
+            pass
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+def test_a_store_that_is_away_is_told_after_some_patience(tmp_path: Path) -> None:
+    with environment(
+        {"AWS_ENDPOINT_URL": "http://127.0.0.1:1", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
+    ):
+        store = ObjectBlobStore("s3://bucket", patience_s=0.2)
+    for use in (store.probe, lambda: store.open("a"), lambda: store.put("a", b"."), lambda: list(store.list(""))):
+        with pytest.raises(StorageUnavailableError):
+            use()
+    with pytest.raises(StorageUnavailableError), store.writer() as writer:  # noqa: PT012
+        writer.write(bytes(20 << 20))
+        writer.commit("a")
 
 
 def test_a_store_that_takes_bytes_says_so(store: BlobStore) -> None:

@@ -1,0 +1,89 @@
+"""Storage that stays away longer than the worker's patience: the work is done once more, nobody is told a fault."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from service.blobs import StorageUnavailableError
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.records import FieldRecord, JobRecord
+from service.settings import Settings
+from tests.worker.tiny_engine import TinyEngine, tiny_importer
+from worker import kernel
+from worker.context import Context
+from worker.imports import run_import_attempt
+from worker.registration import run_attempt
+from worker.settle import HorseEnd, settle_import, settle_registration
+
+SHA = "a" * 64
+
+
+class AwayStore(InMemoryBlobStore):
+    """Takes nothing while it is away."""
+
+    away = False
+
+    def put(self, key: str, data: bytes) -> None:
+        if self.away:
+            raise StorageUnavailableError("away")
+        super().put(key, data)
+
+
+@pytest.fixture
+def store() -> AwayStore:
+    return AwayStore()
+
+
+@pytest.fixture
+def context(tmp_path: Path, store: AwayStore) -> Context:
+    settings = Settings(state_dir=tmp_path, heartbeat_s=0.05)
+    return Context(settings, InMemoryRecordStore(), store, InMemoryJobQueue())
+
+
+def test_a_job_whose_result_cannot_be_stored_is_run_again(context: Context, store: AwayStore) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
+    store.put(f"fields/{SHA}/field.safetensors", b"f")
+    request = {"scene": SHA, "object": SHA, "options": {"do": "succeed"}}
+    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+    store.away = True
+    with pytest.raises(StorageUnavailableError):
+        run_attempt(context, "j1", 1, "w", TinyEngine)
+    running = context.records.get_job("j1")
+    assert running is not None
+    assert (running.status, running.error) == ("running", None)
+    store.away = False
+    settle_registration(context, "j1", 1, "w", HorseEnd())
+    run_attempt(context, "j1", 2, "w", TinyEngine)
+    done = context.records.get_job("j1")
+    assert done is not None
+    assert (done.status, done.attempt) == ("successful", 2)
+
+
+def test_an_import_whose_field_cannot_be_stored_is_done_again_once(context: Context, store: AwayStore) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
+    store.put(f"fields/{SHA}/original", b"f")
+    store.away = True
+    states = []
+    for attempt in (1, 2):
+        with pytest.raises(StorageUnavailableError):
+            run_import_attempt(context, SHA, attempt, "w", tiny_importer)
+        settle_import(context, SHA, attempt, "w", HorseEnd())
+        record = context.records.get_field(SHA)
+        assert record is not None
+        states.append((record.state, record.attempt, (record.error or {}).get("reason")))
+    assert states == [("validating", 2, None), ("rejected", 2, "INTERNAL")]
+    assert context.queue.holds_import(SHA, 2)
+
+
+def test_work_in_a_child_changes_nothing_here(tmp_path: Path) -> None:
+    parent = os.getpid()
+
+    def tell() -> None:
+        (tmp_path / "pid").write_text(str(os.getpid()))
+
+    assert kernel.in_child(tell)
+    assert int((tmp_path / "pid").read_text()) != parent
+    assert not kernel.in_child(lambda: os.kill(os.getpid(), 9))
