@@ -12,8 +12,8 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
-from service.logs import log_context
 from service.blobs import StorageUnavailableError
+from service.logs import log_context
 from service.ownership import sha256_of
 from service.records import FieldRecord, JobRecord, StaleAttemptError
 from worker.artifacts import Manifest, discard, discard_others, publish, read_manifest, store_artifacts, verdict_of
