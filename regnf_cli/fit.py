@@ -63,6 +63,9 @@ def fit(
         Path | None,
         typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colours included (.ckpt)."),
     ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")
+    ] = False,
     start: Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")] = StartChoice.auto,
     device: Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")] = DeviceChoice.auto,
 ) -> None:
@@ -78,10 +81,11 @@ def fit(
         if (
             snapshots is not None
             or sdfstudio is not None
+            or pictures
             or start is not StartChoice.auto
             or device is not DeviceChoice.auto
         ):
-            raise InvalidOptionsError("--snapshots, --sdfstudio, --start and --device are for images")
+            raise InvalidOptionsError("--snapshots, --sdfstudio, --pictures, --start and --device are for images")
         settings = {"iterations": iterations} | ({} if hidden_width is None else {"hidden_width": hidden_width})
         _fit_mesh(source, output, settings, table_log2, extent, {"seed": seed, "label": label})
         return
@@ -91,7 +95,7 @@ def fit(
 
     choices: dict[str, Any] = {"iterations": iterations, "table_log2": table_log2, "start": start.value}
     choices |= {} if hidden_width is None else {"hidden_width": hidden_width}
-    files = {"snapshots": snapshots, "sdfstudio": sdfstudio}
+    files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures}
     fit_images(source, output, choices, files, {"seed": seed, "label": label, "device": device.value})
 
 

@@ -18,7 +18,7 @@ def fit_images(
     """Fit to the images in ``dataset``.
 
     settings: of ReconstructionOptions, and ``table_log2`` · extra: ``snapshots``, percents between commas, and
-    ``sdfstudio``, a path, or None each · rest: what
+    ``sdfstudio``, a path, or None each; ``pictures``, whether to draw · rest: what
     ``reconstruct`` takes beside.
     """
     from regnf_core.datasets.sdfstudio import load_dataset
@@ -28,7 +28,13 @@ def fit_images(
     table_log2 = settings.pop("table_log2")
     options = ReconstructionOptions(**settings)
     options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
-    files = FitFiles(output, output.with_suffix(".checkpoint"), shares(extra["snapshots"]), extra["sdfstudio"])
+    files = FitFiles(
+        output,
+        output.with_suffix(".checkpoint"),
+        shares(extra["snapshots"]),
+        pictures=extra["pictures"],
+        sdfstudio=extra["sdfstudio"],
+    )
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
     with Progress(*columns, console=err) as bar:
         task = bar.add_task("fitting", total=options.iterations, state="reading the images")

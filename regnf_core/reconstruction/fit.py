@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
 import time
@@ -13,8 +14,10 @@ import numpy as np
 import torch
 
 from regnf_core.datasets.posed_images import PosedImages
-from regnf_core.errors import InvalidOptionsError, RegnfError
+from regnf_core.errors import InvalidInputError, InvalidOptionsError, NoSurfaceError, RegnfError
+from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.safe_format import write_safe_field
+from regnf_core.pictures.field_picture import field_picture
 from regnf_core.reconstruction.checkpoint import read_checkpoint, write_checkpoint
 from regnf_core.reconstruction.held_out import judge
 from regnf_core.reconstruction.network import DEGREE, RadianceField
@@ -25,6 +28,7 @@ from regnf_core.reconstruction.trainer import Trainer
 
 _REPORT_EVERY = 25
 _CHECKPOINTS = 10
+_PICTURES = (0.03, 0.1, 0.3)
 
 
 class FitDivergedError(RegnfError):
@@ -41,6 +45,8 @@ class FitFiles:
     output: Path
     checkpoint: Path | None = None
     snapshots: tuple[float, ...] = ()
+    pictures: bool = False
+    """Draw the field after 3, 10 and 30 % of the iterations and at the end, beside ``output``, as .png."""
     sdfstudio: Path | None = None
     """The field with its colours in the layout of sdfstudio's checkpoints, if wanted."""
 
@@ -72,6 +78,8 @@ def reconstruct(
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
     write(trainer.field, files.output)
+    if files.pictures:
+        _draw(trainer.field, prepared.bounds, files.output.with_suffix(".png"))
     if files.sdfstudio is not None:
         write_sdfstudio(trainer.field, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
     if files.checkpoint is not None:
@@ -103,6 +111,7 @@ def _train(
     """Run the iterations that are left; the mean loss of the last ones."""
     total = trainer.options.iterations
     snapshots = {max(1, round(share * total)): share for share in files.snapshots}
+    pictures = {max(1, round(share * total)): share for share in _PICTURES if files.pictures}
     interval = max(1, total // _CHECKPOINTS)
     started, first = time.monotonic(), trainer.iteration
     recent = math.nan
@@ -111,9 +120,12 @@ def _train(
         done = trainer.iteration
         if done in snapshots:
             write(trainer.field, snapshot_path(files.output, snapshots[done]))
+        if done in pictures:
+            drawn = snapshot_path(files.output, pictures[done]).with_suffix(".png")
+            _draw(trainer.field, write.bounds, drawn)
         if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
             recent = trainer.mean_loss()
-            if not math.isfinite(recent):
+            if not math.isfinite(recent) or not trainer.is_finite():
                 raise FitDivergedError(f"the fit diverged about iteration {done}")
             if files.checkpoint is not None and done % interval == 0 and done < total:
                 write_checkpoint(files.checkpoint, trainer.state(), key)
@@ -125,6 +137,12 @@ def _train(
 def snapshot_path(output: Path, share: float) -> Path:
     """Where the field after a share of the iterations goes: NAME-after-3-percent.safetensors."""
     return output.with_name(f"{output.stem}-after-{100.0 * share:g}-percent{output.suffix}")
+
+
+def _draw(field: RadianceField, bounds: torch.Tensor, path: Path) -> None:
+    """A picture of the field as it is; none where it has no surface, or is not finite."""
+    with contextlib.suppress(NoSurfaceError, InvalidInputError):
+        field_picture(NeusFactoField(field.function(), bounds)).save(path)
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,10 @@ class Trainer:
         losses, self._losses = self._losses, []
         return float(torch.stack(losses).mean()) if losses else math.nan
 
+    def is_finite(self) -> bool:
+        """Whether all parameters are numbers."""
+        return all(bool(torch.isfinite(parameter).all()) for parameter in self.field.parameters())
+
     def step(self) -> None:
         """One iteration."""
         share = self.options.rate_share(self.iteration)

@@ -42,7 +42,9 @@ def surface_errors(field, distance):
 
 def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
     path = tmp_path / "field.safetensors"
-    report = reconstruct(scenes.images(), FitFiles(path, snapshots=(0.03,)), SMALL, device="cpu", label="two")
+    report = reconstruct(
+        scenes.images(), FitFiles(path, snapshots=(0.03,), pictures=True), SMALL, device="cpu", label="two"
+    )
     error, matter = surface_errors(open_field(path), scenes.distance)
     assert error < 0.01
     assert matter == 0.0
@@ -51,6 +53,7 @@ def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
     description = read_description(path)
     assert description["label"] == "two"
     assert np.allclose(description["bounds"], scenes.BOUNDS)
+    assert {"field.png", "field-after-10-percent.png"} <= {each.name for each in tmp_path.iterdir()}
     early, _ = surface_errors(open_field(tmp_path / "field-after-3-percent.safetensors"), scenes.distance)
     assert early > 2.0 * error
 
@@ -58,7 +61,7 @@ def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
 def test_colours_alone_find_the_ball(tmp_path):
     images = replace(scenes.images(count=12, ball_alone=True), depths=None)
     path = tmp_path / "field.safetensors"
-    short, whole = replace(SMALL, iterations=5), replace(SMALL, iterations=300)
+    short, whole = replace(SMALL, iterations=5), replace(SMALL, iterations=200)
     first = reconstruct(images, FitFiles(tmp_path / "first.safetensors"), short, device="cpu")
     report = reconstruct(images, FitFiles(path), whole, device="cpu")
     assert report.psnr is not None
