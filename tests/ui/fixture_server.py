@@ -9,6 +9,7 @@ the detection), broken (damaged clouds), searched (the best of a library) or tip
 
 from __future__ import annotations
 
+import io
 import json
 import mimetypes
 import re
@@ -17,6 +18,8 @@ import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, ClassVar
+
+from PIL import Image
 
 from tests.ui.synthetic import JOB_ID, Synthetic, synthetic
 from tests.ui.verdicts import ambiguous_result, searched_result
@@ -130,8 +133,15 @@ FAILURE = {
 }
 
 
+def field_picture(sha256: str) -> bytes:
+    """A PNG in a colour of its own, by which a test tells it from another field's."""
+    buffer = io.BytesIO()
+    Image.new("RGB", (96, 32), f"#{sha256[:6]}").save(buffer, "PNG")
+    return buffer.getvalue()
+
+
 class Handler(BaseHTTPRequestHandler):
-    """GET and POST below /jobs/{story}, static files below /static."""
+    """GET and POST below /jobs/{story}, pictures below /fields, static files below /static."""
 
     protocol_version = "HTTP/1.1"
     stage: ClassVar[Stage]
@@ -140,6 +150,11 @@ class Handler(BaseHTTPRequestHandler):
         path = self.path.split("?")[0]
         if path.startswith("/static/"):
             return self._file(WEB / path.removeprefix("/static/"))
+        picture = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})/preview\.png", path)
+        if picture:
+            if "/locked/" in self.headers.get("Referer", "") and self.headers.get("Authorization") != f"Bearer {TOKEN}":
+                return self._problem(401, "UNAUTHENTICATED")
+            return self._bytes(200, field_picture(picture[1]), "image/png")
         match = re.fullmatch(r"(?:/v1)?/jobs/(\w+)(/.*)?", path)
         if not match:
             return self._problem(404, "NOT_FOUND")

@@ -17,13 +17,16 @@ from playwright.sync_api import expect
 
 from service.app import create_app
 from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import JobRecord
+from service.ownership import ANONYMOUS, reference_of
+from service.records import FieldRecord, JobRecord
 from service.settings import Settings
 from tests.ui.conftest import Visit
+from tests.ui.fixture_server import field_picture
 from tests.ui.pixels import canvas_pixels, coloured
 from tests.ui.synthetic import JOB_ID, Synthetic
 
 pytestmark = pytest.mark.browser
+SCENE, OBJECT = "a3" * 32, "7c" * 32
 
 
 @dataclass(frozen=True)
@@ -53,12 +56,24 @@ class RealService:
 
 
 @contextmanager
-def real_service(detection: dict[str, object], settings: Settings) -> Iterator[RealService]:
+def real_service(detection: dict[str, object], settings: Settings, owner: str = ANONYMOUS) -> Iterator[RealService]:
     records, blobs = InMemoryRecordStore(), InMemoryBlobStore()
     now = time.time()
-    inputs = {"scene": "a3" * 32, "object": "7c" * 32, "seed": 7, "detection": detection}
-    job = JobRecord(JOB_ID, "registration", "accepted", request={}, inputs=inputs, created=now, updated=now)
+    inputs = {"scene": SCENE, "object": OBJECT, "seed": 7, "detection": detection}
+    job = JobRecord(
+        JOB_ID,
+        "registration",
+        "accepted",
+        request={"scene": reference_of(owner, SCENE)},
+        inputs=inputs,
+        created=now,
+        updated=now,
+    )
     records.create_job(job, max_active=10)
+    for sha256 in (SCENE, OBJECT):
+        reference = reference_of(owner, sha256)
+        records.create_field(FieldRecord(reference, "ready", bytes=1, created=now, updated=now))
+        blobs.put(f"fields/{reference}/preview.png", field_picture(sha256))
     app = create_app(settings, records, blobs, InMemoryJobQueue())
     server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -90,6 +105,7 @@ def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
         page.wait_for_selector("#legend svg rect")
         assert page.locator("#box-chip").is_visible()
         assert "result.json" in page.locator("#files").inner_text()
+        expect(page.locator("#field-pictures canvas")).to_have_count(2)
         assert visit.complaints == []
         assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
         page.goto("about:blank")  # lets go of the connections before the server ends
@@ -106,8 +122,8 @@ def test_failed_job_of_the_real_service(visit: Visit) -> None:
 
 
 def test_page_of_a_guarded_service_asks_for_the_token(visit: Visit) -> None:
-    settings = Settings(api_tokens=frozenset({"open-sesame"}))
-    with real_service(visit.server.stage.data.detection, settings) as service:
+    settings = Settings(api_tokens=frozenset({"robot:open-sesame"}))
+    with real_service(visit.server.stage.data.detection, settings, owner="robot") as service:
         service.records.update_job(JOB_ID, 1, status="running")
         service.finish(visit.server.stage.data)
         page = visit.page

@@ -209,6 +209,33 @@ def test_every_artifact_can_be_downloaded(visit: Visit, tmp_path: Path) -> None:
     assert (tmp_path / "trace.json").read_bytes() == artifacts["trace.json"]
 
 
+def colours_of_the_fields(visit: Visit) -> list[str]:
+    """The colour in the middle of each field's picture; the fixture's are all of one colour."""
+    visit.page.wait_for_selector("#fields:not([hidden])")
+    program = """all => all.map(one => {
+        const [r, g, b] = one.getContext('2d').getImageData(one.width / 2, one.height / 2, 1, 1).data;
+        return [r, g, b].map(value => value.toString(16).padStart(2, '0')).join('');
+    })"""
+    colours: list[str] = visit.page.locator("#field-pictures canvas").evaluate_all(program)
+    return colours
+
+
+def test_the_fields_pictures_are_shown(visit: Visit) -> None:
+    page = visit.open("done")
+    assert colours_of_the_fields(visit) == ["a3" * 3, "7c" * 3]
+    assert page.locator("#field-pictures figcaption").all_inner_texts() == ["Scene", "Object"]
+    labels = page.locator("#field-pictures canvas").evaluate_all("all => all.map(one => one.ariaLabel)")
+    assert [label.split(":")[0] for label in labels] == ["Scene", "Object"]
+
+
+def test_fields_without_a_picture_have_no_card(visit: Visit) -> None:
+    visit.page.route("**/preview.png", lambda route: route.fulfill(status=404, json={"reason": "NONE"}))
+    with visit.page.expect_response("**/preview.png"):
+        page = visit.open("done")
+    assert page.locator("#fields").is_hidden()
+    assert page.locator("#verdict-word").inner_text() == "Registered"
+
+
 def test_sparse_result_is_shown_without_trace_and_start(visit: Visit) -> None:
     page = visit.open("bare")
     assert coloured(canvas_pixels(page), "blue").mean() > 0.01
@@ -239,6 +266,7 @@ def test_token_opens_page_and_downloads(visit: Visit, tmp_path: Path) -> None:
     page.locator("#token").fill(TOKEN)
     page.keyboard.press("Enter")
     page.wait_for_selector("#tools:not([hidden])")
+    assert len(colours_of_the_fields(visit)) == 2
     with page.expect_download() as download:
         page.locator("#files a", has_text="trace.json").click()
     download.value.save_as(tmp_path / "trace.json")

@@ -53,14 +53,23 @@ export class JobApi {
     return (await this.open(`/artifacts/${encodeURIComponent(name)}`)).arrayBuffer();
   }
 
+  /** The picture of a field, a PNG. */
+  async fieldPicture(sha256) {
+    return (await this.request(`${this.base.replace(/\/jobs\/[^/]*$/, '')}/fields/${sha256}/preview.png`)).blob();
+  }
+
   async cancel() {
     await this.open('/cancel', { method: 'POST' });
   }
 
   /** A successful response below the job's address; everything else becomes an ApiProblem. */
-  async open(path, { method = 'GET', headers = {}, signal } = {}) {
+  async open(path, options) {
+    return this.request(this.base + path, options);
+  }
+
+  async request(address, { method = 'GET', headers = {}, signal } = {}) {
     const authorised = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
-    const response = await fetch(this.base + path, { method, headers: authorised, signal, cache: 'no-cache' });
+    const response = await fetch(address, { method, headers: authorised, signal, cache: 'no-cache' });
     if (response.ok) return response;
     throw new ApiProblem(response.status, await problemOf(response));
   }

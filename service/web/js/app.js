@@ -5,6 +5,7 @@ import { showCertainty } from './certainty.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
 import { announce, byId, copyText, show } from './dom.js';
 import { followJob } from './events.js';
+import { showFields } from './fields.js';
 import { prefersStillness } from './motion.js';
 import { showOptions } from './options.js';
 import {
@@ -26,6 +27,7 @@ async function main() {
   try {
     let job = await api.job();
     showJob(job);
+    showFields(api, job);
     if (isActive(job)) {
       showActive(job);
       job = await followJob(api, job, showActive, showTrouble);
@@ -59,6 +61,7 @@ async function showResult(job, result) {
   showTimes(result.metrics);
   showFiles(api, artifacts);
   showJob(job, result);
+  showFields(api, job, result);
   if (frames.length) await showStage(job, result, frames, names);
   else showFilesOnly();
 }
