@@ -16,7 +16,8 @@ def worker(
 ) -> None:
     """Take jobs from the service's queue until told to stop; a running job goes back to the queue.
 
-    It needs the service's Redis and its storage folder (REGNF_STATE_DIR). What is not given here is read from REGNF_*.
+    It needs the service's Redis and its storage (REGNF_STORAGE_URL, or the same REGNF_STATE_DIR). What is not given
+    here is read from REGNF_*.
 
     Example: **regnf worker --redis-url redis://queue:6379/0**
     """

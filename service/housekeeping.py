@@ -72,6 +72,7 @@ class Housekeeper:
             return Removed()  # what Redis has lost must not pass for what nobody needs
         temporary = self._blobs.sweep(_ORPHANED_AFTER_S)
         folders = self._folders()
+        self._forget_expired(term)
         orphans = tuple(self._drop_orphans(term, folders))
         fields = self._unused_fields()
         now = self._records.now()
@@ -96,6 +97,18 @@ class Housekeeper:
                 kept = found[folder]
                 found[folder] = Kept(kept.bytes + entry.bytes, max(kept.modified, entry.modified))
         return found
+
+    def _forget_expired(self, term: Term) -> None:
+        """What the journal still says of jobs whose records went while somebody died."""
+        for job_id in self._records.journal.jobs():
+            if self._records.get_job(job_id) is not None:
+                continue
+            now = self._records.now()
+            job = self._records.journal.recall(job_id, now)
+            if job is not None and self._records.has_expired(job, now):
+                term.confirm()
+                self._blobs.delete_prefix(f"jobs/{job_id}")
+                self._records.journal.forget(job_id)
 
     def _drop_orphans(self, term: Term, folders: dict[str, Kept]) -> Iterator[str]:
         """Folders that were written a day ago at least and belong to no record."""

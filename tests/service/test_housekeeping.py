@@ -159,6 +159,19 @@ def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
     assert list(world.blobs.list("jobs")) == ["jobs/j/1/result.json"]
 
 
+def test_the_journal_of_a_job_whose_record_has_expired_goes_too(world: World) -> None:
+    """Its record went, and whoever saw to that died before the rest was done."""
+    a = world.add_field("a")
+    for job_id in ("dead", "alive"):
+        world.add_job(job_id, a, a, size=10)
+    world.redis.delete("regnf:job:dead")
+    world.tidy()
+    assert list(world.records.journal.jobs()) == ["alive", "dead"], "not before its time"
+    world.tidy(8 * DAY_S)
+    assert list(world.records.journal.jobs()) == ["alive"]
+    assert list(world.blobs.list("jobs")) == ["jobs/alive/1/result.json"]
+
+
 def test_nothing_goes_while_redis_has_lost_the_records(world: World) -> None:
     world.add_job("j", world.add_field("a"), world.add_field("b"), size=10)
     before = dict(world.blobs.blobs)
