@@ -3,8 +3,8 @@
     python -m benchmarks.fuzz_uploads [--cases 1000] [--seed 1] [--output benchmarks/results/fuzz_uploads.md]
 
 The files are those of benchmarks.fuzz_gate. A case fails if the API answers 5xx or not at all, if the field does not
-come to ``ready`` or ``rejected`` in three minutes, or if a rejected file leaves anything in the store; the run also if a
-traceback is logged, a process ends, or a sound upload is not taken afterwards. Ends with status 1 if there are any.
+come to ``ready`` or ``rejected`` in three minutes, or if a rejected file leaves anything in the store; the run also if
+a traceback is logged, a process ends, or a sound upload is not taken afterwards. Ends with status 1 if there are any.
 """
 
 from __future__ import annotations
