@@ -85,7 +85,11 @@ class _Held(Collector):
         for labels, count in sorted(Tally((job.status, job.phase or "") for job in active).items()):
             jobs.add_metric(labels, count)
         yield jobs
-        yield _gauge("imports_active", "Imports that wait or run.", len(services.records.validating_fields()))
+        imports = len(services.records.validating_fields())
+        yield _gauge("imports_active", "Imports that wait or run.", imports)
+        yield _gauge(
+            "unfinished", "Jobs and imports that wait or run: what workers are needed for.", len(active) + imports
+        )
         yield _gauge("workers", "Workers that have reported lately.", services.queue.live_workers())
         if self._redis is None:
             return

@@ -1,4 +1,4 @@
-"""Takes messages from the outbox and sends them until they are received, or for a day and a half in vain."""
+"""Takes messages from the outbox and sends them until they are received, or for some 32 hours in vain."""
 
 from __future__ import annotations
 

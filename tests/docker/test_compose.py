@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from service.settings import Settings
 from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
 
-every_service = pytest.mark.parametrize("name", ["redis", "api", "worker"])
+every_service = pytest.mark.parametrize("name", ["redis", "api", "worker", "worker-gpu", "prometheus", "grafana"])
 # Read by the compose file itself, not by the program.
 COMPOSE_ONLY = {"REGNF_PUBLISH"}
 
@@ -30,7 +31,41 @@ def test_follows_the_compose_specification() -> None:
 
 
 def test_holds_exactly_these_services() -> None:
-    assert set(services()) == {"redis", "api", "worker"}
+    profiles = {name: service.get("profiles") for name, service in services().items()}
+    assert profiles == {
+        "redis": None,
+        "api": None,
+        "worker": ["cpu"],
+        "worker-gpu": ["gpu"],
+        "prometheus": ["observability"],
+        "grafana": ["observability"],
+    }
+
+
+def test_the_gpu_is_for_its_own_profile() -> None:
+    reserved = services()["worker-gpu"]["deploy"]["resources"]["reservations"]["devices"]
+    assert reserved == [{"driver": "nvidia", "count": 1, "capabilities": ["gpu"]}]
+    assert services()["worker-gpu"]["environment"]["REGNF_DEVICE"] == "cuda"
+    assert "reservations" not in services()["worker"]["deploy"]["resources"]
+
+
+def test_what_watches_finds_what_it_watches() -> None:
+    config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yaml").read_text())
+    (job,) = config["scrape_configs"]
+    port = services()["api"]["environment"]["REGNF_METRICS_PORT"]
+    assert (job["job_name"], job["static_configs"]) == ("regnf", [{"targets": [f"api:{port}"]}])
+    for rules in config["rule_files"]:
+        assert (ROOT / "deploy/prometheus" / Path(rules).name).is_file()
+    folder = ROOT / "deploy/grafana/provisioning"
+    (source,) = yaml.safe_load((folder / "datasources/prometheus.yaml").read_text())["datasources"]
+    assert source["url"] == "http://prometheus:9090"
+    (boards,) = yaml.safe_load((folder / "dashboards/regnf.yaml").read_text())["providers"]
+    mounted = [volume.split(":")[1] for volume in services()["grafana"]["volumes"]]
+    assert f"{boards['options']['path']}/regnf.json" in mounted
+    for name in ("prometheus", "grafana"):
+        for volume in services()[name]["volumes"]:
+            source_path = volume.split(":")[0]
+            assert not source_path.startswith("..") or (ROOT / "docker" / source_path).exists()
 
 
 @every_service
@@ -63,7 +98,7 @@ def test_redis_forgets_nothing() -> None:
     assert int(memory[1]) * 2 <= int(redis["deploy"]["resources"]["limits"]["memory"].removesuffix("M"))
 
 
-@pytest.mark.parametrize("name", ["api", "worker"])
+@pytest.mark.parametrize("name", ["api", "worker", "worker-gpu"])
 def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
     service = services()[name]
     assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
@@ -75,15 +110,19 @@ def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
 def test_volumes_and_networks_are_declared() -> None:
     document = compose()
     used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
+    used = {name for name in used if not name.startswith("..")}
     assert used == set(document["volumes"])
     assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
 
 
 def test_only_the_api_can_be_reached_and_only_from_this_machine() -> None:
     published = {name: service["ports"] for name, service in services().items() if "ports" in service}
-    assert published == {"api": ["${REGNF_PUBLISH:-127.0.0.1:8080}:8080"]}
+    assert published == {
+        "api": ["${REGNF_PUBLISH:-127.0.0.1:8080}:8080"],
+        "grafana": ["${GRAFANA_PUBLISH:-127.0.0.1:3000}:3000"],
+    }
     assert compose()["networks"]["inside"] == {"internal": True}
-    for name in ("redis", "worker"):
+    for name in ("redis", "worker", "worker-gpu", "prometheus"):
         assert services()[name]["networks"] == ["inside"]
 
 
@@ -112,7 +151,7 @@ def test_defaults_are_settings_that_can_be_read(monkeypatch: pytest.MonkeyPatch)
     assert settings.threads == 2
 
 
-@pytest.mark.parametrize("name", ["api", "worker"])
+@pytest.mark.parametrize("name", ["api", "worker", "worker-gpu"])
 def test_is_built_from_a_dockerfile_that_exists(name: str) -> None:
     build: dict[str, Any] = services()[name]["build"]
     context = (COMPOSE.parent / build["context"]).resolve()

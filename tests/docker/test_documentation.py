@@ -13,7 +13,7 @@ from service.settings import Settings
 from tests.docker.files import COMPOSE, ROOT
 
 DEPLOYMENT = (ROOT / "docs" / "deployment.md").read_text()
-ROW = re.compile(r"^\| `(REGNF_\w+|PIP_\w+)` \| `?([^|`]*)`? \| (.+) \|$", re.MULTILINE)
+ROW = re.compile(r"^\| `(REGNF_\w+|PIP_\w+|GRAFANA_\w+)` \| `?([^|`]*)`? \| (.+) \|$", re.MULTILINE)
 
 
 def written(value: Any) -> str:

@@ -84,6 +84,7 @@ def test_a_jobs_way_is_counted_once(redis: Redis, tmp_path: Path) -> None:
     assert now["regnf_job_run_seconds_count", "successful"] == 1
     assert now["regnf_job_run_seconds_sum", "successful"] < 60
     assert now["regnf_workers",] == 0
+    assert now["regnf_unfinished",] == 1
     assert now["regnf_redis_up",] == 1
 
 
@@ -120,7 +121,7 @@ def test_imports_by_reason(redis: Redis, tmp_path: Path) -> None:
     now = scrape(metrics)
     assert now["regnf_imports_total", "", "ready"] == 1
     assert now["regnf_imports_total", "FIELD_SHAPES_MISMATCH", "rejected"] == 1
-    assert (now["regnf_imports_active",], now["regnf_import_seconds_count",]) == (1, 2)
+    assert (now["regnf_imports_active",], now["regnf_import_seconds_count",], now["regnf_unfinished",]) == (1, 2, 1)
 
 
 def test_requests_by_route_never_by_id(tmp_path: Path) -> None:

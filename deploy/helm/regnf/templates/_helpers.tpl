@@ -1,0 +1,65 @@
+{{- define "regnf.name" -}}
+{{- printf "%s" .Release.Name | trunc 40 | trimSuffix "-" -}}
+{{- end -}}
+
+{{- define "regnf.labels" -}}
+app.kubernetes.io/name: regnf
+app.kubernetes.io/instance: {{ .root.Release.Name }}
+app.kubernetes.io/component: {{ .component }}
+{{- end -}}
+
+{{- define "regnf.tag" -}}
+{{- .Values.image.tag | default .Chart.AppVersion -}}
+{{- end -}}
+
+{{- define "regnf.podSecurity" -}}
+runAsNonRoot: true
+runAsUser: {{ . }}
+runAsGroup: {{ . }}
+fsGroup: {{ . }}
+seccompProfile: {type: RuntimeDefault}
+{{- end -}}
+
+{{- define "regnf.containerSecurity" -}}
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities: {drop: [ALL]}
+{{- end -}}
+
+{{/* What front end and workers are both told. */}}
+{{- define "regnf.environment" -}}
+- name: REGNF_REDIS_URL
+  {{- if .Values.redis.existingSecret }}
+  valueFrom: {secretKeyRef: {name: {{ .Values.redis.existingSecret }}, key: url}}
+  {{- else }}
+  value: redis://{{ include "regnf.name" . }}-redis:6379/0
+  {{- end }}
+- {name: REGNF_STATE_DIR, value: /var/lib/regnf}
+- {name: REGNF_LOG_FORMAT, value: json}
+{{- if eq .Values.storage.kind "s3" }}
+- name: REGNF_STORAGE_URL
+  value: {{ required "storage.s3.url is needed where storage.kind is s3" .Values.storage.s3.url | quote }}
+{{- end }}
+{{- range $name, $value := .Values.settings }}
+- name: {{ $name }}
+  value: {{ $value | quote }}
+{{- end }}
+{{- end -}}
+
+{{- define "regnf.storageEnvironment" -}}
+{{- if and (eq .Values.storage.kind "s3") .Values.storage.s3.existingSecret }}
+envFrom:
+  - secretRef: {name: {{ .Values.storage.s3.existingSecret }}}
+{{- end }}
+{{- end -}}
+
+{{- define "regnf.stateVolume" -}}
+- name: state
+  {{- if eq .Values.storage.kind "volume" }}
+  persistentVolumeClaim: {claimName: {{ .Values.storage.volume.existingClaim | default (printf "%s-state" (include "regnf.name" .)) }}}
+  {{- else }}
+  emptyDir: {sizeLimit: {{ .Values.storage.scratchSize }}}
+  {{- end }}
+- name: tmp
+  emptyDir: {sizeLimit: 1Gi}
+{{- end -}}
