@@ -16,21 +16,28 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 from uuid import uuid4
 
 import obstore
-from obstore.exceptions import AlreadyExistsError, BaseError
+from obstore.exceptions import AlreadyExistsError, BaseError, PreconditionError
 from obstore.store import S3Store
 
 from service.blobs import BlobEntry, StorageUnavailableError, check_key
 from service.file_cache import FileCache
 
+if TYPE_CHECKING:
+    from obstore import GetOptions, ObjectMeta
+
 _TEMPORARY = ".tmp"
 _PART_BYTES = 8 << 20
 _PAGE = 1000
 _ENDPOINTS = ("AWS_ENDPOINT", "AWS_ENDPOINT_URL")
+_PARTS_AT_ONCE = 2
 _REQUEST_TIMEOUT_S = 20.0
+"""For a whole request, which moves one part at most."""
+_COPY_TIMEOUT_S = 600.0
+"""For the store's own copying of a large object."""
 _CONNECT_TIMEOUT_S = 5.0
 _LONGEST_WAIT_S = 2.0
 _Value = TypeVar("_Value")
@@ -58,7 +65,9 @@ class ObjectBlobWriter:
         with _told_apart():
             if self._stream is None:
                 self._temporary = f"{_TEMPORARY}/{uuid4().hex}"
-                self._stream = obstore.open_writer(self._store.client, self._temporary, buffer_size=_PART_BYTES)
+                self._stream = obstore.open_writer(
+                    self._store.client, self._temporary, buffer_size=_PART_BYTES, max_concurrency=_PARTS_AT_ONCE
+                )
             self._stream.write(bytes(self._buffer))
         self._buffer.clear()
 
@@ -72,7 +81,7 @@ class ObjectBlobWriter:
             self._stream.close()
         self._stream = None
         source = self._temporary
-        self._store.tried(lambda: obstore.copy(self._store.client, source, key))
+        self._store.tried(lambda: obstore.copy(self._store.copier, source, key))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -88,10 +97,11 @@ class ObjectBlobWriter:
 class _RangedReader(io.RawIOBase):
     """An object read by ranges, as its reader asks for them."""
 
-    def __init__(self, store: ObjectBlobStore, key: str, size: int) -> None:
+    def __init__(self, store: ObjectBlobStore, key: str, meta: ObjectMeta) -> None:
         self._store = store
         self._key = key
-        self._size = size
+        self._meta = meta
+        self._size = meta["size"]
         self._position = 0
 
     def readable(self) -> bool:
@@ -108,12 +118,18 @@ class _RangedReader(io.RawIOBase):
         self._position = max(0, start + offset)
         return self._position
 
+    def readall(self) -> bytes:
+        """In parts: the base class asks for eight kibibytes at a time."""
+        parts = []
+        while part := self.read(_PART_BYTES):
+            parts.append(part)
+        return b"".join(parts)
+
     def readinto(self, buffer: Any) -> int:
         end = min(self._size, self._position + len(buffer))
         if end <= self._position:
             return 0
-        start = self._position
-        data = self._store.tried(lambda: obstore.get_range(self._store.client, self._key, start=start, end=end))
+        data = self._store.read_range(self._key, self._meta, self._position, end)
         buffer[: len(data)] = data
         self._position += len(data)
         return len(data)
@@ -129,24 +145,8 @@ class ObjectBlobStore:
     def __init__(self, url: str, patience_s: float = 10.0, cache: FileCache | None = None) -> None:
         self._patience_s = patience_s
         self._cache = cache
-        self.client = S3Store.from_url(
-            url,
-            client_options={
-                "timeout": timedelta(seconds=_REQUEST_TIMEOUT_S),
-                "connect_timeout": timedelta(seconds=_CONNECT_TIMEOUT_S),
-                # whoever names an endpoint without TLS means it
-                "allow_http": any(os.environ.get(name, "").startswith("http://") for name in _ENDPOINTS),
-            },
-            retry_config={
-                "max_retries": 1000,
-                "retry_timeout": timedelta(seconds=patience_s),
-                "backoff": {
-                    "init_backoff": timedelta(seconds=0.1),
-                    "max_backoff": timedelta(seconds=_LONGEST_WAIT_S),
-                    "base": 2,
-                },
-            },
-        )
+        self.client = _client(url, patience_s, _REQUEST_TIMEOUT_S)
+        self.copier = _client(url, patience_s, _COPY_TIMEOUT_S)
 
     def tried(self, do: Callable[[], _Value]) -> _Value:
         """What a request that may be repeated answers. Raises FileNotFoundError, StorageUnavailableError.
@@ -187,11 +187,10 @@ class ObjectBlobStore:
     def open(self, key: str) -> BinaryIO:
         check_key(key)
 
-        def whole() -> bytes | int:
-            """The bytes of a small object, the size of another."""
+        def whole() -> bytes | ObjectMeta:
+            """The bytes of a small object, what is said of another."""
             answer = obstore.get(self.client, key)
-            size = answer.meta["size"]
-            return bytes(answer.bytes()) if size <= _PART_BYTES else size
+            return bytes(answer.bytes()) if answer.meta["size"] <= _PART_BYTES else answer.meta
 
         found = self.tried(whole)
         if isinstance(found, bytes):
@@ -201,34 +200,36 @@ class ObjectBlobStore:
     @contextmanager
     def local_copy(self, key: str) -> Iterator[Path]:
         check_key(key)
+        meta = self._head(key)
         if self._cache is not None and key.endswith(".safetensors"):
-            meta = self._head(key)
             name = "|".join((key, str(meta["e_tag"]), str(meta["size"])))  # the key alone may come to name other bytes
-            with self._cache.held(name, lambda target: self._fetch(key, target)) as path:
+            with self._cache.held(name, lambda target: self._fetch(key, meta, target)) as path:
                 yield path
             return
         with tempfile.TemporaryDirectory(prefix="blob-") as folder:
             path = Path(folder) / key.rsplit("/", 1)[-1]
             with path.open("wb") as target:
-                self._fetch(key, target)
+                self._fetch(key, meta, target)
             yield path
 
-    def _fetch(self, key: str, target: BinaryIO) -> None:
-        """Write the blob into an empty file, from the beginning again when it breaks off."""
+    def read_range(self, key: str, meta: ObjectMeta, start: int, end: int) -> bytes:
+        """Bytes of the very object that ``meta`` tells of. Raises FileNotFoundError when another took its place."""
 
-        def fetch() -> None:
-            target.seek(0)
-            target.truncate()
-            answer = obstore.get(self.client, key)
-            for chunk in answer.stream(min_chunk_size=1 << 20):
-                target.write(chunk)
-            target.flush()
-            if target.tell() != answer.meta["size"]:
-                raise StorageUnavailableError("the blob broke off")
+        def read() -> bytes:
+            options: GetOptions = {"range": (start, end), "if_match": meta["e_tag"]}
+            try:
+                return bytes(obstore.get(self.client, key, options=options).bytes())
+            except PreconditionError as error:
+                raise FileNotFoundError(f"{key} was replaced") from error
 
-        self.tried(fetch)
+        return self.tried(read)
 
-    def _head(self, key: str) -> Any:
+    def _fetch(self, key: str, meta: ObjectMeta, target: BinaryIO) -> None:
+        """Write the blob into a file, a part a request: each has its own time limit, and is repeated by itself."""
+        for start in range(0, meta["size"], _PART_BYTES):
+            target.write(self.read_range(key, meta, start, min(meta["size"], start + _PART_BYTES)))
+
+    def _head(self, key: str) -> ObjectMeta:
         check_key(key)
         return self.tried(lambda: obstore.head(self.client, key))
 
@@ -240,8 +241,7 @@ class ObjectBlobStore:
         return True
 
     def size(self, key: str) -> int:
-        size: int = self._head(key)["size"]
-        return size
+        return self._head(key)["size"]
 
     def _entries(self, prefix: str) -> Iterator[BlobEntry]:
         with _told_apart():
@@ -277,6 +277,27 @@ class ObjectBlobStore:
     def probe(self) -> None:
         name = f"{_TEMPORARY}/probe"
         self.tried(lambda: obstore.put(self.client, name, b"probe", use_multipart=False))
+
+
+def _client(url: str, patience_s: float, timeout_s: float) -> S3Store:
+    return S3Store.from_url(
+        url,
+        client_options={
+            "timeout": timedelta(seconds=timeout_s),
+            "connect_timeout": timedelta(seconds=_CONNECT_TIMEOUT_S),
+            # whoever names an endpoint without TLS means it
+            "allow_http": any(os.environ.get(name, "").startswith("http://") for name in _ENDPOINTS),
+        },
+        retry_config={
+            "max_retries": 1000,
+            "retry_timeout": timedelta(seconds=patience_s),
+            "backoff": {
+                "init_backoff": timedelta(seconds=0.1),
+                "max_backoff": timedelta(seconds=_LONGEST_WAIT_S),
+                "base": 2,
+            },
+        },
+    )
 
 
 @contextmanager

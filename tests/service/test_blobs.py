@@ -145,6 +145,18 @@ def test_copies_of_fields_are_kept_until_the_field_changes(objects: ObjectServer
     assert len(list((tmp_path / "cache").iterdir())) == 2
 
 
+def test_an_object_that_is_replaced_while_it_is_read_is_told(objects: ObjectServer) -> None:
+    with environment(objects.environment):
+        store = ObjectBlobStore(f"s3://{objects.new_bucket()}")
+        store.put("a", b"1" * (9 << 20))
+        with store.open("a") as file:
+            assert file.read(1) == b"1"
+            store.put("a", b"2" * (9 << 20))
+            file.seek(8 << 20)
+            with pytest.raises(FileNotFoundError):
+                file.read(1)
+
+
 def test_a_store_that_is_away_is_told_after_some_patience(tmp_path: Path) -> None:
     with environment(
         {"AWS_ENDPOINT_URL": "http://127.0.0.1:1", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
