@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.hash_grid_config import HashGridConfig, Interpolation
+from regnf_core.fields.hash_grid_config import MAX_GROWTH, HashGridConfig, Interpolation
 from regnf_core.importing.upload_description import GridDescription
 
 MAX_GRIDS = 24
@@ -61,6 +61,8 @@ def _candidates(parameters: int, width: int, habits: GridHabits, wanted: GridDes
         if rest or parameters % features or not 1 <= levels <= _MAX_LEVELS:
             continue
         for base, top in _resolutions(habits, wanted):
+            if levels > 1 and top > base * MAX_GROWTH ** (levels - 1):
+                continue
             for log2_size in _LOG2_SIZES:
                 yield HashGridConfig.from_top_resolution(
                     top,

@@ -77,3 +77,11 @@ def test_no_usual_grid_is_a_refusal() -> None:
     assert_refused(lambda: find(12_196_241, 32), "HASH_GRID_NOT_RECOGNISED")
     assert_refused(lambda: find(12_196_240, 33), "HASH_GRID_NOT_RECOGNISED")
     assert_refused(lambda: find(2, 1_000_000), "HASH_GRID_NOT_RECOGNISED")
+
+
+def test_levels_that_grow_faster_than_a_field_file_may_say_are_not_tried() -> None:
+    """Two levels from 16 to 512 nodes would grow by 32; eight of them by 32^(1/7)."""
+    grid = HashGridConfig.from_top_resolution(512, levels=8, features_per_level=2, log2_table_size=12)
+    found = find(grid.entries * 2, 16)
+    assert grid in [config for config in found if config.strides is None]
+    assert all(config.per_level_scale <= 8.0 for config in found)

@@ -123,7 +123,7 @@ def test_the_exported_layout_reads_back_through_the_gate(tmp_path):
     options = replace(SMALL, iterations=40, half_table=False)
     files = FitFiles(path, sdfstudio=exported)
     reconstruct(scenes.images(count=4), files, options, device="cpu")
-    report = import_field(exported, tmp_path / "imported", {"hash": {"features_per_level": 2}})
+    report = import_field(exported, tmp_path / "imported")
     assert report.family == "sdfstudio_neus_facto", report
     imported = open_field(next((tmp_path / "imported").glob("*.safetensors")))
     points = torch.from_numpy(np.random.default_rng(0).uniform(*scenes.BOUNDS, size=(500, 3))).float()
