@@ -8,12 +8,11 @@ Do not use a store in a process that forks afterwards: the client's threads do n
 from __future__ import annotations
 
 import io
-import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
@@ -21,10 +20,10 @@ from uuid import uuid4
 
 import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, PreconditionError
-from obstore.store import S3Store
 
 from service.blobs import BlobEntry, StorageUnavailableError, check_key
 from service.file_cache import FileCache
+from service.object_client import LONGEST_WAIT_S, object_client, told_apart
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -32,14 +31,11 @@ if TYPE_CHECKING:
 _TEMPORARY = ".tmp"
 _PART_BYTES = 8 << 20
 _PAGE = 1000
-_ENDPOINTS = ("AWS_ENDPOINT", "AWS_ENDPOINT_URL")
 _PARTS_AT_ONCE = 2
 _REQUEST_TIMEOUT_S = 20.0
 """For a whole request, which moves one part at most."""
 _COPY_TIMEOUT_S = 600.0
 """For the store's own copying of a large object."""
-_CONNECT_TIMEOUT_S = 5.0
-_LONGEST_WAIT_S = 2.0
 _Value = TypeVar("_Value")
 
 
@@ -62,7 +58,7 @@ class ObjectBlobWriter:
         return len(data)
 
     def _send(self) -> None:
-        with _told_apart():
+        with told_apart():
             if self._stream is None:
                 self._temporary = f"{_TEMPORARY}/{uuid4().hex}"
                 self._stream = obstore.open_writer(
@@ -77,7 +73,7 @@ class ObjectBlobWriter:
             self._store.put(key, bytes(self._buffer))
             return
         self._send()
-        with _told_apart():
+        with told_apart():
             self._stream.close()
         self._stream = None
         source = self._temporary
@@ -145,8 +141,8 @@ class ObjectBlobStore:
     def __init__(self, url: str, patience_s: float = 10.0, cache: FileCache | None = None) -> None:
         self._patience_s = patience_s
         self._cache = cache
-        self.client = _client(url, patience_s, _REQUEST_TIMEOUT_S)
-        self.copier = _client(url, patience_s, _COPY_TIMEOUT_S)
+        self.client = object_client(url, patience_s, _REQUEST_TIMEOUT_S)
+        self.copier = object_client(url, patience_s, _COPY_TIMEOUT_S)
 
     def tried(self, do: Callable[[], _Value]) -> _Value:
         """What a request that may be repeated answers. Raises FileNotFoundError, StorageUnavailableError.
@@ -157,13 +153,13 @@ class ObjectBlobStore:
         wait_s = 0.1
         while True:
             try:
-                with _told_apart():
+                with told_apart():
                     return do()
             except StorageUnavailableError:
                 if time.monotonic() + wait_s > end:
                     raise
             time.sleep(wait_s)
-            wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
+            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
 
     def writer(self) -> ObjectBlobWriter:
         return ObjectBlobWriter(self)
@@ -244,7 +240,7 @@ class ObjectBlobStore:
         return self._head(key)["size"]
 
     def _entries(self, prefix: str) -> Iterator[BlobEntry]:
-        with _told_apart():
+        with told_apart():
             for page in obstore.list(self.client, prefix or None, chunk_size=_PAGE):
                 for meta in page:
                     yield BlobEntry(meta["path"], meta["size"], meta["last_modified"].timestamp())
@@ -277,33 +273,3 @@ class ObjectBlobStore:
     def probe(self) -> None:
         name = f"{_TEMPORARY}/probe"
         self.tried(lambda: obstore.put(self.client, name, b"probe", use_multipart=False))
-
-
-def _client(url: str, patience_s: float, timeout_s: float) -> S3Store:
-    return S3Store.from_url(
-        url,
-        client_options={
-            "timeout": timedelta(seconds=timeout_s),
-            "connect_timeout": timedelta(seconds=_CONNECT_TIMEOUT_S),
-            # whoever names an endpoint without TLS means it
-            "allow_http": any(os.environ.get(name, "").startswith("http://") for name in _ENDPOINTS),
-        },
-        retry_config={
-            "max_retries": 1000,
-            "retry_timeout": timedelta(seconds=patience_s),
-            "backoff": {
-                "init_backoff": timedelta(seconds=0.1),
-                "max_backoff": timedelta(seconds=_LONGEST_WAIT_S),
-                "base": 2,
-            },
-        },
-    )
-
-
-@contextmanager
-def _told_apart() -> Iterator[None]:
-    """Turns the client's errors into OSErrors; FileNotFoundError is one already."""
-    try:
-        yield
-    except BaseError as error:
-        raise StorageUnavailableError(f"the object store refuses: {type(error).__name__}") from error

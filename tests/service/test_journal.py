@@ -1,22 +1,19 @@
-"""What the journal remembers, and how records are made anew from it."""
+"""What the journal remembers of jobs, and how their records are made anew from it."""
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 from redis import Redis
 
 from service.blobs import StorageUnavailableError
-from service.journaled_records import JournaledRecordStore
-from service.memory import InMemoryBlobStore, InMemoryJobQueue
-from service.rebuild import Rebuilder, Rebuilt
-from service.records import FieldRecord, JobRecord, StaleAttemptError
+from service.memory import InMemoryJobQueue
+from service.rebuild import Rebuilt
+from service.records import JobRecord, StaleAttemptError
 from service.redis_client import connect
 from tests.redis_server import private_redis
-
-SCENE, OBJECT = "a" * 64, "b" * 64
-RETENTION_S = 3600
+from tests.service.journal_world import RETENTION_S, World, fresh_world
 
 
 @pytest.fixture(scope="module")
@@ -25,62 +22,9 @@ def redis() -> Iterator[Redis]:
         yield client
 
 
-@dataclass
-class World:
-    """Records over a real Redis and a journal in memory, as one of several machines would hold them."""
-
-    redis: Redis
-    blobs: InMemoryBlobStore
-    queue: InMemoryJobQueue
-
-    def __post_init__(self) -> None:
-        self.records = JournaledRecordStore(self.redis, RETENTION_S, self.blobs)
-        self.rebuilder = Rebuilder(self.records, self.queue, self.blobs)
-
-    def accept(self, job_id: str = "j1", created: float | None = None) -> JobRecord:
-        now = self.records.now() if created is None else created
-        job = JobRecord(job_id, "registration", "accepted", {"scene": SCENE, "object": OBJECT}, {}, now, now)
-        return self.records.create_job(job, 100)[0]
-
-    def run(self, job_id: str = "j1", attempt: int = 1) -> None:
-        self.records.update_job(job_id, attempt, status="running", worker="w")
-
-    def end(self, status: str, job_id: str = "j1", attempt: int = 1) -> JobRecord:
-        error = {"reason": "NO_SURFACE_IN_OBJECT"} if status == "failed" else None
-        return self.records.update_job(job_id, attempt, status=status, error=error)
-
-    def field(self, state: str = "ready") -> FieldRecord:
-        now = self.records.now()
-        self.records.create_field(FieldRecord(SCENE, "validating", 5, now, now, label="a room"))
-        self.blobs.put(f"fields/{SCENE}/original", b"bytes")
-        if state == "ready":
-            self.blobs.put(f"fields/{SCENE}/field.safetensors", b"bytes")
-        if state != "validating":
-            self.blobs.delete(f"fields/{SCENE}/original")
-            self.records.update_field(SCENE, state=state, report={"family": "tiny"})
-        return self.known_field()
-
-    def known_field(self) -> FieldRecord:
-        found = self.records.get_field(SCENE)
-        assert found is not None
-        return found
-
-    def lose_redis(self) -> Rebuilt:
-        self.redis.flushall()
-        return self.rebuilder.run_if_needed()
-
-    def job(self, job_id: str = "j1") -> JobRecord:
-        found = self.records.get_job(job_id)
-        assert found is not None
-        return found
-
-
 @pytest.fixture
 def world(redis: Redis) -> World:
-    redis.flushall()
-    made = World(redis, InMemoryBlobStore(), InMemoryJobQueue())
-    made.rebuilder.run_if_needed()
-    return made
+    return fresh_world(redis)
 
 
 def same_but_version(first: JobRecord, second: JobRecord) -> bool:
@@ -272,39 +216,3 @@ def test_an_end_that_cannot_be_journaled_stands_all_the_same(world: World, monke
 
     monkeypatch.setattr(world.blobs, "put_if_absent", refuse)
     assert world.end("failed").status == "failed"
-
-
-# fields
-
-
-def test_a_ready_field_comes_back(world: World) -> None:
-    ready = world.field()
-    assert world.lose_redis() == Rebuilt(fields=(SCENE,))
-    assert replace(world.known_field(), version=ready.version) == ready
-    assert world.queue.imports == []
-
-
-def test_a_field_whose_import_had_not_ended_is_imported(world: World) -> None:
-    world.field("validating")
-    world.lose_redis()
-    assert (world.known_field().state, world.known_field().attempt) == ("validating", 2)
-    assert world.queue.imports == [(SCENE, 2)]
-
-
-def test_a_rejected_field_comes_back_with_its_reason(world: World) -> None:
-    world.field("rejected")
-    world.lose_redis()
-    assert world.known_field().state == "rejected"
-
-
-def test_a_field_without_its_bytes_does_not_come_back(world: World) -> None:
-    world.field()
-    world.blobs.delete_prefix(f"fields/{SCENE}")
-    assert world.lose_redis() == Rebuilt()
-    assert world.records.get_field(SCENE) is None
-
-
-def test_a_deleted_field_stays_deleted(world: World) -> None:
-    world.field()
-    world.records.delete_field(SCENE)
-    assert world.lose_redis() == Rebuilt()
