@@ -2,7 +2,8 @@
 
     python -m benchmarks.robust FIELDS [--only NAME ...] [--seeds 10] [--limit N] [--output FOLDER]
 
-FIELDS is the folder that benchmarks.make_fields wrote. With --output every table is written to FOLDER as NAME.md and,
+FIELDS is the folder that benchmarks.make_fields wrote; for imperfect and roc, which run only when named, that of
+benchmarks.make_image_fields. With --output every table is written to FOLDER as NAME.md and,
 with each single run, NAME.json. --limit is for a look beforehand: at most N registrations a table.
 """
 
@@ -19,10 +20,12 @@ from benchmarks.robust import (
     boxes,
     covariance,
     evaluator,
+    imperfect,
     library,
     one_view,
     orientations,
     pairs,
+    roc,
     scales,
     speed,
     symmetry,
@@ -47,12 +50,14 @@ TABLES = {
         library,
     )
 }
+IMAGE_TABLES = {module.NAME: module.table for module in (imperfect, roc)}
+"""Of fields fitted to images: run when they are named."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("fields", type=Path)
-    parser.add_argument("--only", nargs="+", choices=sorted(TABLES), default=list(TABLES))
+    parser.add_argument("--only", nargs="+", choices=sorted(TABLES | IMAGE_TABLES), default=list(TABLES))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--limit", type=int)
     parser.add_argument("--output", type=Path)
@@ -63,7 +68,7 @@ def main() -> None:
     limit = f" --limit {arguments.limit}" if arguments.limit else ""
     for name in arguments.only:
         command = f"python -m benchmarks.robust FIELDS --only {name} --seeds {arguments.seeds}{limit}"
-        write(TABLES[name](context), command, arguments.output, print)
+        write((TABLES | IMAGE_TABLES)[name](context), command, arguments.output, print)
 
 
 if __name__ == "__main__":

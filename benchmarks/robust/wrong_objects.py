@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-from scipy.stats import mannwhitneyu
-
 from benchmarks.robust.cases import KINDS, load_pairs
 from benchmarks.robust.judging import FAILED, NOT_AMONG, REJECTED, SUCCESSES, WRONG
+from benchmarks.robust.ranking import area_under_roc
 from benchmarks.robust.report import Bar, Section, Table, by_group, count, failures_of, of_kind, share_bar, successes
 from benchmarks.robust.runs import Context, Job, Run, run_all
 
@@ -118,4 +117,4 @@ def _area(score: Callable[[Run], float], right: Sequence[Run], wrong: Sequence[R
     if not right or not wrong:
         return ""
     values = [[score(run) if run["category"] != FAILED else float("-inf") for run in some] for some in (right, wrong)]
-    return f"{mannwhitneyu(*values).statistic / (len(right) * len(wrong)):.4f}"
+    return f"{area_under_roc(*values):.4f}"
