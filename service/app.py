@@ -43,6 +43,7 @@ from service.webhooks.service import deliver_until_stopped, webhooks_of
 
 logger = logging.getLogger(__name__)
 _REAP_EVERY_S = 15.0
+_CLEARING_UP_S = 5.0
 _STORAGE_PATIENCE_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
 _ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
@@ -132,6 +133,8 @@ def _lifespan_of(
         with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
+        # the server has broken off what was still arriving, and does not wait for it to be cleared away
+        await services.uploads.emptied(_CLEARING_UP_S)
         if delivering is not None:
             await delivering
         if reaping is not None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from service.body import CLOSE
 from service.problems import RETRY_LATER, Problem
+
+_LOOK_EVERY_S = 0.02
 
 
 class Slots:
@@ -37,6 +41,12 @@ class Slots:
             yield
         finally:
             self.free(caller)
+
+    async def emptied(self, seconds: float) -> None:
+        """Wait until none is taken, at most this long."""
+        deadline = time.monotonic() + seconds
+        while self._taken and time.monotonic() < deadline:
+            await asyncio.sleep(_LOOK_EVERY_S)
 
     @property
     def taken(self) -> int:

@@ -211,3 +211,17 @@ def test_told_to_stop_it_ends_open_streams_and_waits_and_leaves(tmp_path: Path) 
         except subprocess.TimeoutExpired:
             pytest.fail("the API did not end")
         assert "Traceback" not in ending.log()
+
+
+def test_told_to_stop_during_an_upload_it_leaves_nothing_of_it(tmp_path: Path) -> None:
+    data = field_bytes("stopped", 4 * MIB)
+    with live_service(tmp_path, with_worker=False) as ending, ending.connect() as upload:
+        before = ending.files()
+        upload.sendall(head_of("PUT", f"/fields/{sha256(data)}", Content_Length=len(data)) + data[: 2 * MIB])
+        eventually(lambda: ending.files() - before, "the first bytes in the store")
+        ending.api.terminate()
+        try:
+            ending.api.wait(20)
+        except subprocess.TimeoutExpired:
+            pytest.fail("the API did not end")
+        assert ending.files() - before == set()
