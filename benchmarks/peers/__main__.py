@@ -21,13 +21,14 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch loads
 
 from benchmarks.peers.interface import Peer, sampled
-from benchmarks.peers.judging import run_one
+from benchmarks.peers.judging import no_points, run_one
 from benchmarks.peers.nerf2nerf import STEPS, Nerf2nerf
 from benchmarks.peers.registry import PEERS
 from benchmarks.peers.table import table
 from benchmarks.robust.cases import MAIN, load_pairs
 from benchmarks.robust.report import write
 from benchmarks.robust.runs import Run, summary
+from regnf_core import RegnfError
 
 SHORT_STEPS = STEPS // 10
 
@@ -45,14 +46,24 @@ def main() -> None:
         sys.exit(f"no such pairs in {arguments.fields / arguments.pairs}")
     runs: list[Run] = []
     for pair in pairs:
-        case = sampled(pair.case(), pair.diameter)
+        try:
+            case = sampled(pair.case(), pair.diameter)
+        except RegnfError as error:
+            runs += [no_points(name, pair.name, error) for name in makers]
+            continue
         for name, make in makers.items():
             for seed in range(arguments.seeds):
                 runs.append(run_one(name, make, case, seed))
                 print(_line(runs[-1]), file=sys.stderr, flush=True)
+        _write(runs, notes, arguments, lambda _: None)  # what is done outlasts an interruption
+    _write(runs, notes, arguments, print)
+
+
+def _write(runs: list[Run], notes: list[str], arguments: argparse.Namespace, show: Callable[[str], None]) -> None:
     output = arguments.output
-    finished = table(output.stem if output else "peers", runs, notes)
-    write(finished, _command(arguments), output.parent if output else None, print)
+    done = len({run["case"] for run in runs})
+    finished = table(output.stem if output else "peers", runs, [*notes, f"{done} pairs."])
+    write(finished, _command(arguments), output.parent if output else None, show)
 
 
 def _arguments() -> argparse.Namespace:

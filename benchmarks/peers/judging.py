@@ -63,3 +63,9 @@ def run_one(name: str, make: Callable[[], Peer], case: PeerCase, seed: int) -> d
     if peer.uses_samples:
         seconds, evaluations = seconds + case.sampling_seconds, evaluations + case.sampling_evaluations
     return found | {"seconds": seconds, "field_evaluations": evaluations, **judge(result, case)}
+
+
+def no_points(name: str, case: str, error: RegnfError) -> dict[str, Any]:
+    """A run that no method could begin: the shared sampling found no surface."""
+    reason = error.reason or type(error).__name__
+    return {"group": name, "case": case, "seed": 0, "verdict": "none", "reason": reason, "category": NO_POSE}
