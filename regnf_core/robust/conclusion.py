@@ -68,11 +68,14 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     return Conclusion(decision, reason, winner, T_work, T, metrics, alternatives)
 
 
-def pose_covariance(problem: Problem, T_work: Sim3) -> Tensor:
-    """(7, 7) of a pose between the working frames, in object units: see :mod:`regnf_core.robust.covariance`."""
+def pose_covariance(problem: Problem, T_work: Sim3, offset: Tensor) -> Tensor:
+    """(7, 7) of a pose between the working frames, in object units: see :mod:`regnf_core.robust.covariance`.
+
+    offset: of the surfaces, object diameters, a single number.
+    """
     A, B = problem.A, problem.B
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
-    r = residuals(problem.scene_field, problem.object_field, A, B, batch)
+    r = residuals(problem.scene_field, problem.object_field, A, B, batch, offset[None])
     places = torch.cat([T_work.apply(A.points.double()), B.points.double()])
     cov = covariance(r, fitting_width(r, LAST.widths[-1]), places)
     return in_object_units(cov, T_work, problem.view.frame, problem.model.frame)

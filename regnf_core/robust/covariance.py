@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.frame import WorkingFrame
-from regnf_core.robust.levenberg import geman_mcclure_weights, kernel_widths
+from regnf_core.robust.levenberg import OFFSET_PRIOR, geman_mcclure_weights, kernel_widths, with_offset
 from regnf_core.robust.residuals import Residuals
 from regnf_core.sim3 import Sim3
 from regnf_core.sim3_tangent import skew
@@ -34,7 +34,8 @@ _SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class _Witnesses:
-    """Samples that agree. points (N, 3), object diameters · J (N, 7) · residuals (N,) · weights, curvatures (N,)."""
+    """Samples that agree. points (N, 3), object diameters · J (N, 7), with the offset (N, 8) · residuals (N,) ·
+    weights, curvatures (N,)."""
 
     points: Tensor
     J: Tensor
@@ -53,10 +54,13 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     comes out as uncertain as the samples leave it.
     """
     seen = _witnesses(r, float(width), points)
-    scales = 1.0 / seen.J.square().mean(0).sqrt().clamp_min(_TINY)  # the seven unknowns in like units
+    scales = 1.0 / seen.J.square().mean(0).sqrt().clamp_min(_TINY)  # the unknowns in like units
     seen = replace(seen, J=seen.J * scales)
     variances = _likely_variances(seen.first(_WEIGHED))  # (lengths, nuggets)
-    B = torch.linalg.solve(_curvature(seen), (seen.J * seen.weights[:, None]).mT)  # (7, N)
+    curvature = _curvature(seen)
+    if r.offset is not None:
+        curvature[7, 7] += OFFSET_PRIOR
+    B = torch.linalg.solve(curvature, (seen.J * seen.weights[:, None]).mT)[:7]  # (7, N)
     nuggets = torch.tensor(_NUGGETS, dtype=torch.float64)
     rough = (variances * nuggets).sum()
     cov: Tensor = rough * (B @ B.mT)
@@ -65,7 +69,7 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
         if smooth > _TINY * variances.sum():
             cov = cov + smooth * (B @ _smooth(distances, length).double() @ B.mT)
     symmetric: Tensor = (cov + cov.mT) / 2.0
-    return scales[:, None] * symmetric * scales
+    return scales[:7, None] * symmetric * scales[:7]
 
 
 def _witnesses(r: Residuals, width: float, points: Tensor) -> _Witnesses:
@@ -84,15 +88,15 @@ def _witnesses(r: Residuals, width: float, points: Tensor) -> _Witnesses:
     some = agreeing[torch.randperm(len(agreeing), generator=generator)[:_PROPAGATED]]
     squares = (values / widths).square()
     curvatures = weights * share * (1.0 - 3.0 * squares) / (1.0 + squares)
-    J = r.jacobian[0].double() * sign[:, None]
+    J = with_offset(r)[0].double() * sign[:, None]
     return _Witnesses(points[some].double(), J[some], values[some], (weights * share)[some], curvatures[some])
 
 
 def _curvature(seen: _Witnesses) -> Tensor:
-    """(7, 7) second derivative of the robust cost, or half of its Gauss-Newton form where that is not positive."""
+    """Second derivative of the robust cost, or half of its Gauss-Newton form where that is not positive."""
     gauss_newton: Tensor = (seen.J * seen.weights[:, None]).mT @ seen.J
     exact: Tensor = (seen.J * seen.curvatures[:, None]).mT @ seen.J
-    floor = _TINY * gauss_newton.diagonal().max() * torch.eye(7, dtype=torch.float64)
+    floor = _TINY * gauss_newton.diagonal().max() * torch.eye(seen.J.shape[1], dtype=torch.float64)
     if float(torch.linalg.eigvalsh(exact)[0]) > float(floor[0, 0]):
         return exact
     return 0.5 * gauss_newton + floor

@@ -74,12 +74,16 @@ class Trail:
 
 @dataclass(frozen=True, eq=False)
 class Finalists:
-    """Poses (H,), best first, their scores (H,), their residuals on the stage's samples, and how they came there."""
+    """Poses (H,), best first, their scores (H,), their residuals on the stage's samples, and how they came there.
+
+    offsets: (H,), see :class:`regnf_core.robust.residuals.Residuals`.
+    """
 
     T: Sim3
     scores: Tensor
     residuals: Residuals
     trail: Trail
+    offsets: Tensor
 
 
 def run_stage(
@@ -93,6 +97,7 @@ def run_stage(
     generator: torch.Generator,
     trail: Trail,
     on_step: Callable[[], None],
+    offsets: Tensor,
 ) -> Finalists:
     """Refine every pose of the batch on the stage's share of the samples, and keep the best distinct ones."""
     few_A, few_B = some(A, stage.points, generator), some(B, stage.points, generator)
@@ -106,8 +111,12 @@ def run_stage(
         )
         on_step()
 
-    refined = minimise(scene, obj, few_A, few_B, T, list(stage.widths), adaptive=True, on_iteration=record)
+    refined = minimise(
+        scene, obj, few_A, few_B, T, list(stage.widths), adaptive=True, on_iteration=record, offset=offsets
+    )
     scores = disagreement(refined.residuals, stage.score_width)
     kept = distinct(refined.T, scores, extremes, _APART, stage.keep)
     kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]
-    return Finalists(select(refined.T, kept), scores[kept], refined.residuals.of(kept), trail.keep(kept))
+    r = refined.residuals.of(kept)
+    assert r.offset is not None
+    return Finalists(select(refined.T, kept), scores[kept], r, trail.keep(kept), r.offset)

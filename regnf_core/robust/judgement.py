@@ -44,6 +44,8 @@ class Evidence:
     """Object samples in the scene's free space, of those that it does not hide."""
     residual_rms: Tensor
     """Root mean square of the inliers' residuals."""
+    offsets: Tensor
+    """How much farther out the scene's surface lies than the object's."""
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
@@ -55,14 +57,21 @@ class Evidence:
             "hidden_share_object": float(self.hidden[index]),
             "free_space_violations": float(self.violations[index]),
             "residual_rms": float(self.residual_rms[index]),
+            "surface_offset": float(self.offsets[index]),
         }
 
 
 def gather_evidence(
-    scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3, options: RobustOptions
+    scene: DistanceModel,
+    obj: DistanceModel,
+    A: Samples,
+    B: Samples,
+    T: Sim3,
+    options: RobustOptions,
+    offsets: Tensor,
 ) -> Evidence:
-    """Judge all poses T (H,) on held-out samples A of the scene and B of the object, working frames."""
-    r = residuals(scene, obj, A, B, T)
+    """Judge all poses T (H,), offsets (H,), on held-out samples A of the scene and B of the object, working frames."""
+    r = residuals(scene, obj, A, B, T, offsets)
     n = r.scene_count
     forth, back = r.values[:, :n], r.values[:, n:]
     inlier = (r.values.abs() <= options.inlier_distance) & (r.cosines >= _SAME_SIDE)
@@ -79,6 +88,7 @@ def gather_evidence(
         hidden=hidden.float().mean(1),
         violations=violating.sum(1) / open_,
         residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
+        offsets=offsets,
     )
 
 

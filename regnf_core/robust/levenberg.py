@@ -19,6 +19,9 @@ _SPREAD_QUANTILE, _SPREAD_FACTOR = 0.3, 6.7
 """Three tenths of normal residuals are below 0.385 of their spread; 6.7 times that is 2.6 spreads. So low a quantile,
 because up to two thirds of the samples may lie where the other field has nothing to say."""
 _WIDEST = 0.04  # object diameters: what the spread may widen the kernel to
+MOST_OFFSET = 0.04  # object diameters
+OFFSET_PRIOR = 0.02
+"""Of the weight of one direction's samples, in favour of no offset: round things may as well be larger as thicker."""
 _LARGEST_STEP = 0.6  # of the rotation (radians), the shift (working units) and the log scale
 
 
@@ -61,7 +64,11 @@ def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
     """
     widths = kernel_widths(r, width)
     loss = r.values.square() / (r.values.square() + widths**2) * (widths / width) ** 2
-    return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
+    cost = 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
+    if r.offset is None:
+        return cost
+    prior: Tensor = 0.5 * OFFSET_PRIOR * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
+    return cost + prior
 
 
 def minimise(
@@ -74,21 +81,24 @@ def minimise(
     fix_scale: bool = False,
     adaptive: bool = False,
     on_iteration: Callable[[int, Sim3, Residuals, Tensor], None] | None = None,
+    offset: Tensor | None = None,
 ) -> Refined:
     """Minimise the robust cost of every pose in the batch T (H,), one iteration for each kernel width.
 
     widths: kernel widths, object units; falling widths anneal. With ``adaptive`` they are
     the least, see :func:`fitting_width`. A step that raises the cost is undone and damped more.
+    offset: (H,) float64 to start from, of one surface outside the other; None: there is none, and none is looked for.
     Each iteration asks each field once at each sample. Solves are in float64.
     """
-    now = residuals(scene, obj, A, B, T)
+    now = residuals(scene, obj, A, B, T, offset)
     damping = torch.full_like(T.scale, _DAMPING_START, dtype=torch.float64)
     width: Tensor | float = widths[-1]
     for iteration, least in enumerate(widths):
         width = fitting_width(now, least) if adaptive else least
         step = _step(now, width, damping, fix_scale)
         T_tried = perturb(T, step)
-        tried = residuals(scene, obj, A, B, T_tried)
+        shifted = None if now.offset is None else (now.offset + step[:, 7]).clamp(-MOST_OFFSET, MOST_OFFSET)
+        tried = residuals(scene, obj, A, B, T_tried, shifted)
         better = robust_cost(tried, width) < robust_cost(now, width)
         T, now = _choose(better, T_tried, T), _choose_residuals(better, tried, now)
         damping = torch.where(better, damping / 6.0, damping * 5.0).clamp(*_DAMPING_RANGE)
@@ -98,12 +108,29 @@ def minimise(
 
 
 def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tensor]:
-    """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64; each direction has the same total influence."""
+    """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64; each direction has the same total influence.
+
+    With an offset it is the eighth unknown.
+    """
     n, m = r.scene_count, r.values.shape[1] - r.scene_count
     weights = geman_mcclure_weights(r.values, kernel_widths(r, width))
     weights = torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
-    weighted = (r.jacobian * weights[..., None]).mT.double()
-    return weighted @ r.jacobian.double(), (weighted @ r.values.double()[..., None]).squeeze(-1)
+    J = with_offset(r)
+    weighted = (J * weights[..., None]).mT.double()
+    H, b = weighted @ J.double(), (weighted @ r.values.double()[..., None]).squeeze(-1)
+    if r.offset is not None:
+        H[:, 7, 7] += OFFSET_PRIOR
+        b[:, 7] += OFFSET_PRIOR * r.offset
+    return H, b
+
+
+def with_offset(r: Residuals) -> Tensor:
+    """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: with its column."""
+    if r.offset is None:
+        return r.jacobian
+    column = torch.ones_like(r.jacobian[..., :1])
+    column[:, : r.scene_count] = -1.0
+    return torch.cat([r.jacobian, column], -1)
 
 
 def _step(r: Residuals, width: Tensor | float, damping: Tensor, fix_scale: bool) -> Tensor:
@@ -111,7 +138,7 @@ def _step(r: Residuals, width: Tensor | float, damping: Tensor, fix_scale: bool)
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     extra = damping[:, None] * diagonal + 1e-9 + 1e-6 * diagonal.amax(-1, keepdim=True)
     if fix_scale:
-        extra = extra + torch.tensor([0.0] * 6 + [1e9], dtype=torch.float64)
+        extra = extra + torch.tensor([0.0] * 6 + [1e9] + [0.0] * (H.shape[-1] - 7), dtype=torch.float64)
     step = -torch.linalg.solve(H + torch.diag_embed(extra), b)
     longest = step.abs().amax(-1, keepdim=True)
     short: Tensor = step * (_LARGEST_STEP / longest.clamp_min(_LARGEST_STEP))
@@ -133,4 +160,5 @@ def _choose_residuals(better: Tensor, first: Residuals, second: Residuals) -> Re
         torch.where(better[:, None], first.cosines, second.cosines),
         first.scene_count,
         first.partial,
+        None if first.offset is None or second.offset is None else torch.where(better, first.offset, second.offset),
     )

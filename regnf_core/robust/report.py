@@ -41,7 +41,7 @@ def result_of(
         seed=seed,
         options=options.to_dict(),
         alternatives=conclusion.alternatives,
-        covariance=pose_covariance(problem, conclusion.T_work),
+        covariance=pose_covariance(problem, conclusion.T_work, outcome.finalists.offsets[conclusion.winner]),
         symmetry=model.symmetry.group(),
     )
 

@@ -6,6 +6,9 @@ With y = T x for scene points x, w = T^-1 z for object points z, g the fields' g
     r2 = s S_a(w) - S_b(z)    dr2 = [ -(z-t) x (R g_a), -R g_a, s S_a(w) - (R g_a) . (z-t)     ]
 
 Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them.
+
+Fields learnt from images are too thick or too thin by much the same everywhere: the two surfaces are then an offset d
+apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 """
 
 from __future__ import annotations
@@ -53,7 +56,8 @@ class Residuals:
     """Residuals (H, N + M) of H poses, scene samples first; Jacobian (H, N + M, 7); agreement of the normals.
 
     ``cosines`` (H, N + M): cosine between a sample's normal and the other field's gradient where the pose carries it.
-    partial: the scene was seen from one side.
+    partial: the scene was seen from one side · offset: (H,) how much farther out the scene's surface lies than the
+    object's, object units; already taken out of the values.
     """
 
     values: Tensor
@@ -61,6 +65,7 @@ class Residuals:
     cosines: Tensor
     scene_count: int
     partial: bool = False
+    offset: Tensor | None = None
 
     def unseen(self) -> Tensor | None:
         """(H, N + M) bool: object samples within a partial scene's matter, where nobody looked; None: all was seen."""
@@ -72,21 +77,32 @@ class Residuals:
 
     def of(self, poses: Tensor) -> Residuals:
         """Those of some poses."""
-        return Residuals(self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, self.partial)
+        offset = None if self.offset is None else self.offset[poses]
+        return Residuals(
+            self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, self.partial, offset
+        )
 
 
-def residuals(scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3) -> Residuals:
-    """Both residuals of the batch of poses T (H,) at scene samples A (N) and object samples B (M), object units."""
+def residuals(
+    scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3, offset: Tensor | None = None
+) -> Residuals:
+    """Both residuals of the batch of poses T (H,) at scene samples A (N) and object samples B (M), object units.
+
+    offset: (H,), see :class:`Residuals`; None: the surfaces coincide.
+    """
     T = T.to(A.points)
     s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
     forth, J_forth, cos_forth = _scene_to_object(obj, A, s, R, t)
     back, J_back, cos_back = _object_to_scene(scene, B, s, R, t)
+    if offset is not None:
+        forth, back = forth - offset[:, None].to(forth), back + offset[:, None].to(back)
     return Residuals(
         torch.cat([forth, back], 1),
         torch.cat([J_forth, J_back], 1),
         torch.cat([cos_forth, cos_back], 1),
         len(A),
         A.partial,
+        offset,
     )
 
 

@@ -1,0 +1,97 @@
+"""Surfaces too thick by the same everywhere: told from a larger scale, on exact fields."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from regnf_core.robust.levenberg import MOST_OFFSET, OFFSET_PRIOR, minimise, normal_equations, robust_cost, with_offset
+from regnf_core.robust.poses import perturb
+from regnf_core.robust.residuals import Residuals, residuals
+from regnf_core.robust.samples import sample_object_surface
+from regnf_core.sim3 import Sim3
+from tests.core.analytic import AnalyticField, chair, chair_pose, room
+from tests.core.robust.shapes import detection, placement_error, run
+
+D = torch.float64
+
+
+def thickened(field: AnalyticField, by: float) -> AnalyticField:
+    """The same field with its surface ``by`` units farther out."""
+    return AnalyticField(lambda points: field.formula(points) - by, field.bounds.tolist())
+
+
+def some_residuals(offset: float) -> Residuals:
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=D)
+
+    values, jacobian = 0.01 * draw(1, 9), draw(1, 9, 7)
+    return Residuals(values, jacobian, torch.ones(1, 9, dtype=D), 4, offset=torch.tensor([offset], dtype=D))
+
+
+def test_the_offset_is_taken_out_of_both_directions() -> None:
+    found = sample_object_surface(chair(), 300, torch.Generator().manual_seed(0))
+    identity = Sim3(torch.ones(1, dtype=D), torch.eye(3, dtype=D)[None], torch.zeros(1, 3, dtype=D))
+    plain = residuals(found.field, found.field, found.samples, found.samples, identity)
+    moved = residuals(found.field, found.field, found.samples, found.samples, identity, torch.tensor([0.02], dtype=D))
+    n = len(found.samples)
+    torch.testing.assert_close(moved.values[:, :n], plain.values[:, :n] - 0.02)
+    torch.testing.assert_close(moved.values[:, n:], plain.values[:, n:] + 0.02)
+    torch.testing.assert_close(moved.jacobian, plain.jacobian)
+
+
+def test_the_offsets_column_is_the_derivative_of_the_values() -> None:
+    r = some_residuals(0.0)
+    column = with_offset(r)[0, :, 7]
+    assert column.tolist() == [-1.0] * 4 + [1.0] * 5
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    # b is w^2 times the derivative of the robust cost: here by the offset, its prior included, by finite differences.
+    width, h = 0.02, 1e-6
+
+    def cost(offset: float) -> float:
+        shift = offset - 0.003
+        r = some_residuals(offset)
+        values = r.values + with_offset(r)[..., 7] * shift
+        return float(robust_cost(Residuals(values, r.jacobian, r.cosines, 4, offset=r.offset), width))
+
+    slope = (cost(0.003 + h) - cost(0.003 - h)) / (2 * h)
+    _, b = normal_equations(some_residuals(0.003), width)
+    assert float(b[0, 7]) == pytest.approx(slope * width**2, rel=1e-5)
+    assert OFFSET_PRIOR > 0.0
+
+
+def test_a_thick_copy_keeps_its_scale() -> None:
+    generator = torch.Generator().manual_seed(0)
+    target = sample_object_surface(chair(), 900, generator)
+    by = 0.015 * target.frame.length
+    source = sample_object_surface(thickened(chair(), by), 900, generator)
+    truth = target.frame.to_field().inverse() @ source.frame.to_field()
+    start = perturb(
+        Sim3(truth.scale[None], truth.rotation[None], truth.translation[None]),
+        torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D),
+    )
+    widths = [0.05, 0.04, 0.03, 0.02, *[0.01] * 8]
+    without = minimise(source.field, target.field, source.samples, target.samples, start, widths, adaptive=True)
+    free = minimise(
+        source.field, target.field, source.samples, target.samples, start, widths, adaptive=True,
+        offset=torch.zeros(1, dtype=D),
+    )  # fmt: skip
+    assert free.residuals.offset is not None
+    assert abs(float(without.T.scale / truth.scale) - 1.0) > 0.008
+    assert abs(float(free.T.scale / truth.scale) - 1.0) < 0.002
+    assert float(free.residuals.offset) == pytest.approx(0.015, abs=0.001)
+    assert float(free.residuals.offset) <= MOST_OFFSET
+
+
+def test_a_thick_scene_is_registered_at_its_scale_and_says_so() -> None:
+    truth = chair_pose()
+    result = run(thickened(room(truth), 0.012), chair(), detection())
+    assert result.verdict == "registered"
+    assert placement_error(result, truth) < 0.01
+    diameters = 0.012 * float(truth.scale) / result.metrics["object_diameter"]
+    assert result.metrics["surface_offset"] == pytest.approx(diameters, abs=0.003)
