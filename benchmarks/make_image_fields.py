@@ -39,10 +39,13 @@ KINDS = ("objects", "rooms", "single")
 OBJECT_OPTIONS = ReconstructionOptions()
 ROOM_OPTIONS = replace(
     OBJECT_OPTIONS,
-    grid=HashGridConfig.from_top_resolution(512, levels=8, log2_table_size=17),
-    iterations=6000,
-    surface_rays=1024,
-    free_points=2048,
+    grid=HashGridConfig.from_top_resolution(1024, levels=8, log2_table_size=17),
+    iterations=5000,
+    surface_rays=768,
+    free_points=1536,
+    colour_rays=32,
+    band=0.006,
+    band_behind=0.002,
 )
 SINGLE_OPTIONS = replace(ROOM_OPTIONS, iterations=2000)
 

@@ -12,7 +12,7 @@ import torch
 
 from regnf_core.errors import InvalidInputError
 
-_VERSION = 2
+_VERSION = 3
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:

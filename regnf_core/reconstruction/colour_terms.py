@@ -57,9 +57,10 @@ def render_rays(
     return Rendered(colour, depth, opacity)
 
 
-def samples_about_depth(rays: PixelRays, band: float, generator: torch.Generator) -> Tensor:
-    """(R, S) ascending depths: a few in free space, the others within ``band`` (field units) of the measured depth."""
-    half = band / rays.directions.norm(dim=1, keepdim=True)
+def samples_about_depth(rays: PixelRays, bands: Tensor, generator: torch.Generator) -> Tensor:
+    """(R, S) ascending depths: a few in free space, the others within ``bands`` (R,), field units, of the
+    measured depth."""
+    half = (bands / rays.directions.norm(dim=1))[:, None]
     measured = rays.depths[:, None]
     start = torch.minimum(rays.near[:, None], measured - 2.0 * half)
     free = start + (measured - half - start) * _stratified(len(rays), _FREE_SAMPLES, generator).to(half.device)

@@ -77,14 +77,14 @@ def reconstruct(
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
-    write(trainer.field, files.output)
+    write(trainer.averaged, files.output)
     if files.pictures:
-        _draw(trainer.field, prepared.bounds, files.output.with_suffix(".png"))
+        _draw(trainer.averaged, prepared.bounds, files.output.with_suffix(".png"))
     if files.sdfstudio is not None:
-        write_sdfstudio(trainer.field, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
+        write_sdfstudio(trainer.averaged, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
-    figures = judge(trainer.field, prepared.held_out.to(torch_device), prepared.size)
+    figures = judge(trainer.averaged, prepared.held_out.to(torch_device), prepared.size)
     return ReconstructionReport(
         loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(figures)
     )
@@ -119,10 +119,10 @@ def _train(
         trainer.step()
         done = trainer.iteration
         if done in snapshots:
-            write(trainer.field, snapshot_path(files.output, snapshots[done]))
+            write(trainer.averaged, snapshot_path(files.output, snapshots[done]))
         if done in pictures:
             drawn = snapshot_path(files.output, pictures[done]).with_suffix(".png")
-            _draw(trainer.field, write.bounds, drawn)
+            _draw(trainer.averaged, write.bounds, drawn)
         if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
             recent = trainer.mean_loss()
             if not math.isfinite(recent) or not trainer.is_finite():

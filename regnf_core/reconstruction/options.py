@@ -61,11 +61,22 @@ class ReconstructionOptions:
     """Rays an iteration for colour and opacity, where there is depth."""
     rays_without_depth: int = 384
     """The same where there is none: colour is all there is to learn from."""
+    band_deviations: float = 5.0
+    """How far before a measured surface the distance along the ray is believed, in standard deviations of the depth's
+    noise, or a pixel's width there if that is more; half as far behind it."""
     band: float = 0.012
-    """How far before a measured surface the distance along the ray is believed."""
+    """At most so far before it."""
     band_behind: float = 0.006
-    """The same behind it: half of the thinnest part worth having."""
+    """At most so far behind it: half of the thinnest part worth having."""
+    detail_share: float = 0.5
+    """The share of rays and free points that are drawn from within the boxes of the dataset's instances, if any."""
     weights: LossWeights = field(default_factory=LossWeights)
+    levels_at_start: int = 4
+    """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""
+    level_interval: float = 0.03
+    """The share of the iterations from one level to the next."""
+    averaging: float = 0.99
+    """Decay of the moving average of the parameters, which is what is written; 0 for none."""
     table_rate: float = 1e-2
     network_rate: float = 2e-3
     final_rate: float = 0.01
@@ -73,6 +84,15 @@ class ReconstructionOptions:
     start: Start = "auto"
     half_table: bool = True
     """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
+
+    def learning_levels(self, iteration: int) -> int:
+        """How many of the grid's levels learn at ``iteration``, coarsest first."""
+        steps = iteration / (self.level_interval * self.iterations) if self.level_interval > 0.0 else math.inf
+        return self.grid.levels if math.isinf(steps) else min(self.levels_at_start + int(steps), self.grid.levels)
+
+    def decay(self, iteration: int) -> float:
+        """Of the moving average at ``iteration``: less at first, so that the start is soon forgotten."""
+        return min(self.averaging, (1.0 + iteration) / (10.0 + iteration))
 
     def rate_share(self, iteration: int) -> float:
         """What is left of the learning rates at ``iteration``: a cosine from 1 down to ``final_rate``."""

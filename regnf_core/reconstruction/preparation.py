@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from regnf_core.box import OrientedBox
 from regnf_core.datasets.posed_images import PosedImages
 from regnf_core.reconstruction.checks import check_images, check_seen
-from regnf_core.reconstruction.depth_normals import ray_cosines
+from regnf_core.reconstruction.depth_normals import local_planes
 from regnf_core.reconstruction.network import StartShape
 from regnf_core.reconstruction.options import Start
 from regnf_core.reconstruction.rays import PixelRays, rays_of_pixels
@@ -23,7 +24,8 @@ _START_RADIUS = 0.2
 
 @dataclass(frozen=True)
 class PreparedImages:
-    """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units."""
+    """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
+    instances that the dataset names · pixel: a pixel's width at depth 1."""
 
     training: PixelRays
     held_out: PixelRays
@@ -31,14 +33,16 @@ class PreparedImages:
     bounds: torch.Tensor
     size: float
     has_depth: bool
+    boxes: tuple[OrientedBox, ...]
+    pixel: float
 
 
 def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
     """The rays that meet the bounds, at most three million. Raises DatasetError, see :func:`check_images`."""
     check_images(images)
     pixels = rng.permutation(images.colours[..., 0].size)[:_MOST_PIXELS]
-    cosines = None if images.depths is None else ray_cosines(images.depths, images.intrinsics)
-    rays = rays_of_pixels(images, pixels, cosines)
+    planes = None if images.depths is None else local_planes(images.depths, images.intrinsics)
+    rays = rays_of_pixels(images, pixels, planes)
     rays = rays.take(rays.far > rays.near)
     has_depth = images.depths is not None
     shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
@@ -52,6 +56,8 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
         bounds=torch.from_numpy(images.bounds),
         size=float(np.linalg.norm(images.bounds[1] - images.bounds[0])),
         has_depth=has_depth,
+        boxes=tuple(instance.box for instance in images.instances),
+        pixel=float(1.0 / np.median(images.intrinsics[:, 0, 0])),
     )
 
 

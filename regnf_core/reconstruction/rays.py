@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.datasets.posed_images import PosedImages
+from regnf_core.reconstruction.depth_normals import LocalPlanes
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class PixelRays:
     A point at depth z lies at origins + z directions: directions (R, 3) are not of unit length, their part along the
     camera's axis is 1. near, far: (R,) depths between which the ray is inside the bounds · colours: (R, 3) in [0, 1] ·
     depths: (R,), 0 where none was measured · background: (R,) true where a mask says so · cosines: (R,) between ray
-    and surface normal, 0 where unknown.
+    and surface normal, 0 where unknown · deviations: (R,) of the depths' noise, 0 where unknown.
     """
 
     origins: Tensor
@@ -30,6 +31,7 @@ class PixelRays:
     depths: Tensor
     background: Tensor
     cosines: Tensor
+    deviations: Tensor
 
     def __len__(self) -> int:
         return self.origins.shape[0]
@@ -47,10 +49,10 @@ class PixelRays:
         return self.origins[:, None] + depths[..., None] * self.directions[:, None]
 
 
-def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], cosines: NDArray[np.float32] | None) -> PixelRays:
+def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: LocalPlanes | None) -> PixelRays:
     """The rays of ``pixels`` (R,), indices into the images' (N, H, W) taken as one row.
 
-    cosines: (N, H, W), see :class:`PixelRays`.
+    planes: of the images' depths.
     """
     image, row, column = np.unravel_index(pixels, images.colours.shape[:3])
     centres = np.stack([column + 0.5, row + 0.5, np.ones(len(pixels))], axis=-1)
@@ -72,7 +74,8 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], cosines: NDAr
         colours=picked(images.colours) / 255.0 if len(pixels) else torch.zeros(0, 3),
         depths=picked(images.depths),
         background=picked(None if images.masks is None else ~images.masks) > 0.5,
-        cosines=picked(cosines),
+        cosines=picked(None if planes is None else planes.cosines),
+        deviations=picked(None if planes is None else planes.deviations),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from typing import Any
 
@@ -11,7 +13,8 @@ from torch import Tensor
 
 from regnf_core.fields.neus_facto import NeusFactoFunction
 from regnf_core.reconstruction.colour_terms import render_rays, samples_about_depth, samples_by_weight
-from regnf_core.reconstruction.depth_terms import DepthSupervision, depth_terms, supervise
+from regnf_core.reconstruction.depth_supervision import DepthSupervision, supervise
+from regnf_core.reconstruction.depth_terms import depth_terms
 from regnf_core.reconstruction.network import RadianceField
 from regnf_core.reconstruction.opacity import least_sharpness
 from regnf_core.reconstruction.options import ReconstructionOptions
@@ -39,11 +42,14 @@ class Trainer:
         self._losses: list[Tensor] = []
         self.generator = torch.Generator().manual_seed(seed)
         self.field = RadianceField(options, prepared.start, self.generator).to(device)
+        self.averaged = copy.deepcopy(self.field).requires_grad_(False)
+        """The moving average of ``field``: what is worth writing while the learning rates are still high."""
+        self._level_ends = list(itertools.accumulate(options.grid.level_entries()))
         self._size = prepared.size
         self._rays = prepared.training.to(device)
         self._data: DepthSupervision | None = None
         if prepared.has_depth:
-            self._data = supervise(prepared.training, prepared.size, options, rng).to(device)
+            self._data = supervise(prepared, options, rng).to(device)
         self._masked = bool(prepared.training.background.any())
         self._bounds = prepared.bounds.float().to(device)
         self._device = device
@@ -78,11 +84,21 @@ class Trainer:
         loss = self._loss()
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        self._hold_back_fine_levels()
         self.optimiser.step()
         with torch.no_grad():
             self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
+            keep = self.options.decay(self.iteration)
+            for average, parameter in zip(self.averaged.parameters(), self.field.parameters(), strict=True):
+                average.lerp_(parameter, 1.0 - keep)
         self.iteration += 1
         self._losses.append(loss.detach())
+
+    def _hold_back_fine_levels(self) -> None:
+        """Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero."""
+        levels = self.options.learning_levels(self.iteration)
+        if self.field.table.grad is not None and levels < len(self._level_ends):
+            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
 
     def sharpness(self) -> Tensor:
         """The opacity's sharpness now, per field unit."""
@@ -116,7 +132,7 @@ class Trainer:
         options = self.options
         index = torch.randint(len(data.rays), (options.colour_rays,), generator=self.generator).to(self._device)
         rays = data.rays.take(index)
-        depths = samples_about_depth(rays, 2.0 * options.band * data.size, self.generator)
+        depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
         rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
         colour = (rendered.colours - rays.colours).abs().mean()
         depth = (rendered.depths - rays.depths).abs().mean() / data.size
@@ -143,6 +159,7 @@ class Trainer:
         return {
             "iteration": self.iteration,
             "field": self.field.state_dict(),
+            "averaged": self.averaged.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
         }
@@ -151,5 +168,6 @@ class Trainer:
         """Go on from a :meth:`state`."""
         self.iteration = state["iteration"]
         self.field.load_state_dict(state["field"])
+        self.averaged.load_state_dict(state["averaged"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])

@@ -17,7 +17,7 @@ def loss_and_parameter():
     rays = rays_of_pixels(images, np.flatnonzero(images.depths.ravel() > 0.0)[:12], None)
     generator = torch.Generator().manual_seed(0)
     field = RadianceField(OPTIONS, StartShape(torch.zeros(3), 0.3, False), generator)
-    depths = samples_about_depth(rays, 0.05, generator)
+    depths = samples_about_depth(rays, torch.full((len(rays),), 0.05), generator)
 
     def loss():
         rendered = render_rays(field, rays, depths, torch.tensor(15.0), torch.zeros(3))
