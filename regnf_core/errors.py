@@ -8,6 +8,7 @@
     │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used
     ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
     ├── InitialisationError          NO_INITIAL_TRANSFORM
+    ├── FitDivergedError             FIT_DIVERGED
     └── CancelledError               CANCELLED
 
 This module imports nothing heavy: the HTTP front end uses it without loading torch.
@@ -70,6 +71,12 @@ class InitialisationError(RegnfError):
     """No initial transform could be estimated from the surface points."""
 
     reason = "NO_INITIAL_TRANSFORM"
+
+
+class FitDivergedError(RegnfError):
+    """A field that is being fitted is no longer made of numbers; its last checkpoint is kept."""
+
+    reason = "FIT_DIVERGED"
 
 
 class CancelledError(RegnfError):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from regnf_core.datasets.posed_images import PosedImages
-from regnf_core.errors import InvalidInputError, InvalidOptionsError, NoSurfaceError, RegnfError
+from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.pictures.field_picture import field_picture
@@ -29,12 +29,6 @@ from regnf_core.reconstruction.trainer import Trainer
 _REPORT_EVERY = 25
 _CHECKPOINTS = 10
 _PICTURES = (0.03, 0.1, 0.3)
-
-
-class FitDivergedError(RegnfError):
-    """The loss is no longer a number; the last checkpoint is kept."""
-
-    reason = "FIT_DIVERGED"
 
 
 @dataclass(frozen=True)
@@ -118,6 +112,8 @@ def _train(
     while trainer.iteration < total:
         trainer.step()
         done = trainer.iteration
+        if (done in snapshots or done in pictures) and not trainer.is_finite():
+            raise FitDivergedError(f"the fit diverged before iteration {done}")
         if done in snapshots:
             write(trainer.averaged, snapshot_path(files.output, snapshots[done]))
         if done in pictures:

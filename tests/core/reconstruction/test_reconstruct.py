@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.errors import DatasetError, InvalidInputError
+from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
 from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.fields.safe_format import open_field, read_description
 from regnf_core.importing.gate import import_field
-from regnf_core.reconstruction.fit import FitDivergedError, FitFiles, reconstruct
+from regnf_core.reconstruction.fit import FitFiles, reconstruct
 from regnf_core.reconstruction.network import RadianceField
 from regnf_core.reconstruction.options import LossWeights, ReconstructionOptions
 from tests.core.reconstruction import scenes
@@ -112,10 +112,11 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
 
 def test_a_fit_that_diverges_says_so_and_writes_no_field(tmp_path):
     options = replace(SMALL, iterations=20, weights=LossWeights(surface=float("inf")))
-    path = tmp_path / "field.safetensors"
-    with pytest.raises(FitDivergedError):
-        reconstruct(scenes.images(count=4), FitFiles(path), options, device="cpu")
-    assert not path.exists()
+    files = FitFiles(tmp_path / "field.safetensors", snapshots=(0.05,), pictures=True)
+    with pytest.raises(FitDivergedError) as caught:
+        reconstruct(scenes.images(count=4), files, options, device="cpu")
+    assert caught.value.reason == "FIT_DIVERGED"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_exported_layout_reads_back_through_the_gate(tmp_path):
