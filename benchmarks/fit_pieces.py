@@ -1,6 +1,8 @@
 """How well a room's fitted field follows each piece of furniture in it.
 
-A piece is what lies in an instance's box, 2 cm above the floor and up. Lengths are millimetres.
+A piece is what lies in an instance's box, 2 cm above the floor and up. Lengths are millimetres. A field has a surface
+round what no camera saw as well, under a seat for instance: what lies more than 5 cm from the true scene is counted on
+its own, and left out of the mean.
 """
 
 from __future__ import annotations
@@ -26,29 +28,30 @@ Floats = NDArray[np.float64]
 _POINTS = 10_000
 _CELL_M = 0.008
 _ABOVE_FLOOR_M = 0.02
-_FLOATING_M = 0.05
+_LIMIT_MM = 50.0
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Mean errors of the field's surface and of the seen surface, NaN where the field has none. floating: the share of
-    the field's surface more than 5 cm from the true scene · missing: the share of the seen surface more than 5 cm from
-    the field's."""
+    """Mean errors of the field's surface and of the seen surface, NaN where the field has none. beyond: the share of
+    the field's surface more than 5 cm from the true scene, left out of ``from_field`` · missing: the share of the seen
+    surface more than 5 cm from the field's."""
 
     label: str
     from_field: float
     to_field: float
-    floating: float
+    beyond: float
     missing: float
 
 
-def measure_pieces(images: PosedImages, scene: MeshScene, field: SdfField, seen: Floats) -> list[Piece]:
+def measure_pieces(images: PosedImages, scene: MeshScene, field: SdfField, seen: Floats) -> tuple[Piece, ...]:
     """One an instance. seen: (N, 3) metric points of surfaces that some camera saw."""
     assert isinstance(field, NeusFactoField)
     assert images.T_metric_world is not None
     T = images.T_metric_world
     floor = float(np.quantile(seen[:, 2], 0.001)) + _ABOVE_FLOOR_M
-    return [_piece(each.label, each.box, T, scene, field, seen[seen[:, 2] > floor], floor) for each in images.instances]
+    high = seen[seen[:, 2] > floor]
+    return tuple(_piece(each.label, each.box, T, scene, field, high, floor) for each in images.instances)
 
 
 def _piece(
@@ -59,7 +62,7 @@ def _piece(
     corners = box.corners().numpy()
     reach = 0.05 / scale
     bounds = torch.from_numpy(np.stack((corners.min(axis=0) - reach, corners.max(axis=0) + reach)))
-    own = _moved(seen, back)
+    own = moved(seen, back)
     near = seen[box.contains(torch.from_numpy(own)).numpy()]
     cropped = NeusFactoField(field.function, bounds)
     resolution = int(np.ceil(float((bounds[1] - bounds[0]).max()) * scale / _CELL_M))
@@ -67,15 +70,16 @@ def _piece(
         surface = extract_surface(cropped, resolution)
     except NoSurfaceError:
         return Piece(label, np.nan, np.nan, 0.0, 1.0)
-    mesh = trimesh.Trimesh(_moved(surface.vertices, T), surface.faces, process=False)
+    mesh = trimesh.Trimesh(moved(surface.vertices, T), surface.faces, process=False)
     sampled = trimesh.sample.sample_surface(mesh, 4 * _POINTS, seed=0)[0]
-    inside = box.contains(torch.from_numpy(_moved(sampled, back))).numpy() & (sampled[:, 2] > floor)
+    inside = box.contains(torch.from_numpy(moved(sampled, back))).numpy() & (sampled[:, 2] > floor)
     out = 1000.0 * np.abs(scene.signed_distance(sampled[inside]))
-    # a surface within matter that no camera could see is no error
     chosen = near[np.random.default_rng(0).permutation(len(near))[:_POINTS]]
     to = 1000.0 * distances_to(mesh, chosen)
-    limit = 1000.0 * _FLOATING_M
-    return Piece(label, float(out.mean()), float(to.mean()), float((out > limit).mean()), float((to > limit).mean()))
+    beyond = out > _LIMIT_MM
+    return Piece(
+        label, float(out[~beyond].mean()), float(to.mean()), float(beyond.mean()), float((to > _LIMIT_MM).mean())
+    )
 
 
 def distances_to(mesh: trimesh.Trimesh, points: Floats) -> Floats:
@@ -89,6 +93,7 @@ def distances_to(mesh: trimesh.Trimesh, points: Floats) -> Floats:
     return np.asarray(distance.numpy(), dtype=np.float64)
 
 
-def _moved(points: Floats, T: Floats) -> Floats:
-    moved: Floats = points @ T[:3, :3].T + T[:3, 3]
-    return moved
+def moved(points: Floats, T: Floats) -> Floats:
+    """Points (N, 3) by a transform (4, 4)."""
+    placed: Floats = points @ T[:3, :3].T + T[:3, 3]
+    return placed

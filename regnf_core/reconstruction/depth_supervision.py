@@ -51,8 +51,16 @@ class DepthSupervision:
 
     def to(self, device: torch.device) -> DepthSupervision:
         """The same on another device."""
-        tensors = self.before, self.behind, self.trust, self.detailed, self.free_points, self.clearances
-        return DepthSupervision(self.rays.to(device), *(tensor.to(device) for tensor in tensors), size=self.size)
+        return DepthSupervision(
+            rays=self.rays.to(device),
+            before=self.before.to(device),
+            behind=self.behind.to(device),
+            trust=self.trust.to(device),
+            detailed=self.detailed.to(device),
+            free_points=self.free_points.to(device),
+            clearances=self.clearances.to(device),
+            size=self.size,
+        )
 
 
 def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator) -> DepthSupervision:
