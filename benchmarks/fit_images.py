@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -81,15 +82,24 @@ def measure(images: PosedImages, scene: MeshScene, path: Path) -> Figures:
     distance = field.signed_distance(torch.from_numpy(moved(free, T_world_metric)).float()).numpy()
     return Figures(
         diameter=1000.0 * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])),
-        from_field=float(out.mean()),
-        from_field_p95=float(np.quantile(out, 0.95)),
-        to_field=float(back.mean()),
-        to_field_p95=float(np.quantile(back, 0.95)),
+        from_field=_mean(out),
+        from_field_p95=_p95(out),
+        to_field=_mean(back),
+        to_field_p95=_p95(back),
         depths=float(1000.0 * np.abs(scene.signed_distance(read)).mean()),
         free_distance=float(np.abs(millimetres * distance - 1000.0 * scene.signed_distance(free)).mean()),
         false_matter=float((distance < 0.0).mean()),
         pieces=measure_pieces(images, scene, field, seen) if len(scene.things) > 1 else (),
     )
+
+
+def _mean(values: Floats) -> float:
+    """nan where the field has no surface near what was seen."""
+    return float(values.mean()) if len(values) else math.nan
+
+
+def _p95(values: Floats) -> float:
+    return float(np.quantile(values, 0.95)) if len(values) else math.nan
 
 
 def _seen(images: PosedImages, scene: MeshScene, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:

@@ -10,7 +10,7 @@ pairs-after-N-percent.json    the same rooms after 1, 3 and 10 % of their traini
 pairs-short.json              rooms from a short walk past
 pairs-single.json             rooms from one bad view, a chair each
 
-What exists is kept. On one core about 3 minutes an object, 15 a room, 5 a single view.
+What exists is kept. On one core about 2 minutes an object, 5 a room, 2 a single view.
 """
 
 from __future__ import annotations
