@@ -28,6 +28,8 @@ _METRICS = (
     "hidden_share_object",
     "free_space_violations",
     "residual_rms",
+    "coarse_agreement",
+    "surface_offset",
     "field_evaluations",
 )
 

@@ -49,7 +49,7 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     best = float(evidence.scores[winner])
     close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
     rivals = [i for i in ranked.tolist() if i != winner and close[i]]
-    decision, reason = verdict(evidence, winner, len(rivals), options.robust)
+    decision, reason = verdict(evidence, winner, len(rivals), options.robust, problem.view.incoherence)
     T_work = select(poses, torch.tensor(winner))
     T = problem.in_field_frames(T_work)
     alternatives = []
@@ -75,7 +75,9 @@ def pose_covariance(problem: Problem, T_work: Sim3, offset: Tensor) -> Tensor:
     """
     A, B = problem.A, problem.B
     batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
-    r = residuals(problem.scene_field, problem.object_field, A, B, batch, offset[None])
+    r = residuals(
+        problem.scene_field, problem.object_field, A, B, batch, offset[None] if problem.view.most_offset > 0.0 else None
+    )
     places = torch.cat([T_work.apply(A.points.double()), B.points.double()])
     cov = covariance(r, fitting_width(r, LAST.widths[-1]), places)
     return in_object_units(cov, T_work, problem.view.frame, problem.model.frame)

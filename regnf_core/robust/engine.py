@@ -120,17 +120,18 @@ def refine_candidates(
     """
     scene, obj, ex = problem.scene_field, problem.object_field, problem.model.extremes
     found = None
+    most = problem.view.most_offset
     T, offsets = candidates, torch.zeros_like(candidates.scale)
     for stage in STAGES:
         trail = found.trail if found else Trail()
-        found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, trail, on_step, offsets)
+        found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, trail, on_step, offsets, most)
         T, offsets = found.T, found.offsets
     assert found is not None
     twins = _missing_twins(T, problem.model.symmetry, ex)
     descent = torch.cat([torch.arange(T.scale.numel()), torch.zeros(twins.scale.numel(), dtype=torch.long)])
     trail = found.trail.keep(descent)
     last = run_stage(
-        scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail, on_step, offsets[descent]
+        scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail, on_step, offsets[descent], most
     )
     evidence = gather_evidence(scene, obj, problem.A_held, problem.B_held, last.T, options, last.offsets)
     T_initial = last.trail.steps[0].T

@@ -98,6 +98,7 @@ def run_stage(
     trail: Trail,
     on_step: Callable[[], None],
     offsets: Tensor,
+    most_offset: float,
 ) -> Finalists:
     """Refine every pose of the batch on the stage's share of the samples, and keep the best distinct ones."""
     few_A, few_B = some(A, stage.points, generator), some(B, stage.points, generator)
@@ -112,7 +113,16 @@ def run_stage(
         on_step()
 
     refined = minimise(
-        scene, obj, few_A, few_B, T, list(stage.widths), adaptive=True, on_iteration=record, offset=offsets
+        scene,
+        obj,
+        few_A,
+        few_B,
+        T,
+        list(stage.widths),
+        adaptive=True,
+        on_iteration=record,
+        offset=offsets,
+        most_offset=most_offset,
     )
     scores = disagreement(refined.residuals, stage.score_width)
     kept = distinct(refined.T, scores, extremes, _APART, stage.keep)

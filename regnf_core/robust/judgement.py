@@ -3,6 +3,10 @@
 Two-sided: how much of the object's surface the scene confirms, and how much of the scene's surface the object explains.
 Where the scene is free although the object should be there, the pose is wrong; where the scene holds matter instead,
 the part may just never have been seen (fields are solid behind what was seen), and counts for nothing.
+
+Where the scene's field is rough, the right object misses the distance that accurate fields keep to, and normals say
+little. There a second measure may stand in: what agrees at twice the distance, whatever the normals, less the share of
+the object that lies in free space by more than that. Another thing's shape is wrong by more than roughness explains.
 """
 
 from __future__ import annotations
@@ -24,6 +28,13 @@ _CLEAN_VIOLATIONS, _VIOLATIONS_PER_NOISE = 0.05, 20.0
 _CLEAN_SHARE, _SHARE_PER_NOISE = 0.87, 45.0
 """Where the inliers agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing
 (a chair without its cushion); where they agree to a hundredth, it may be the fields' errors."""
+_COARSE = 2.0  # inlier distances
+_LEAST_COARSE = 0.68
+_ROUGH, _ROUGH_SCORE, _SCORE_PER_INCOHERENCE = 0.022, 0.5, 12.0
+"""From so incoherent normals on a field counts as rough, and the score may be as bad as they explain."""
+_CORE, _TAIL, _LONGEST_TAIL = 0.3, 0.75, 5.5
+"""Quantiles of the residuals' sizes, and the most that one may be of the other: 3 for normal errors everywhere. Another
+thing's residuals are small where it is alike and large where it is not."""
 _SAME_SIDE = 0.5  # least cosine of the normals of an inlier
 
 
@@ -44,6 +55,12 @@ class Evidence:
     """Object samples in the scene's free space, of those that it does not hide."""
     residual_rms: Tensor
     """Root mean square of the inliers' residuals."""
+    coarse: Tensor
+    """What both directions agree on at twice the distance, whatever the normals, less the share in free space."""
+    tail: Tensor
+    """How long the residuals' tail is: 3 for normal errors that are alike everywhere."""
+    explained_coarsely: Tensor
+    """Scene samples, near or not, that the object explains at twice the distance."""
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
 
@@ -57,6 +74,7 @@ class Evidence:
             "hidden_share_object": float(self.hidden[index]),
             "free_space_violations": float(self.violations[index]),
             "residual_rms": float(self.residual_rms[index]),
+            "coarse_agreement": float(self.coarse[index]),
             "surface_offset": float(self.offsets[index]),
         }
 
@@ -79,6 +97,7 @@ def gather_evidence(
     violating = back > options.inlier_distance
     open_ = (~hidden).sum(1).clamp_min(1)
     near = forth.abs() <= _REACH
+    coarse, explained_coarsely = _coarse(forth, back, near, _COARSE * options.inlier_distance)
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
     return Evidence(
         scores=disagreement(r, _SCORE_WIDTH),
@@ -88,28 +107,68 @@ def gather_evidence(
         hidden=hidden.float().mean(1),
         violations=violating.sum(1) / open_,
         residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
+        coarse=coarse,
+        tail=_tail(r.values),
+        explained_coarsely=explained_coarsely,
         offsets=offsets,
     )
 
 
-def verdict(evidence: Evidence, index: int, rivals: int, options: RobustOptions) -> tuple[Verdict, str]:
+def _coarse(forth: Tensor, back: Tensor, near: Tensor, distance: float) -> tuple[Tensor, Tensor]:
+    """``coarse`` and ``explained_coarsely`` of the evidence, (H,) each."""
+    explained = forth.abs() <= distance
+    of_near = explained.sum(1) / near.sum(1).clamp_min(1)
+    of_object = (back.abs() <= distance).float().mean(1)
+    free = (back > distance).sum(1) / (back >= -distance).sum(1).clamp_min(1)
+    return torch.minimum(of_near, of_object) - free, explained.float().mean(1)
+
+
+def verdict(
+    evidence: Evidence, index: int, rivals: int, options: RobustOptions, incoherence: float = 0.0
+) -> tuple[Verdict, str]:
     """The verdict on one pose that has ``rivals`` equals, and its reason, a stable UPPER_SNAKE word.
 
-    Written so that a number that is none can only lead to a rejection.
+    incoherence: of the scene's normals. Written so that a number that is none can only lead to a rejection.
     """
     if not float(evidence.hidden[index]) <= options.max_hidden_share:
         return "rejected", "TOO_LITTLE_SURFACE"
+    reason = _disagreement(evidence, index, options)
+    if reason and not _is_roughness(evidence, index, options, incoherence):
+        return "rejected", reason
+    if rivals:
+        return "ambiguous", "SEVERAL_POSES_AGREE"
+    return "registered", "SURFACES_AGREE"
+
+
+def _tail(values: Tensor) -> Tensor:
+    core, tail = torch.quantile(values.abs(), torch.tensor([_CORE, _TAIL]), dim=1)
+    longer: Tensor = tail / core.clamp_min(1e-9)
+    return longer
+
+
+def _is_roughness(evidence: Evidence, index: int, options: RobustOptions, incoherence: float) -> bool:
+    """Whether the disagreement is what a field as rough as this leads to at the right pose."""
+    most = _ROUGH_SCORE + _SCORE_PER_INCOHERENCE * (incoherence - _ROUGH)
+    return (
+        incoherence >= _ROUGH
+        and float(evidence.scores[index]) <= most
+        and float(evidence.tail[index]) <= _LONGEST_TAIL
+        and float(evidence.coarse[index]) >= _LEAST_COARSE
+        and float(evidence.explained_coarsely[index]) >= options.min_explained_share
+    )
+
+
+def _disagreement(evidence: Evidence, index: int, options: RobustOptions) -> str:
+    """Why the pose is to be rejected by what is asked of accurate fields; empty where it is not."""
     noise = float(evidence.residual_rms[index])
     if not float(evidence.violations[index]) <= min(
         options.max_free_space_violations, _CLEAN_VIOLATIONS + _VIOLATIONS_PER_NOISE * noise
     ):
-        return "rejected", "FREE_SPACE_VIOLATED"
+        return "FREE_SPACE_VIOLATED"
     if not float(evidence.share_object[index]) >= options.min_inlier_share:
-        return "rejected", "LOW_OVERLAP"
+        return "LOW_OVERLAP"
     if not float(evidence.share_scene[index]) >= max(options.min_inlier_share, _CLEAN_SHARE - _SHARE_PER_NOISE * noise):
-        return "rejected", "LOW_OVERLAP"
+        return "LOW_OVERLAP"
     if not float(evidence.share_explained[index]) >= options.min_explained_share:
-        return "rejected", "SCENE_UNEXPLAINED"
-    if rivals:
-        return "ambiguous", "SEVERAL_POSES_AGREE"
-    return "registered", "SURFACES_AGREE"
+        return "SCENE_UNEXPLAINED"
+    return ""

@@ -82,12 +82,14 @@ def minimise(
     adaptive: bool = False,
     on_iteration: Callable[[int, Sim3, Residuals, Tensor], None] | None = None,
     offset: Tensor | None = None,
+    most_offset: float = MOST_OFFSET,
 ) -> Refined:
     """Minimise the robust cost of every pose in the batch T (H,), one iteration for each kernel width.
 
     widths: kernel widths, object units; falling widths anneal. With ``adaptive`` they are
     the least, see :func:`fitting_width`. A step that raises the cost is undone and damped more.
     offset: (H,) float64 to start from, of one surface outside the other; None: there is none, and none is looked for.
+    most_offset: either way, object units.
     Each iteration asks each field once at each sample. Solves are in float64.
     """
     now = residuals(scene, obj, A, B, T, offset)
@@ -95,9 +97,9 @@ def minimise(
     width: Tensor | float = widths[-1]
     for iteration, least in enumerate(widths):
         width = fitting_width(now, least) if adaptive else least
-        step = _step(now, width, damping, fix_scale)
+        step = _step(now, width, damping, fix_scale, most_offset == 0.0)
         T_tried = perturb(T, step)
-        shifted = None if now.offset is None else (now.offset + step[:, 7]).clamp(-MOST_OFFSET, MOST_OFFSET)
+        shifted = None if now.offset is None else (now.offset + step[:, 7]).clamp(-most_offset, most_offset)
         tried = residuals(scene, obj, A, B, T_tried, shifted)
         better = robust_cost(tried, width) < robust_cost(now, width)
         T, now = _choose(better, T_tried, T), _choose_residuals(better, tried, now)
@@ -133,12 +135,12 @@ def with_offset(r: Residuals) -> Tensor:
     return torch.cat([r.jacobian, column], -1)
 
 
-def _step(r: Residuals, width: Tensor | float, damping: Tensor, fix_scale: bool) -> Tensor:
+def _step(r: Residuals, width: Tensor | float, damping: Tensor, fix_scale: bool, fix_offset: bool) -> Tensor:
     H, b = normal_equations(r, width)
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     extra = damping[:, None] * diagonal + 1e-9 + 1e-6 * diagonal.amax(-1, keepdim=True)
-    if fix_scale:
-        extra = extra + torch.tensor([0.0] * 6 + [1e9] + [0.0] * (H.shape[-1] - 7), dtype=torch.float64)
+    fixed = torch.tensor([False] * 6 + [fix_scale, fix_offset])[: H.shape[-1]]
+    extra = extra + 1e9 * fixed.double()
     step = -torch.linalg.solve(H + torch.diag_embed(extra), b)
     longest = step.abs().amax(-1, keepdim=True)
     short: Tensor = step * (_LARGEST_STEP / longest.clamp_min(_LARGEST_STEP))

@@ -11,13 +11,17 @@ from regnf_core.box import OrientedBox
 from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.frame import WorkingField, WorkingFrame
+from regnf_core.robust.levenberg import MOST_OFFSET
 from regnf_core.robust.proxy import ProxyField, proxy_of
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.samples import sample_scene_surface
 from regnf_core.robust.shadow import shadow_walls
+from regnf_core.robust.smoothing import smoothed
 from regnf_core.robust.support import support
 
 _FEWEST = 30  # samples in front of the supports; with fewer, the supports are kept after all
+_SMOOTH, _OFFSET_PER_INCOHERENCE = 0.012, 2.0
+"""What is smooth is no thicker than it should be either: there an offset would make one box another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +42,17 @@ class SceneView:
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)
+
+    @cached_property
+    def incoherence(self) -> float:
+        """How rough the foreground's normals are, see :class:`regnf_core.robust.smoothing.Smoothed`."""
+        return smoothed(self.foreground).incoherence
+
+    @property
+    def most_offset(self) -> float:
+        """How far the surface may lie outside or inside the object's, object diameters."""
+        allowed = _OFFSET_PER_INCOHERENCE * (self.incoherence - _SMOOTH)
+        return min(max(allowed, 0.0), MOST_OFFSET)
 
     @cached_property
     def proxy(self) -> ProxyField:
