@@ -8,7 +8,18 @@ from regnf_core.errors import RegnfError
 
 MODULES = {
     "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh"),
-    "service": ("fastapi", "pydantic_settings", "python_multipart", "yaml", "redis", "rq", "uvicorn"),
+    "service": (
+        "fastapi",
+        "httpcore",
+        "obstore",
+        "prometheus_client",
+        "pydantic_settings",
+        "python_multipart",
+        "redis",
+        "rq",
+        "uvicorn",
+        "yaml",
+    ),
 }
 """What each extra of the package brings."""
 
