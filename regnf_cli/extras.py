@@ -10,7 +10,6 @@ MODULES = {
     "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh"),
     "service": (
         "fastapi",
-        "httpcore",
         "obstore",
         "prometheus_client",
         "pydantic_settings",
