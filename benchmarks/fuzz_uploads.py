@@ -28,6 +28,7 @@ from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 
 _STATE_S = 180.0
 _POLL_S = 0.02
+_LEFT_S = 5.0
 
 
 @dataclass
@@ -71,7 +72,7 @@ def run(live: Live, seeds: Seeds, cases: int, seed: int) -> Tally:
             except (ValueError, KeyError, httpx.HTTPError) as error:
                 tally.failures.append(f"case {index} ({stage}): {error!r:.300}")
             tally.slowest = max(tally.slowest, time.monotonic() - begun)
-            if left := live.files() - known:
+            if left := _left(live, known):
                 tally.failures.append(f"case {index} ({stage}) left {sorted(left)[:3]}")
                 known |= left
         try:
@@ -85,6 +86,14 @@ def run(live: Live, seeds: Seeds, cases: int, seed: int) -> Tally:
     if "Traceback" in live.log():
         tally.failures.append("a traceback in the log")
     return tally
+
+
+def _left(live: Live, known: set[str]) -> set[str]:
+    """Files that are still there a little later: the journal is written once the field's state is known."""
+    end = time.monotonic() + _LEFT_S
+    while (left := live.files() - known) and time.monotonic() < end:
+        time.sleep(_POLL_S)
+    return left
 
 
 def report(tally: Tally, arguments: argparse.Namespace, seconds: float, peak: int) -> str:
