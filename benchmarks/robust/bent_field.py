@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import torch
@@ -35,8 +36,11 @@ class BentField:
         return self.field.device
 
     def to(self, device: torch.device | str) -> BentField:
-        """Not needed here: the benchmarks run where the field is."""
-        raise NotImplementedError(f"a bent field stays on {self.device}, asked for {device}")
+        """The same field and bend on another device."""
+        moved = copy.copy(self)
+        moved.field = self.field.to(device)
+        moved._wave, moved._phase = self._wave.to(device), self._phase.to(device)
+        return moved
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Signed distance (N,) float32 at points (N, 3)."""

@@ -26,12 +26,6 @@ from tests.redis_server import private_redis
 SHA = "a" * 64
 
 
-@pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
-
-
 @pytest.fixture
 def redis(redis_url: str) -> Iterator[Redis]:
     with connect(redis_url, retries=0) as made:

@@ -2,29 +2,13 @@
 
 import json
 import zlib
-from collections.abc import Iterator
 
 import pytest
 from redis import Redis
 
-from service.redis_client import connect
 from service.redis_queue import RqJobQueue, attempt_of, import_id, registration_id
-from tests.redis_server import private_redis
 
 SHA = "a" * 64
-
-
-@pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
-
-
-@pytest.fixture
-def redis(redis_url: str) -> Iterator[Redis]:
-    with connect(redis_url) as client:
-        client.flushall()
-        yield client
 
 
 @pytest.fixture

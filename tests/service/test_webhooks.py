@@ -24,7 +24,6 @@ from service.webhooks.outbox import RedisOutbox
 from service.webhooks.sender import HttpSender
 from service.webhooks.signing import read_secrets, signed_headers
 from service.webhooks.targets import AllowList, is_public
-from tests.redis_server import private_redis
 
 KEY = bytes(range(24))
 SECRET = f"whsec_{base64.b64encode(KEY).decode()}"
@@ -70,19 +69,6 @@ def receiver() -> Iterator[Receiver]:
         yield made
         server.shutdown()
         thread.join()
-
-
-@pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
-
-
-@pytest.fixture
-def redis(redis_url: str) -> Iterator[Redis]:
-    with connect(redis_url) as made:
-        made.flushall()
-        yield made
 
 
 def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> Deliverer:
