@@ -68,11 +68,20 @@ def _mend(operation: dict[str, Any]) -> None:
     for parameter in operation.get("parameters", []):
         for repeated in ("title", "description"):
             parameter["schema"].pop(repeated, None)
+        _drop_null(parameter["schema"])
     responses = operation["responses"]
     schema = responses.get("422", {}).get("content", {}).get("application/json", {}).get("schema", {})
     if schema.get("$ref", "").endswith("/HTTPValidationError"):
         del responses["422"]
     operation["responses"] = dict(sorted(responses.items()))
+
+
+def _drop_null(schema: dict[str, Any]) -> None:
+    """Nobody can send null in a query or a header: what is not required is left out."""
+    match [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]:
+        case [only]:
+            del schema["anyOf"]
+            schema |= only
 
 
 def _drop_content(operation: dict[str, Any]) -> None:

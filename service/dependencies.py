@@ -90,6 +90,4 @@ CallerDep = Annotated[str, Depends(caller_of_request)]
 PrefixDep = Annotated[str, Depends(prefix_of)]
 WaitQuery = Annotated[int, Query(ge=0, le=30, description="Seconds to hold the answer back for news.")]
 LimitQuery = Annotated[int, Query(ge=1, le=200, description="How many to return at most.")]
-PageTokenQuery = Annotated[
-    str | None, Query(max_length=200, description="`next_page_token` of the page before.", examples=[None])
-]
+PageTokenQuery = Annotated[str | None, Query(max_length=200, description="`next_page_token` of the page before.")]

@@ -51,6 +51,19 @@ def header(description: str) -> dict[str, Any]:
     return {"description": description, "schema": {"type": "string"}}
 
 
+def links(parameter: str, source: str, *operations: str, **fixed: str) -> dict[str, Any]:
+    """What can be done next with what an answer names: operations whose ``parameter`` is ``source``, a JSON Pointer.
+
+    ``fixed`` are further parameters, taken from the request's path by their names.
+    """
+    known = {name: f"$request.path.{place}" for name, place in fixed.items()}
+    parameters = {parameter: f"$response.body#{source}"} | known
+    return {operation: {"operationId": operation, "parameters": parameters} for operation in operations}
+
+
+FIELD_LINKS = links("sha256", "/sha256", "get_field", "get_field_preview", "delete_field")
+JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
+FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 UPLOAD_REFUSALS = (
     "INVALID_HEADER",

@@ -31,6 +31,7 @@ from service.webhooks.outbox import Delivery
 
 router = APIRouter(tags=["jobs"])
 _RETRY_AFTER_S = "1"
+_EVENT_ID = {"pattern": "^[0-9]{1,19}(-[0-9]{1,19})?$"}
 
 
 async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
@@ -142,7 +143,9 @@ async def job_events(
     id: str,  # noqa: A002
     services: ServicesDep,
     caller: CallerDep,
-    last_event_id: Annotated[str | None, Header(description="Resume after this event.")] = None,
+    last_event_id: Annotated[
+        str | None, Header(description="Resume after this event.", json_schema_extra=_EVENT_ID)
+    ] = None,
 ) -> Response:
     """From the beginning, or after `Last-Event-ID`."""
     record = await off_loop(find_job, services, id, caller)

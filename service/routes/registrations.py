@@ -19,7 +19,16 @@ from service.ownership import owned_request
 from service.problems import Problem
 from service.records import ACTIVE, FINISHED
 from service.registrations import check_fields, check_idempotency_key, submit
-from service.routes.documentation import JSON, MULTIPART_REFUSALS, UPLOAD_REFUSALS, header, reference, refusals
+from service.routes.documentation import (
+    FILE,
+    JOB_LINKS,
+    JSON,
+    MULTIPART_REFUSALS,
+    UPLOAD_REFUSALS,
+    header,
+    reference,
+    refusals,
+)
 from service.routes.examples import REGISTER_EXAMPLES
 from service.routes.jobs import job_answer
 from service.schemas.jobs import JobDocument
@@ -30,12 +39,11 @@ from service.waiting import wait_for
 router = APIRouter(tags=["registrations"])
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
 _LONGEST_WAIT_S = 30
-_FILE = {"type": "string", "format": "binary"}
 _ONE_SHOT = {
     "schema": {
         "type": "object",
         "required": ["scene", "object", "request"],
-        "properties": {"scene": _FILE, "object": _FILE, "request": reference(Question)},
+        "properties": {"scene": FILE, "object": FILE, "request": reference(Question)},
     }
 }
 
@@ -58,10 +66,12 @@ def preferred_wait(prefer: str | None) -> int | None:
         200: {
             "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
             "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
+            "links": JOB_LINKS,
         },
         202: {
             "description": "Accepted.",
             "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
+            "links": JOB_LINKS,
         },
         **refusals(
             *UPLOAD_REFUSALS,
@@ -106,7 +116,7 @@ async def register(
         str | None,
         Header(
             description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
-            json_schema_extra={"minLength": 1, "maxLength": 255},
+            json_schema_extra={"pattern": "^[!-~]([ -~]{0,253}[!-~])?$"},
         ),
     ] = None,
 ) -> JSONResponse:

@@ -15,7 +15,7 @@ from service.problems import Problem
 from service.ranges import ByteRange, parse_range
 from service.records import ACTIVE, JobRecord
 from service.results import ARTIFACTS, Manifest, read_manifest, read_result
-from service.routes.documentation import BINARY, header, refusals
+from service.routes.documentation import BINARY, header, links, refusals
 from service.schemas.common import whole_problem
 from service.schemas.results import ResultDocument
 
@@ -47,18 +47,21 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
     "/jobs/{id}/result",
     summary="What the registration found",
     response_model=ResultDocument,
-    responses=refusals(
-        "JOB_NOT_FOUND",
-        "JOB_NOT_READY",
-        "JOB_DISMISSED",
-        "JOB_EXPIRED",
-        "NO_SURFACE_IN_DETECTION",
-        "NO_SURFACE_IN_OBJECT",
-        "NO_INITIAL_TRANSFORM",
-        "WORKER_LOST",
-        "JOB_TIMEOUT",
-        "OUT_OF_MEMORY",
-    ),
+    responses={
+        200: {"links": links("name", "/artifacts/0/name", "get_artifact", "head_artifact", id="id")},
+        **refusals(
+            "JOB_NOT_FOUND",
+            "JOB_NOT_READY",
+            "JOB_DISMISSED",
+            "JOB_EXPIRED",
+            "NO_SURFACE_IN_DETECTION",
+            "NO_SURFACE_IN_OBJECT",
+            "NO_INITIAL_TRANSFORM",
+            "WORKER_LOST",
+            "JOB_TIMEOUT",
+            "OUT_OF_MEMORY",
+        ),
+    },
 )
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
     """A failed job answers here with its own problem."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import AsyncIterator
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path
 from starlette.requests import Request
@@ -18,7 +18,15 @@ from service.intake import Intake, check_room, take_in
 from service.multipart import boundary_of, read_parts
 from service.problems import Problem
 from service.records import FieldRecord
-from service.routes.documentation import BINARY, MULTIPART_REFUSALS, UPLOAD_REFUSALS, header, reference, refusals
+from service.routes.documentation import (
+    FIELD_LINKS,
+    FILE,
+    MULTIPART_REFUSALS,
+    UPLOAD_REFUSALS,
+    header,
+    reference,
+    refusals,
+)
 from service.schemas.fields import FieldDocument, field_document
 from service.schemas.reading import read_model
 from service.uploads import Received, Upload
@@ -26,11 +34,21 @@ from service.uploads import Received, Upload
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
 _HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
+_DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The bytes were held already.",
+        "model": FieldDocument,
+        "headers": _HEADERS,
+        "links": FIELD_LINKS,
+    },
+    201: {"description": "Stored; the import is queued.", "headers": _HEADERS, "links": FIELD_LINKS},
+}
 _MULTIPART = {
     "schema": {
         "type": "object",
         "required": ["file"],
-        "properties": {"file": {"type": "string", "format": "binary"}, "description": reference(UploadDescription)},
+        "properties": {"file": FILE, "description": reference(UploadDescription)},
     }
 }
 
@@ -41,11 +59,10 @@ _MULTIPART = {
     response_model=FieldDocument,
     status_code=201,
     responses={
-        200: {"description": "The bytes were held already.", "model": FieldDocument, "headers": _HEADERS},
-        201: {"description": "Stored; the import is queued.", "headers": _HEADERS},
+        **_ANSWERS,
         **refusals(*UPLOAD_REFUSALS),
     },
-    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": BINARY}}},
+    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": FILE}}}},
 )
 async def put_field(
     request: Request,
@@ -53,7 +70,9 @@ async def put_field(
     caller: CallerDep,
     prefix: PrefixDep,
     sha256: Annotated[str, Path(description="SHA-256 of the file.", json_schema_extra={"pattern": "^[0-9a-f]{64}$"})],
-    content_digest: Annotated[str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.")] = None,
+    content_digest: Annotated[
+        str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.", json_schema_extra=_DIGEST)
+    ] = None,
 ) -> JSONResponse:
     """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held."""
     if not is_sha256(sha256):
@@ -76,8 +95,7 @@ async def put_field(
     response_model=FieldDocument,
     status_code=201,
     responses={
-        200: {"description": "The bytes were held already.", "model": FieldDocument, "headers": _HEADERS},
-        201: {"description": "Stored; the import is queued.", "headers": _HEADERS},
+        **_ANSWERS,
         **refusals(
             *UPLOAD_REFUSALS, *MULTIPART_REFUSALS, "MALFORMED_JSON", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"
         ),
@@ -85,7 +103,7 @@ async def put_field(
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": {"application/octet-stream": BINARY, "multipart/form-data": _MULTIPART},
+            "content": {"application/octet-stream": {"schema": FILE}, "multipart/form-data": _MULTIPART},
         }
     },
 )
@@ -94,7 +112,9 @@ async def post_field(
     services: ServicesDep,
     caller: CallerDep,
     prefix: PrefixDep,
-    content_digest: Annotated[str | None, Header(description="RFC 9530, of the body as sent.")] = None,
+    content_digest: Annotated[
+        str | None, Header(description="RFC 9530, of the body as sent.", json_schema_extra=_DIGEST)
+    ] = None,
 ) -> JSONResponse:
     """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
     digest = announced_digest(content_digest)
