@@ -32,6 +32,16 @@ from service.webhooks.outbox import Delivery
 router = APIRouter(tags=["jobs"])
 _RETRY_AFTER_S = "1"
 _EVENT_ID = {"pattern": "^[0-9]{1,19}(-[0-9]{1,19})?$"}
+_EVENT = {
+    "description": "One event of the stream.",
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string"} | _EVENT_ID,
+        "event": {"enum": ["status", "progress"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
 
 
 async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
@@ -133,7 +143,7 @@ async def get_job(
         200: {
             "description": "Events `status` and `progress`; the data are status, phase, progress, attempt, updated. "
             "The stream ends after the event that ends the job.",
-            "content": {sse.MEDIA_TYPE: {"schema": {"type": "string"}}},
+            "content": {sse.MEDIA_TYPE: {"schema": _EVENT}},
         },
         204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
         **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_STREAMS"),

@@ -43,6 +43,8 @@ _ONE_SHOT = {
     "schema": {
         "type": "object",
         "required": ["scene", "object", "request"],
+        "additionalProperties": False,
+        "additionalProperties": False,
         "properties": {"scene": FILE, "object": FILE, "request": reference(Question)},
     }
 }

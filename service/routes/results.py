@@ -22,6 +22,21 @@ from service.schemas.results import ResultDocument
 router = APIRouter(tags=["results"])
 _BLOCK_BYTES = 256 * 1024
 _CACHE = "private, max-age=0, must-revalidate"
+_OWN_PROBLEMS = (
+    "FIELD_NOT_FOUND",
+    "FIELD_REJECTED",
+    "FIELD_IMPORT_TIMEOUT",
+    "NO_SURFACE_IN_DETECTION",
+    "NO_SURFACE_IN_OBJECT",
+    "NO_INITIAL_TRANSFORM",
+    "WORKER_LOST",
+    "JOB_TIMEOUT",
+    "OUT_OF_MEMORY",
+    "STORAGE_FULL",
+    "INTERNAL",
+)
+"""What a failed job can have ended with, as far as the table of reasons goes; the engine's own are 422."""
+_FILES = {media_type: BINARY for media_type in sorted(set(ARTIFACTS.values()))}
 
 
 def _require_successful(record: JobRecord) -> None:
@@ -54,12 +69,7 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
             "JOB_NOT_READY",
             "JOB_DISMISSED",
             "JOB_EXPIRED",
-            "NO_SURFACE_IN_DETECTION",
-            "NO_SURFACE_IN_OBJECT",
-            "NO_INITIAL_TRANSFORM",
-            "WORKER_LOST",
-            "JOB_TIMEOUT",
-            "OUT_OF_MEMORY",
+            *_OWN_PROBLEMS,
         ),
     },
 )
@@ -78,15 +88,22 @@ def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: Prefix
 
 
 _RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"description": "The whole file.", "content": {"application/octet-stream": BINARY}},
+    200: {"description": "The whole file.", "content": _FILES},
     206: {
         "description": "The range asked for.",
-        "content": {"application/octet-stream": BINARY},
+        "content": _FILES,
         "headers": {"Content-Range": header("Which bytes these are.")},
     },
     304: {"description": "Nothing has changed since the ETag given."},
-    **refusals("JOB_NOT_FOUND", "ARTIFACT_NOT_FOUND", "JOB_NOT_READY", "JOB_DISMISSED", "JOB_EXPIRED"),
-    **refusals("RANGE_NOT_SATISFIABLE"),
+    **refusals(
+        "JOB_NOT_FOUND",
+        "ARTIFACT_NOT_FOUND",
+        "JOB_NOT_READY",
+        "JOB_DISMISSED",
+        "JOB_EXPIRED",
+        "RANGE_NOT_SATISFIABLE",
+        *_OWN_PROBLEMS,
+    ),
 }
 
 

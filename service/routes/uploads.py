@@ -48,6 +48,8 @@ _MULTIPART = {
     "schema": {
         "type": "object",
         "required": ["file"],
+        "additionalProperties": False,
+        "additionalProperties": False,
         "properties": {"file": FILE, "description": reference(UploadDescription)},
     }
 }
