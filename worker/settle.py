@@ -14,6 +14,8 @@ from worker.imports import claim_import, reject
 from worker.problems import problem
 
 logger = logging.getLogger(__name__)
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
+"""What a process does not do to itself; other signals, a segmentation fault say, would come again."""
 _DETAILS = {
     "WORKER_LOST": "The process that did the work was killed. Send the request again.",
     "INTERNAL": "A fault of ours: the process that did the work ended without a word. The log has more under its id.",
@@ -31,9 +33,9 @@ class HorseEnd:
     """The worker itself was told to stop and took its job down with it."""
 
     @property
-    def by_itself(self) -> bool:
-        """Neither killed nor too slow: for want of Redis or storage, as a rule."""
-        return self.signal is None and not self.late
+    def worth_another_try(self) -> bool:
+        """It ended for want of Redis or storage, as a rule, or was killed from outside; not too slow, not too large."""
+        return not self.late and (self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory))
 
     def reason(self) -> str:
         if self.late:
@@ -47,7 +49,8 @@ def settle_registration(context: Context, job_id: str, attempt: int, worker: str
     """See that the record of a job whose process is gone does not go on saying it runs.
 
     A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
-    that ended by itself, for want of Redis or storage, is granted one more attempt; everything else has failed.
+    that was killed, or ended by itself for want of Redis or storage, is granted one more attempt; everything else has
+    failed.
     """
     record = context.records.get_job(job_id)
     if record is None or record.attempt != attempt or record.status not in ACTIVE:
@@ -73,7 +76,7 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
     changes: dict[str, Any]
     if record.cancel_requested:
         changes = {"status": "dismissed"}
-    elif end.given_back or (end.by_itself and record.requeues == 0):
+    elif end.given_back or (end.worth_another_try and record.requeues == 0):
         again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
         context.queue.enqueue_registration(job_id, again.attempt)
         logger.warning("job %s attempt %d is to be run again", job_id, attempt)
@@ -85,13 +88,13 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
 
 
 def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: HorseEnd) -> None:
-    """The same for an import: one that was given back, or ended by itself, starts anew; others have it rejected."""
+    """The same for an import: one that was given back, killed, or ended by itself starts anew; others are rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
         return
     if not claim_import(context, sha256, attempt, worker):
         return
-    if end.given_back or (end.by_itself and field.requeues == 0):
+    if end.given_back or (end.worth_another_try and field.requeues == 0):
         try:
             again = context.records.retry_import(sha256, attempt, lost=not end.given_back)
         except StaleAttemptError:

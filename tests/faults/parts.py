@@ -1,7 +1,8 @@
-"""The service's processes with short patience and an engine that does as it is told: `python -m tests.faults.parts`.
+"""The service's processes with an engine that does as it is told: `python -m tests.faults.parts`.
 
 api FD      the API on a socket it is handed. With REGNF_TEST_DIE it kills itself where a job would be queued.
-worker      a worker. Its jobs wait for as long as the file `hold` is in the state folder.
+worker      a worker. Its jobs wait for as long as the file `hold` is in the state folder, and once more, when their
+            result stands, while `hold-end` is.
 """
 
 from __future__ import annotations
@@ -11,17 +12,21 @@ import signal
 import socket
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import uvicorn
 
 from service import app, object_blobs, reaper
+from service.blobs import BlobStore
 from service.logs import configure_logging
 from service.redis_client import connect
 from service.redis_queue import RqJobQueue
 from service.settings import Settings
+from tests.faults.pace import pace
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
+from worker import artifacts, registration
 from worker.context import Context
 from worker.imports import run_import_attempt
 from worker.jobs import delivery
@@ -30,7 +35,6 @@ from worker.registration import run_attempt
 from worker.scratch import Scratch
 
 FUNCTIONS = ("tests.faults.parts.run_registration", "tests.faults.parts.run_import")
-REQUEST_TIMEOUT_S = 1.0
 
 
 class DyingQueue(RqJobQueue):
@@ -38,6 +42,11 @@ class DyingQueue(RqJobQueue):
 
     def enqueue_registration(self, job_id: str, attempt: int) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_while(gate: str) -> None:
+    while (Settings().state_dir / gate).exists():
+        time.sleep(0.01)
 
 
 class HeldEngine(TinyEngine):
@@ -50,28 +59,56 @@ class HeldEngine(TinyEngine):
         return super().register(scene, object_, model, held, report, folder)
 
     def while_held(self, report: Report) -> None:
-        while (Settings().state_dir / "hold").exists():
+        while True:
             report("optimising", 0.5)
+            if not (Settings().state_dir / "hold").exists():
+                return
             time.sleep(0.01)
 
 
+def publish(blobs: BlobStore, job_id: str, manifest: artifacts.Manifest) -> bool:
+    stands = artifacts.publish(blobs, job_id, manifest)
+    wait_while("hold-end")
+    return stands
+
+
+def held_importer(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+    wait_while("hold-import")
+    return tiny_importer(upload, folder, description)
+
+
+def context() -> Context:
+    """Everything real but the functions that the queue names."""
+    settings = Settings()
+    assert settings.redis_url is not None
+    return replace(Context.from_settings(settings), queue=RqJobQueue(connect(settings.redis_url), *FUNCTIONS))
+
+
 def run_registration(job_id: str) -> None:
-    object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
-    run_attempt(Context.from_settings(Settings()), job_id, *delivery(), HeldEngine)
+    shorten_patience()
+    registration.publish = publish
+    run_attempt(context(), job_id, *delivery(), HeldEngine)
 
 
 def run_import(sha256: str) -> None:
-    object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
-    run_import_attempt(Context.from_settings(Settings()), sha256, *delivery(), tiny_importer)
+    shorten_patience()
+    run_import_attempt(context(), sha256, *delivery(), held_importer)
 
 
-def serve_api(descriptor: int) -> None:
-    settings = Settings()
-    assert settings.redis_url is not None
+def shorten_patience() -> None:
+    """What no setting shortens; nothing in the whole version."""
+    if pace().whole:
+        return
     app._REAP_EVERY_S = 0.5
     app._STORAGE_PATIENCE_S = 2.0
     reaper._UNHELD_FOR_S = 1.0
-    object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
+    object_blobs._REQUEST_TIMEOUT_S = 1.0
+
+
+def serve_api(descriptor: int) -> None:
+    shorten_patience()
+    settings = Settings()
+    assert settings.redis_url is not None
     kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else RqJobQueue
     application = app.create_app(settings, queue=kind(connect(settings.redis_url), *FUNCTIONS))
     config = uvicorn.Config(application, log_config=None, access_log=False, lifespan="on", timeout_graceful_shutdown=2)
@@ -79,10 +116,9 @@ def serve_api(descriptor: int) -> None:
 
 
 def work() -> None:
-    context = Context.from_settings(Settings())
-    scratch = Scratch(context.settings.scratch_dir)
+    scratch = Scratch(Settings().scratch_dir)
     try:
-        RegnfWorker(context, scratch).serve()
+        RegnfWorker(context(), scratch).serve()
     finally:
         scratch.remove()
 

@@ -179,10 +179,15 @@ def test_a_running_job_can_be_cancelled(client: Client, demo: dict[str, Any]) ->
     assert client.get(f"/jobs/{job_id}/result").json()["reason"] == "JOB_DISMISSED"
 
 
-def test_a_killed_job_says_so_and_the_next_one_runs(client: Client, demo: dict[str, Any]) -> None:
+def test_a_job_killed_twice_says_so_and_the_next_one_runs(client: Client, demo: dict[str, Any]) -> None:
     job_id = running(client, {**demo, "seed": 102})
-    (process,) = [pid for pid in processes_with_torch() if is_descendant_of(pid, os.getpid())]
-    os.kill(process, signal.SIGKILL)
+    for attempt in (1, 2):
+        wait(
+            lambda: client.get(f"/jobs/{job_id}", params={"wait": 1}).json(),
+            lambda job, attempt=attempt: (job["attempts"], job["phase"]) == (attempt, "optimising"),
+        )
+        (process,) = [pid for pid in processes_with_torch() if is_descendant_of(pid, os.getpid())]
+        os.kill(process, signal.SIGKILL)
     job = finished(client, job_id)
     assert (job["status"], job["error"]["reason"]) == ("failed", "WORKER_LOST")
     assert finished(client, submit(client, {**demo, "seed": 103}))["status"] == "successful"

@@ -176,7 +176,7 @@ def test_a_job_hears_that_another_attempt_has_taken_over(context: Context) -> No
 @pytest.mark.parametrize(
     ("end", "reason"),
     [
-        (HorseEnd(signal=9), "WORKER_LOST"),
+        (HorseEnd(signal=11), "WORKER_LOST"),
         (HorseEnd(signal=11, out_of_memory=True), "WORKER_LOST"),
         (HorseEnd(signal=9, out_of_memory=True), "OUT_OF_MEMORY"),
         (HorseEnd(signal=9, late=True, out_of_memory=True), "JOB_TIMEOUT"),
@@ -196,15 +196,24 @@ def test_how_a_process_ended_is_how_its_job_failed(context: Context, end: HorseE
     assert list(context.blobs.list("jobs")) == []
 
 
-def test_a_process_that_ends_without_a_word_twice_is_a_fault_of_ours(context: Context) -> None:
+@pytest.mark.parametrize(
+    ("end", "reason"),
+    [(HorseEnd(), "INTERNAL"), (HorseEnd(signal=9), "WORKER_LOST"), (HorseEnd(signal=15), "WORKER_LOST")],
+)
+def test_a_process_that_vanishes_is_given_a_second_chance_and_no_third(
+    context: Context, end: HorseEnd, reason: str
+) -> None:
     accept(context)
-    settle_registration(context, "j1", 1, "w", HorseEnd())
-    assert (job(context).status, job(context).attempt) == ("accepted", 2)
-    settle_registration(context, "j1", 2, "w", HorseEnd())
+    context.blobs.put("jobs/j1/1/half", b".")
+    settle_registration(context, "j1", 1, "w", end)
+    assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 1)
+    assert context.queue.holds_registration("j1", 2)
+    settle_registration(context, "j1", 2, "w", end)
     error = job(context).error
     assert error is not None
-    assert error["reason"] == "INTERNAL"
-    assert "request" not in error["detail"]  # no request failed here, so no request id leads anywhere
+    assert (job(context).status, error["reason"]) == ("failed", reason)
+    assert reason == "WORKER_LOST" or "request" not in error["detail"], "no request failed here"
+    assert list(context.blobs.list("jobs")) == []
 
 
 def test_somebody_elses_job_is_left_alone(context: Context) -> None:
@@ -266,7 +275,7 @@ def test_an_import_that_died_after_its_work_is_not_done_again(context: Context) 
 
 
 @pytest.mark.parametrize(
-    ("end", "reason"), [(HorseEnd(signal=9), "WORKER_LOST"), (HorseEnd(late=True, signal=9), "IMPORT_TIMEOUT")]
+    ("end", "reason"), [(HorseEnd(signal=11), "WORKER_LOST"), (HorseEnd(late=True, signal=9), "IMPORT_TIMEOUT")]
 )
 def test_a_killed_import_rejects_its_field(context: Context, end: HorseEnd, reason: str) -> None:
     begin_import(context)
@@ -277,10 +286,12 @@ def test_a_killed_import_rejects_its_field(context: Context, end: HorseEnd, reas
     assert list(context.blobs.list("")) == []
 
 
-def test_an_import_given_back_starts_anew(context: Context) -> None:
+@pytest.mark.parametrize("given_back", [True, False])
+def test_an_import_given_back_or_killed_starts_anew(context: Context, given_back: bool) -> None:
     begin_import(context)
-    settle_import(context, SHA, 1, "w", HorseEnd(signal=9, given_back=True))
-    assert (field(context).state, field(context).attempt, field(context).requeues) == ("validating", 2, 0)
+    settle_import(context, SHA, 1, "w", HorseEnd(signal=9, given_back=given_back))
+    requeues = 0 if given_back else 1
+    assert (field(context).state, field(context).attempt, field(context).requeues) == ("validating", 2, requeues)
     assert context.blobs.exists(f"fields/{SHA}/original")
 
 

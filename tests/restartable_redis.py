@@ -1,0 +1,51 @@
+"""The Redis server of `regnf serve`, to be killed and started at will over the same history."""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from regnf_cli.embedded_redis import answers, server_command
+from tests.worker.bench import eventually
+
+
+@dataclass
+class RestartableRedis:
+    """The server's socket is in ``folder``, what it keeps in ``data``."""
+
+    folder: Path
+    data: Path
+    environment: dict[str, str] | None = None
+    process: subprocess.Popen[bytes] | None = field(default=None)
+
+    @property
+    def url(self) -> str:
+        return f"unix://{self.folder}/s"
+
+    def start(self) -> None:
+        command = server_command(self.folder / "s", self.data)
+        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=self.environment)
+        eventually(lambda: answers(self.url), "Redis")
+
+    def kill(self) -> None:
+        assert self.process is not None
+        self.process.kill()
+        self.process.wait()
+
+
+@contextmanager
+def restartable_redis(
+    data: Path | None = None, environment: dict[str, str] | None = None
+) -> Iterator[RestartableRedis]:
+    """A started server. Socket paths must be short, hence a folder of its own."""
+    with tempfile.TemporaryDirectory(prefix="rg-") as folder:
+        made = RestartableRedis(Path(folder), data or Path(folder) / "data", environment)
+        made.start()
+        try:
+            yield made
+        finally:
+            made.kill()
