@@ -9,15 +9,18 @@ from typing import Any
 from service.problems import Problem
 
 _MAX_DEPTH = 32
+_LARGEST_EXACT = 2**53
 
 
 def parse_json(body: bytes) -> Any:
-    """The value in ``body``. NaN and Infinity pass, for the schema to refuse them where they stand.
+    """The value in ``body``; a number without a fraction is an int, as JSON Schema has it, however it is spelt.
+
+    NaN and Infinity pass, for the schema to refuse them where they stand.
 
     Raises Problem MALFORMED_JSON.
     """
     try:
-        value = json.loads(body.decode("utf-8"), object_pairs_hook=_object)
+        value = json.loads(body.decode("utf-8"), object_pairs_hook=_object, parse_float=_number)
     except UnicodeDecodeError as error:
         raise Problem("MALFORMED_JSON", "The body is not UTF-8.") from error
     except json.JSONDecodeError as error:
@@ -26,6 +29,11 @@ def parse_json(body: bytes) -> Any:
         raise Problem("MALFORMED_JSON", "Too deep, or a number of too many digits.") from error
     _check_depth(value)
     return value
+
+
+def _number(text: str) -> float | int:
+    value = float(text)
+    return int(value) if value.is_integer() and abs(value) <= _LARGEST_EXACT else value
 
 
 def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def links(parameter: str, source: str, *operations: str, **fixed: str) -> dict[s
     return {operation: {"operationId": operation, "parameters": parameters} for operation in operations}
 
 
-FIELD_LINKS = links("sha256", "/sha256", "get_field", "get_field_preview", "delete_field")
+FIELD_LINKS = links("sha256", "/sha256", "get_field", "delete_field")
 JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
 FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}

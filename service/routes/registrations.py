@@ -44,7 +44,6 @@ _ONE_SHOT = {
         "type": "object",
         "required": ["scene", "object", "request"],
         "additionalProperties": False,
-        "additionalProperties": False,
         "properties": {"scene": FILE, "object": FILE, "request": reference(Question)},
     }
 }

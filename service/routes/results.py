@@ -36,7 +36,7 @@ _OWN_PROBLEMS = (
     "INTERNAL",
 )
 """What a failed job can have ended with, as far as the table of reasons goes; the engine's own are 422."""
-_FILES = {media_type: BINARY for media_type in sorted(set(ARTIFACTS.values()))}
+_FILES = dict.fromkeys(sorted(set(ARTIFACTS.values())), BINARY)
 
 
 def _require_successful(record: JobRecord) -> None:

@@ -49,7 +49,6 @@ _MULTIPART = {
         "type": "object",
         "required": ["file"],
         "additionalProperties": False,
-        "additionalProperties": False,
         "properties": {"file": FILE, "description": reference(UploadDescription)},
     }
 }

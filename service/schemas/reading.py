@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TypeVar
 
 from pydantic import TypeAdapter, ValidationError
@@ -32,9 +33,9 @@ def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUE
 
     Raises Problem: MALFORMED_JSON, the faulty member's reason, or ``otherwise``.
     """
-    parse_json(body)
+    text = json.dumps(parse_json(body))
     try:
-        return TypeAdapter(model).validate_json(body, strict=True)
+        return TypeAdapter(model).validate_json(text, strict=True)
     except ValidationError as error:
         raise refusal(error, otherwise) from error
 

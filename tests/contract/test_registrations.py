@@ -52,6 +52,7 @@ def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
         request | {"detection": {"min": [-0.5, -0.25, 0.0], "max": [0.5, 0.75, 1.0]}, "seed": 0},
         request | {"scene": {"field": request["scene"]}, "detection": turned},
         request | {"detection": box | {"label": None}, "options": {"optimisation": {"iterations": 200}}},
+        request | {"detection": box, "options": {"optimisation": {"iterations": 200.0}}, "seed": 0.0},
     ]
     assert len({world.client.post("/register", json=body).json()["id"] for body in spellings}) == 1
     assert len(world.queue.registrations) == 1

@@ -117,6 +117,9 @@ def test_strict_json_takes_what_rfc_8259_has() -> None:
         "a": [1, 2.5, "ä", None, True],
         "b": {"a": 1},
     }
+    whole = parse_json(b"[52.0, 1e2, -0.0, 2.5, 1e300]")
+    assert [type(value) for value in whole] == [int, int, int, float, float]
+    assert whole == [52, 100, 0, 2.5, 1e300]
     assert parse_json(b"[" * 32 + b"]" * 32)
     with pytest.raises(Problem):
         parse_json(b"[" * 33 + b"]" * 33)
