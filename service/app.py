@@ -157,4 +157,6 @@ async def _reap(services: Services, redis: Redis) -> None:
             await off_loop(reaper.run_once)
         except (RedisError, OSError) as error:
             logger.warning("the reaper found a store away: %s", type(error).__name__)
+        except Exception:
+            logger.exception("a fault of ours ended the reaper's round; the next one comes")
         await pause(_REAP_EVERY_S, services.stopping)

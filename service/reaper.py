@@ -7,6 +7,7 @@ that has made sure that it still leads.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -22,6 +23,7 @@ from service.rebuild import Rebuilder
 from service.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
 from service.redis_documents import PREFIX
 from service.settings import Settings
+from service.stillness import Stillness
 
 _LEADER_KEY = f"{PREFIX}reaper"
 _LEADS_FOR_S = 60
@@ -57,6 +59,7 @@ class Reaper:
         blobs: BlobStore | None = None,
         rebuilder: Rebuilder | None = None,
         housekeeper: Housekeeper | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._records = records
         self._queue = queue
@@ -64,6 +67,7 @@ class Reaper:
         self._blobs = blobs
         self._rebuilder = rebuilder
         self._housekeeper = housekeeper
+        self._stillness = Stillness(unbroken_s=settings.lost_after_s / 2, clock=clock)
         self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
     def run_once(self) -> Reaped:
@@ -92,6 +96,7 @@ class Reaper:
     def _lead(self, term: Term, deeds: dict[str, list[str]]) -> list[str]:
         """Look after everything; the ids of what has expired. Raises LeaseLostError."""
         now = self._records.now()
+        self._stillness.begin_round()
         for job in self._records.active_jobs():
             term.confirm()
             _note(deeds, job.id, self._look_after_job, job, now)
@@ -105,12 +110,14 @@ class Reaper:
 
     def _look_after_job(self, job: JobRecord, now: float) -> str | None:
         """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
+        beaten = job.heartbeat or job.updated
+        still = self._stillness.of(job.id, (job.attempt, job.status, beaten))
         if job.status == "accepted":
-            if now - job.updated < _UNHELD_FOR_S or self._queue.holds_registration(job.id, job.attempt):
+            if max(still, now - job.updated) < _UNHELD_FOR_S or self._queue.holds_registration(job.id, job.attempt):
                 return None
             self._queue.enqueue_registration(job.id, job.attempt)
             return "enqueued"
-        if now - (job.heartbeat or job.updated) < self._lost_after_s:
+        if not self._is_lost(still, now - beaten):
             return None
         if job.cancel_requested:
             self._records.update_job(job.id, job.attempt, status="dismissed")
@@ -122,8 +129,17 @@ class Reaper:
         self._records.update_job(job.id, job.attempt, status="failed", error=_worker_lost())
         return "failed"
 
+    def _is_lost(self, still: float, silent: float) -> bool:
+        """Whether a job whose heartbeat is so many seconds old, seen to stand still for so many, is without a worker.
+
+        The first are Redis' seconds: its clock may be stepped, and nobody could beat while it was away.
+        """
+        return still >= self._lost_after_s or (silent >= self._lost_after_s and still >= self._lost_after_s / 6)
+
     def _look_after_import(self, field: FieldRecord, now: float) -> str | None:
-        if now - field.updated < _UNHELD_FOR_S or self._queue.holds_import(field.sha256, field.attempt):
+        still = self._stillness.of(field.sha256, (field.attempt, field.updated))
+        recorded = max(still, now - field.updated)
+        if recorded < _UNHELD_FOR_S or self._queue.holds_import(field.sha256, field.attempt):
             return None
         if field.requeues < _IMPORT_RETRIES:
             again = self._records.retry_import(field.sha256, field.attempt)

@@ -24,16 +24,22 @@ def redis() -> Iterator[Redis]:
 
 @dataclass
 class World:
-    """Stores in memory with a clock that is moved by hand."""
+    """Stores in memory with a clock that is moved by hand, and the reaper's own."""
 
     redis: Redis
     time: float = 1000.0
+    own_time: float = 0.0
     queue: InMemoryJobQueue = field(default_factory=InMemoryJobQueue)
     blobs: InMemoryBlobStore = field(default_factory=InMemoryBlobStore)
 
     def __post_init__(self) -> None:
         self.records = InMemoryRecordStore(retention_s=3600, clock=lambda: self.time)
-        self.reaper = Reaper(self.records, self.queue, self.redis, Settings(lost_after_s=90), self.blobs)
+        self.reaper = self.new_reaper()
+
+    def new_reaper(self) -> Reaper:
+        return Reaper(
+            self.records, self.queue, self.redis, Settings(lost_after_s=90), self.blobs, clock=lambda: self.own_time
+        )
 
     def accept(self, job_id: str = "j1", queued: bool = True) -> None:
         self.records.create_job(JobRecord(job_id, "registration", "accepted", {}, {}, self.time, self.time), 100)
@@ -55,7 +61,15 @@ class World:
             self.queue.enqueue_import(SHA)
 
     def after(self, seconds: float) -> Reaped:
+        """What the last of the rounds does that are run every fifteen seconds or so; the others do nothing."""
+        while seconds > 15:
+            assert self.pass_by(15) == Reaped()
+            seconds -= 15
+        return self.pass_by(seconds)
+
+    def pass_by(self, seconds: float) -> Reaped:
         self.time += seconds
+        self.own_time += seconds
         return self.reaper.run_once()
 
 
@@ -80,18 +94,18 @@ def test_a_silent_job_is_requeued_once_and_then_lost(world: World) -> None:
     assert world.after(2) == Reaped(requeued=("j1",))
     assert world.queue.registrations == [("j1", 2)]
     world.take("j1", 2)
-    assert world.after(91) == Reaped(failed=("j1",))
+    assert world.after(90) == Reaped(failed=("j1",))
     record = world.records.get_job("j1")
     assert record is not None
     assert record.error is not None
     assert (record.status, record.attempt, record.error["reason"]) == ("failed", 2, "WORKER_LOST")
-    assert world.after(91) == Reaped()
+    assert world.after(90) == Reaped()
 
 
 def test_a_silent_job_that_was_to_stop_is_dismissed(world: World) -> None:
     world.run()
     world.records.request_cancel("j1")
-    assert world.after(91) == Reaped(dismissed=("j1",))
+    assert world.after(90) == Reaped(dismissed=("j1",))
 
 
 def test_a_job_that_never_reached_the_queue_is_queued(world: World) -> None:
@@ -106,10 +120,10 @@ def test_a_lost_import_is_tried_again_and_given_up_at_last(world: World) -> None
     world.upload(queued=False)
     assert world.after(14) == Reaped()
     for attempt in (2, 3):
-        assert world.after(20) == Reaped(requeued=(SHA,))
+        assert world.after(15) == Reaped(requeued=(SHA,))
         assert world.queue.imports == [(SHA, attempt)]
         world.queue.imports.clear()
-    assert world.after(20) == Reaped(failed=(SHA,))
+    assert world.after(15) == Reaped(failed=(SHA,))
     record = world.records.get_field(SHA)
     assert record is not None
     assert record.error is not None
@@ -128,10 +142,51 @@ def test_expired_results_go(world: World) -> None:
     assert world.records.job_expired("j1")
 
 
+def test_heartbeats_get_time_to_come_again_after_an_outage(world: World) -> None:
+    world.run()
+    world.after(15)
+    world.time += 120
+    world.own_time += 120
+    assert world.reaper.run_once() == Reaped(), "nobody could beat, and nobody could look"
+    assert world.after(14) == Reaped()
+    assert world.after(1) == Reaped(requeued=("j1",))
+
+
+def test_a_reaper_that_has_just_begun_does_not_know_who_was_silent(world: World) -> None:
+    world.run()
+    world.after(60)
+    world.time += 60
+    world.reaper = world.new_reaper()
+    assert world.after(0) == Reaped()
+    assert world.after(15) == Reaped(requeued=("j1",))
+
+
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_step_of_the_records_clock_loses_no_living_job(world: World, step: float) -> None:
+    world.run()
+    world.after(15)
+    world.time += step
+    assert world.pass_by(1) == Reaped()
+    world.records.heartbeat("j1", 1)
+    assert world.after(89) == Reaped()
+
+
+@pytest.mark.parametrize("step", [3600.0, -3600.0])
+def test_a_step_of_the_records_clock_hides_no_dead_job(world: World, step: float) -> None:
+    world.run("dead")
+    world.accept("lost", queued=False)
+    world.after(14)
+    world.time += step
+    rounds = [world.pass_by(15) for _ in range(8)]
+    assert [one.requeued for one in rounds if one.requeued] == [("dead",)]
+    assert [one.enqueued for one in rounds if one.enqueued] == [("lost",)]
+
+
 def test_one_process_at_a_time(world: World, redis: Redis) -> None:
     world.run()
+    world.after(75)
     redis.set("regnf:reaper", "another", ex=60)
-    assert world.after(91) == Reaped()
+    assert world.after(15) == Reaped()
     assert redis.get("regnf:reaper") == b"another", "its lock is not ours to release"
     redis.delete("regnf:reaper")
     assert world.after(0) == Reaped(requeued=("j1",))
