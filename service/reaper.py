@@ -28,7 +28,7 @@ from service.stillness import Stillness
 _LEADER_KEY = f"{PREFIX}reaper"
 _LEADS_FOR_S = 60
 _UNHELD_FOR_S = 15.0
-"""Work that was recorded this long ago and is in no queue was lost between the two."""
+"""Work that has been in no queue for so long was lost on its way, or with its worker."""
 _IMPORT_RETRIES = 2
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
@@ -110,14 +110,12 @@ class Reaper:
 
     def _look_after_job(self, job: JobRecord, now: float) -> str | None:
         """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
-        beaten = job.heartbeat or job.updated
-        still = self._stillness.of(job.id, (job.attempt, job.status, beaten))
         if job.status == "accepted":
-            if max(still, now - job.updated) < _UNHELD_FOR_S or self._queue.holds_registration(job.id, job.attempt):
+            if self._queue.holds_registration(job.id, job.attempt) or not self._is_unheld(job.id, job.attempt):
                 return None
             self._queue.enqueue_registration(job.id, job.attempt)
             return "enqueued"
-        if not self._is_lost(still, now - beaten):
+        if not self._is_lost(job, now):
             return None
         if job.cancel_requested:
             self._records.update_job(job.id, job.attempt, status="dismissed")
@@ -129,17 +127,23 @@ class Reaper:
         self._records.update_job(job.id, job.attempt, status="failed", error=_worker_lost())
         return "failed"
 
-    def _is_lost(self, still: float, silent: float) -> bool:
-        """Whether a job whose heartbeat is so many seconds old, seen to stand still for so many, is without a worker.
+    def _is_unheld(self, name: str, attempt: int) -> bool:
+        """Whether work that no queue holds now has been seen in none for a while: somebody may be about to queue it."""
+        return self._stillness.of(f"{name}:unheld", attempt) >= _UNHELD_FOR_S
 
-        The first are Redis' seconds: its clock may be stepped, and nobody could beat while it was away.
+    def _is_lost(self, job: JobRecord, now: float) -> bool:
+        """Whether the job's heartbeat is so old, and has been seen to stand still for so long, that its worker is gone.
+
+        How old it is Redis' clock tells, which may be stepped; and nobody could beat while Redis was away.
         """
-        return still >= self._lost_after_s or (silent >= self._lost_after_s and still >= self._lost_after_s / 6)
+        beaten = job.heartbeat or job.updated
+        still = self._stillness.of(job.id, (job.attempt, beaten))
+        silent = now - beaten >= self._lost_after_s
+        return still >= self._lost_after_s or (silent and still >= self._lost_after_s / 6)
 
-    def _look_after_import(self, field: FieldRecord, now: float) -> str | None:
-        still = self._stillness.of(field.sha256, (field.attempt, field.updated))
-        recorded = max(still, now - field.updated)
-        if recorded < _UNHELD_FOR_S or self._queue.holds_import(field.sha256, field.attempt):
+    def _look_after_import(self, field: FieldRecord, _now: float) -> str | None:
+        sha256, attempt = field.sha256, field.attempt
+        if self._queue.holds_import(sha256, attempt) or not self._is_unheld(sha256, attempt):
             return None
         if field.requeues < _IMPORT_RETRIES:
             again = self._records.retry_import(field.sha256, field.attempt)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import suppress
 from typing import Any
 
@@ -10,6 +9,7 @@ from redis import Redis
 from rq import Queue
 from rq.command import send_command
 from rq.exceptions import DuplicateJobError, NoSuchJobError
+from rq.executions import Execution, ExecutionRegistry
 from rq.job import Job
 from rq.serializers import JSONSerializer
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
@@ -76,11 +76,15 @@ class RqJobQueue:
                 return
 
     def _holds(self, queue: Any, rq_id: str) -> bool:
-        """Whether the id waits in the list, or is being worked on by a worker that still reports."""
+        """Whether the id waits in the list, or is being worked on by a worker that still reports.
+
+        That it reports is told by what Redis lets expire, not by RQ's list of what has begun: the times in there are
+        of the workers' clocks, and may be an hour off.
+        """
         if self._redis.lpos(queue.key, rq_id) is not None:
             return True
-        running: Any = self._redis.zrangebyscore(queue.started_job_registry.key, time.time(), "+inf")
-        return any(text(entry).startswith(f"{rq_id}:") for entry in running)
+        begun: Any = self._redis.zrange(ExecutionRegistry(rq_id, connection=self._redis).key, 0, -1)
+        return any(self._redis.exists(Execution(text(one), rq_id, connection=self._redis).key) for one in begun)
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
         return self._holds(self._registrations, registration_id(job_id, attempt))

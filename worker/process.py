@@ -57,6 +57,7 @@ class RegnfWorker(PatientWorker):
             QUEUE_NAME: context.settings.job_timeout_s,
         }
         self._started = 0.0
+        self._limit_s = 0.0
         self._begun = False
         self._exit_status: int | None = None
         self._late = False
@@ -75,7 +76,7 @@ class RegnfWorker(PatientWorker):
     # one job
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        job.timeout = self._limits[queue.name]
+        job.timeout = self._limit_s = self._limits[queue.name]
         self._started, self._exit_status = time.monotonic(), None
         self._begun = self._late = self._given_back = False
         oom_kills = kernel.oom_kills()
@@ -92,7 +93,7 @@ class RegnfWorker(PatientWorker):
         killed = status is not None and os.WIFSIGNALED(status)
         end = HorseEnd(
             signal=os.WTERMSIG(status) if killed and status is not None else None,
-            late=self._late or time.monotonic() - self._started >= job.timeout,
+            late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
             given_back=self._given_back,
         )
@@ -124,6 +125,11 @@ class RegnfWorker(PatientWorker):
             os._exit(0)
         self._horse_pid, self._begun = child, True
 
+    def monitor_work_horse(self, job: Any, queue: Any) -> None:
+        """The limit is kept here, by a clock that nobody steps: RQ would count by the wall clock, and kill by it."""
+        job.timeout = -1
+        super().monitor_work_horse(job, queue)
+
     def wait_for_horse(self) -> tuple[int | None, int | None, Any]:
         pid, status, usage = super().wait_for_horse()
         if pid:
@@ -133,7 +139,7 @@ class RegnfWorker(PatientWorker):
     def maintain_heartbeats(self, job: Any) -> None:
         """Called every ``monitor_s`` while the child runs."""
         now = time.monotonic()
-        if now - self._started > job.timeout + _LATE_GRACE_S:
+        if now - self._started > self._limit_s + _LATE_GRACE_S:
             self._late = True
             self.kill_horse()
         elif self._give_back_at is not None and now >= self._give_back_at:

@@ -13,6 +13,7 @@ import pytest
 from service.redis_client import connect
 from tests.faults.house import House, plain_environment
 from tests.faults.pace import pace
+from tests.faults.proxy import Proxy, to_unix
 from tests.faults.stores import Bucket, Folder, Store
 from tests.object_store import ObjectServer
 from tests.restartable_redis import RestartableRedis, restartable_redis
@@ -52,4 +53,18 @@ def house(tmp_path: Path, objects: ObjectServer, server: RestartableRedis) -> It
 def folder_house(tmp_path: Path, server: RestartableRedis) -> Iterator[House]:
     """API and workers on one machine, over a folder."""
     with house_over(tmp_path, server, Folder(tmp_path / "state")) as made:
+        yield made
+
+
+@pytest.fixture
+def network(server: RestartableRedis) -> Iterator[Proxy]:
+    with Proxy(to_unix(str(server.folder / "s"))) as made:
+        yield made
+
+
+@pytest.fixture
+def far_house(tmp_path: Path, objects: ObjectServer, server: RestartableRedis, network: Proxy) -> Iterator[House]:
+    """A house with a network between Redis and everybody else."""
+    store = Bucket(objects, objects.new_bucket(), objects.endpoint)
+    with house_over(tmp_path, server, store, f"redis://127.0.0.1:{network.port}/0") as made:
         yield made

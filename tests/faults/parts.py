@@ -101,7 +101,7 @@ def shorten_patience() -> None:
         return
     app._REAP_EVERY_S = 0.5
     app._STORAGE_PATIENCE_S = 2.0
-    reaper._UNHELD_FOR_S = 1.0
+    reaper._UNHELD_FOR_S = 2.0
     object_blobs._REQUEST_TIMEOUT_S = 1.0
 
 

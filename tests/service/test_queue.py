@@ -5,8 +5,12 @@ import zlib
 
 import pytest
 from redis import Redis
+from rq.executions import Execution
+from rq.job import Job
+from rq.serializers import JSONSerializer
 
 from service.redis_queue import RqJobQueue, attempt_of, import_id, registration_id
+from tests.worker.bench import eventually
 
 SHA = "a" * 64
 
@@ -56,9 +60,20 @@ def test_what_the_transport_holds(queue: RqJobQueue) -> None:
 
 
 def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: RqJobQueue) -> None:
-    redis.zadd("rq:wip:regnf", {"j1-1:execution": 4e9, "j2-1:execution": 1.0})
+    for job_id in ("j1-1", "j2-1"):
+        queue.enqueue_registration(job_id[:2], 1)
+        redis.delete("rq:queue:regnf")
+        with redis.pipeline() as pipeline:
+            job = Job.fetch(job_id, connection=redis, serializer=JSONSerializer)
+            Execution.create(job, 60, pipeline, worker_name="w")
+            pipeline.execute()
+    redis.zadd("rq:wip:regnf", dict.fromkeys(redis.zrange("rq:wip:regnf", 0, -1), 1.0))
+    assert queue.holds_registration("j1", 1), "whatever its worker's clock says"
+    (key,) = redis.keys("rq:execution:j2-1:*")
+    redis.pexpire(key, 1)
+    eventually(lambda: not redis.exists(key))
+    assert not queue.holds_registration("j2", 1), "its worker fell silent"
     assert queue.holds_registration("j1", 1)
-    assert not queue.holds_registration("j2", 1), "its worker fell silent long ago"
 
 
 def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: RqJobQueue) -> None:
