@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from regnf_core.cameras import axis_vector
 from regnf_core.nearest import gaps
-from regnf_core.pictures.splats import Floats, Surfels, View, render, view_from
+from regnf_core.pictures.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.sim3 import Sim3
 from regnf_core.verification import INLIER_DISTANCE
@@ -40,7 +41,13 @@ def preview(result: RegistrationResult) -> Image.Image:
     view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
     radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
     residual = _residual_surfels(result, scene, end)
-    panels = [_panel(cloud, view, radius) for cloud in (Surfels.join(scene, start), Surfels.join(scene, end), residual)]
+    before, after = Surfels.join(scene, start), Surfels.join(scene, end)
+    in_front = nearest_surfels(after, view, edge, radius)
+    panels = [
+        _panel(before, nearest_surfels(before, view, edge, radius), view),
+        _panel(after, in_front, view),
+        _panel(residual, in_front, view),  # the same discs in other colours
+    ]
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
     for number, panel in enumerate(panels):
         sheet.paste(panel, (number * _PANEL, _CAPTION))
@@ -96,8 +103,8 @@ def _best_direction(scene: Surfels, up: Floats) -> Floats:
     return best
 
 
-def _panel(cloud: Surfels, view: View, radius: float) -> Image.Image:
-    picture = render(cloud, view, _PANEL * _OVERSAMPLING, radius, _BACKGROUND)
+def _panel(cloud: Surfels, nearest: NDArray[np.int64], view: View) -> Image.Image:
+    picture = paint(cloud, nearest, view, _BACKGROUND)
     large = Image.fromarray((255 * np.clip(picture, 0.0, 1.0)).round().astype(np.uint8))
     return large.resize((_PANEL, _PANEL), Image.Resampling.LANCZOS)
 

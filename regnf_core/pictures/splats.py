@@ -60,40 +60,73 @@ def render(surfels: Surfels, view: View, size: int, radius: float, background: F
 
     Discs turned away from the viewer are lit from behind as well, so that hollow shapes stay readable.
     """
+    return paint(surfels, nearest_surfels(surfels, view, size, radius), view, background)
+
+
+def nearest_surfels(surfels: Surfels, view: View, size: int, radius: float) -> NDArray[np.int64]:
+    """(size, size) index of the disc nearest to the viewer in each pixel, -1 where there is none."""
     seen = ((surfels.points - view.centre) @ view.axes.T * view.pixels_per_unit).astype(np.float32)  # right, up, near
-    normals = surfels.normals @ view.axes.T
-    normals = np.where(normals[:, 2:] < 0, -normals, normals)
-    nearest = _nearest_surfels(seen, normals.astype(np.float32), size, radius * view.pixels_per_unit)
-    picture = np.broadcast_to(background, (size * size, 3)).copy()
+    towards = _towards_viewer(surfels, view).astype(np.float32)
+    return _nearest(seen, towards, size, radius * view.pixels_per_unit).reshape(size, size)
+
+
+def paint(surfels: Surfels, nearest: NDArray[np.int64], view: View, background: Floats) -> Floats:
+    """The picture (size, size, 3) of what ``nearest_surfels`` found, in the colours of ``surfels``."""
+    shaded = surfels.colours * _shade(_towards_viewer(surfels, view))[:, None]
+    picture = np.broadcast_to(background, (*nearest.shape, 3)).copy()
     hit = nearest >= 0
-    picture[hit] = (surfels.colours * _shade(normals)[:, None])[nearest[hit]]
-    return picture.reshape(size, size, 3)
+    picture[hit] = shaded[nearest[hit]]
+    return picture
 
 
-def _nearest_surfels(seen: Singles, normals: Singles, size: int, radius: float) -> NDArray[np.int64]:
+def _towards_viewer(surfels: Surfels, view: View) -> Floats:
+    """(N, 3) normals in the camera's axes, those that look away turned round."""
+    normals = surfels.normals @ view.axes.T
+    return np.where(normals[:, 2:] < 0, -normals, normals)
+
+
+def _nearest(seen: Singles, normals: Singles, size: int, radius: float) -> NDArray[np.int64]:
     """(size * size,) index of the disc nearest to the viewer in each pixel, -1 where there is none.
 
     seen: (N, 3) centres, pixels from the middle · normals: (N, 3) towards the viewer · radius: pixels.
-    Works through the discs' window row by row. A pixel keeps the largest of 64-bit keys with the depth in the upper and
-    the index in the lower half, so that one maximum decides and no sorting is needed.
+    Works through the discs row by row, each row of a disc being one span of pixels. A pixel keeps the largest of 64-bit
+    keys with the depth in the upper and the index in the lower half, so that one maximum decides and no sorting is
+    needed.
     """
     keys = np.full(size * size, -1, dtype=np.int64)
-    column, row = seen[:, :1] + size / 2, size / 2 - seen[:, 1:2]
-    slope = normals[:, :2] / np.maximum(normals[:, 2:], np.float32(_STEEPEST))
-    floor = float(seen[:, 2].min()) - radius / _STEEPEST - 1.0
+    column, row, near = seen[:, 0] + size / 2, size / 2 - seen[:, 1], seen[:, 2]
+    slope = (normals[:, :2] / np.maximum(normals[:, 2:], _STEEPEST)).astype(np.float32)
+    near = near - (near.min() - np.float32(radius / _STEEPEST + 1.0))
     reach = int(np.ceil(radius))
-    x = np.floor(column).astype(np.int32) + np.arange(-reach, reach + 1, dtype=np.int32)  # (N, W) pixels
-    dx = x + np.float32(0.5) - column
     for offset in range(-reach, reach + 1):
-        y = np.floor(row).astype(np.int32) + offset  # (N, 1)
-        dy = row - y - np.float32(0.5)
-        dz = -(slope[:, :1] * dx + slope[:, 1:] * dy)
-        inside = (dx * dx + dy * dy + dz * dz <= radius * radius) & (x >= 0) & (x < size) & (y >= 0) & (y < size)
-        source = np.nonzero(inside)[0]
-        depth = ((seen[:, 2:] + dz)[inside] - floor) * _DEPTH_STEPS
-        pixel = (y * size + x)[inside]
-        np.maximum.at(keys, pixel, (depth.astype(np.int64) << 32) | source)
+        y = np.floor(row).astype(np.int64) + offset
+        dy = (row - y - 0.5).astype(np.float32)
+        first, count = _spans(column, dy, slope, radius, size)
+        count[(y < 0) | (y >= size)] = 0
+        source = np.repeat(np.arange(len(seen)), count)
+        x = np.arange(len(source)) - np.repeat(np.cumsum(count) - count - first, count)
+        level = near - slope[:, 1] * dy + slope[:, 0] * (column - np.float32(0.5))  # the depth at x = 0
+        depth = ((level[source] - slope[source, 0] * x.astype(np.float32)) * _DEPTH_STEPS).astype(np.int64)
+        np.maximum.at(keys, y[source] * size + x, (depth << 32) | source)
     return np.where(keys >= 0, keys & 0xFFFFFFFF, -1)
+
+
+def _spans(
+    column: Singles, dy: Singles, slope: Singles, radius: float, size: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixel (N,) and number of pixels (N,) of the row at ``dy`` above each disc's centre that the disc covers.
+
+    A pixel dx, dy from the centre is covered where dx^2 + dy^2 + dz^2 <= radius^2, dz = -(slope . (dx, dy)): between
+    the roots of a quadratic in dx.
+    """
+    square = 1.0 + slope[:, 0] ** 2
+    middle = -slope[:, 0] * slope[:, 1] * dy / square
+    half = middle**2 - ((1.0 + slope[:, 1] ** 2) * dy**2 - radius**2) / square
+    covered = half >= 0
+    half = np.sqrt(np.where(covered, half, 0.0))
+    first = np.ceil(column + middle - half - 0.5).clip(0, size).astype(np.int64)
+    last = np.floor(column + middle + half - 0.5).clip(-1, size - 1).astype(np.int64)
+    return first, np.where(covered, np.maximum(last - first + 1, 0), 0)
 
 
 def _shade(normals: Floats) -> Floats:

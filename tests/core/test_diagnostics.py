@@ -17,7 +17,7 @@ from regnf_core.diagnostics import ranking_document, result_document, write_arti
 from regnf_core.diagnostics.preview import _up_axis, residual_colours
 from regnf_core.library import Candidate
 from regnf_core.options import RegistrationOptions
-from regnf_core.pictures.splats import Surfels, View, render
+from regnf_core.pictures.splats import Surfels, View, nearest_surfels, render
 from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.sim3 import Sim3
 from regnf_core.verdicts import VERDICT_REASONS
@@ -180,6 +180,27 @@ def test_the_nearer_disc_hides_the_farther_one() -> None:
     assert picture[10, 10, 0] > 0.5
     assert picture[10, 10, 1] == 0.0
     np.testing.assert_array_equal(picture[0, 0], np.ones(3))
+
+
+def test_every_pixel_shows_the_disc_nearest_to_the_viewer() -> None:
+    generator = np.random.default_rng(3)
+    points, normals = generator.uniform(-1.3, 1.3, (40, 3)), generator.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    size, pixels_per_unit, radius = 48, 20.0, 0.35
+    cloud = Surfels(points, normals, np.zeros((40, 3)))
+    nearest = nearest_surfels(cloud, View(np.eye(3), np.zeros(3), pixels_per_unit), size, radius)
+    middle = (np.arange(size) + 0.5 - size / 2) / pixels_per_unit
+    expected = np.full((size, size), -1)
+    for i, j in np.ndindex(size, size):
+        x, y = middle[j], -middle[i]
+        lean = normals[:, :2] * np.sign(normals[:, 2:]) / np.maximum(np.abs(normals[:, 2:]), 0.12)
+        away = np.stack([x - points[:, 0], y - points[:, 1]], axis=1)
+        height = -(lean * away).sum(1)
+        covered = (away**2).sum(1) + height**2 <= radius**2
+        if covered.any():
+            expected[i, j] = np.where(covered, points[:, 2] + height, -np.inf).argmax()
+    assert (nearest == expected).mean() > 0.998  # a disc's very edge falls to either side
+    assert (expected >= 0).mean() > 0.3
 
 
 def test_a_disc_seen_from_the_side_is_narrow() -> None:
