@@ -30,12 +30,13 @@ def worker(
     from regnf_cli.start_errors import StartError
     from worker.context import NoRedisError
     from worker.main import run_worker
+    from worker.preload import PreloadError
 
     if redis_url is not None:
         os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too
     try:
         run_worker(read_settings())
-    except NoRedisError as error:
+    except (NoRedisError, PreloadError) as error:
         raise StartError(str(error), reason=error.reason) from error
     except RedisConnectionError as error:
         raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE") from error

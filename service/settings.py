@@ -48,6 +48,8 @@ class Settings(BaseSettings):
     """Where registrations run; auto: on the GPU if torch can use one."""
     threads: int | None = Field(default=None, ge=1, le=256)
     """Threads of each job's process; unset: cores / workers."""
+    preload: bool = False
+    """Workers load the engine once and for all jobs: each begins sooner, and an idle worker holds more memory."""
     api_tokens: frozenset[str] = Field(default=frozenset(), repr=False)
     """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
     api_tokens_file: Path | None = None

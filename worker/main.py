@@ -10,6 +10,7 @@ from service.logs import configure_logging
 from service.settings import Settings
 from worker.context import Context, NoRedisError
 from worker.kernel import share_cores
+from worker.preload import PreloadError, preload
 from worker.process import RegnfWorker
 from worker.scratch import Scratch
 
@@ -17,10 +18,12 @@ logger = logging.getLogger(__name__)
 
 
 def run_worker(settings: Settings) -> None:
-    """Work until told to stop (SIGTERM, SIGINT). Raises NoRedisError when no Redis is configured."""
+    """Work until told to stop (SIGTERM, SIGINT). Raises NoRedisError when no Redis is configured, PreloadError."""
     configure_logging(settings.log_format)
     share_cores(os.environ, settings.threads, settings.workers)
     context = Context.from_settings(settings)
+    if settings.preload:
+        preload()
     scratch = Scratch(settings.scratch_dir)
     try:
         RegnfWorker(context, scratch).serve()
@@ -31,7 +34,7 @@ def run_worker(settings: Settings) -> None:
 def main() -> int:
     try:
         run_worker(Settings())
-    except NoRedisError as error:
+    except (NoRedisError, PreloadError) as error:
         logger.error("%s: %s", error.reason, error)
         return 2
     return 0
