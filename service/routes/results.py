@@ -15,7 +15,7 @@ from service.problems import Problem
 from service.ranges import ByteRange, parse_range
 from service.records import ACTIVE, JobRecord
 from service.results import ARTIFACTS, Manifest, read_manifest, read_result
-from service.routes.documentation import BINARY, header, links, refusals
+from service.routes.documentation import BINARY, JSON, header, links, refusals
 from service.schemas.common import whole_problem
 from service.schemas.results import ResultDocument
 
@@ -36,7 +36,7 @@ _OWN_PROBLEMS = (
     "INTERNAL",
 )
 """What a failed job can have ended with, as far as the table of reasons goes; the engine's own are 422."""
-_FILES = dict.fromkeys(sorted(set(ARTIFACTS.values())), BINARY)
+_FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(set(ARTIFACTS.values()))}
 
 
 def _require_successful(record: JobRecord) -> None:

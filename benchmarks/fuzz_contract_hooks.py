@@ -1,0 +1,135 @@
+"""What benchmarks.fuzz_contract adds to schemathesis, loaded by it: real files, real ids, and a sharper check.
+
+The service's own state comes from a JSON file that REGNF_FUZZ_WORLD names. Requests meant to break the contract are
+sent as they were made; of those that keep to it, most get the files and ids of that state, the others stay invented.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import schemathesis
+from hypothesis import strategies as st
+
+_WORLD: dict[str, Any] = json.loads(Path(os.environ["REGNF_FUZZ_WORLD"]).read_text(encoding="utf-8"))
+_FILES: list[bytes] = [Path(name).read_bytes() for name in _WORLD["files"]]
+_FIELD_FILES = st.one_of(st.sampled_from(_FILES), st.binary(min_size=1, max_size=400))
+_REAL_OF_FOUR = 3
+_LONGEST_WAIT_S = 1
+
+BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
+    "POST /register": frozenset(
+        {
+            "FIELD_NOT_FOUND",  # which fields there are
+            "FIELD_REJECTED",
+            "FIELD_NOT_RECOGNISED",  # what a file's bytes say
+            "FIELD_DESCRIPTION_DIFFERS",
+            "INVALID_DETECTION",  # min below max, a quaternion that is not zero
+            "DETECTION_OUTSIDE_SCENE",
+            "INVALID_TRANSFORM",  # a matrix with a rotation in it
+            "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
+            "LIBRARY_SEARCH_UNSUPPORTED",
+            "INVALID_REQUEST",
+            "WEBHOOK_NOT_ALLOWED",  # the operator's list
+            "IDEMPOTENCY_KEY_REUSED",  # what was asked before
+            "QUOTA_ACTIVE_JOBS",
+        }
+    ),
+    "POST /fields": frozenset(
+        {"FIELD_NOT_RECOGNISED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"}
+    ),
+    "PUT /fields/{sha256}": frozenset({"FIELD_NOT_RECOGNISED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS"}),
+    "GET /fields": frozenset({"INVALID_PAGE_TOKEN"}),
+    "GET /jobs": frozenset({"INVALID_PAGE_TOKEN"}),
+}
+"""Refusals of requests that fit every schema: they depend on what the service holds, or on sums over members."""
+
+schemathesis.openapi.media_type("application/octet-stream", _FIELD_FILES)
+schemathesis.openapi.format("binary", _FIELD_FILES)
+
+
+def _keeps_to_the_contract(case: Any) -> bool:
+    """Whether every part of the request was meant to: a case of which one part was not is called positive too."""
+    meta = case.meta
+    return meta is not None and all(part.mode.is_positive for part in (meta.generation, *meta.components.values()))
+
+
+@schemathesis.check
+def refusals_beyond_schemas(ctx: Any, response: Any, case: Any) -> None:  # noqa: ARG001 -- the library's signature
+    """A request that fits every schema is refused for a reason that no schema can hold, or not at all."""
+    if response.status_code not in (400, 415, 422) or not _keeps_to_the_contract(case):
+        return
+    if case.method == "HEAD" or case.operation.label.startswith("GET /jobs/{id}/"):
+        return  # no body, or the job's own problem
+    reason = response.json()["reason"]
+    allowed = BEYOND_SCHEMAS.get(case.operation.label, frozenset())
+    if reason not in allowed:
+        raise AssertionError(f"{case.operation.label} refused with {reason} what fits its schemas")
+
+
+@schemathesis.hook
+def before_call(ctx: Any, case: Any, kwargs: Any) -> None:  # noqa: ARG001
+    """Put real ids into requests that keep to the contract."""
+    if not _keeps_to_the_contract(case):
+        return
+    if case.query and "wait" in case.query:
+        case.query["wait"] = min(int(case.query["wait"]), _LONGEST_WAIT_S)
+    if case.meta.phase.name.value == "stateful":
+        return
+    draw = _Draw(case)
+    if case.path_parameters:
+        _place_ids(case, draw)
+    if case.query and "page_token" in case.query and draw.real():
+        case.query["page_token"] = draw.one(_WORLD["page_tokens"])
+    if case.operation.label == "POST /register" and isinstance(case.body, dict):
+        _place_fields(case.body, draw)
+
+
+class _Draw:
+    """Choices that follow from the request itself, so that a repeated one meets the same."""
+
+    def __init__(self, case: Any) -> None:
+        seen = repr((case.operation.label, case.path_parameters, case.query, case.headers, case.body))
+        self._state = zlib.crc32(seen.encode("utf-8", "surrogateescape"))
+
+    def below(self, count: int) -> int:
+        self._state = zlib.crc32(self._state.to_bytes(4, "big"))
+        return self._state % count
+
+    def real(self) -> bool:
+        return self.below(4) < _REAL_OF_FOUR
+
+    def one(self, choices: Sequence[Any]) -> Any:
+        return choices[self.below(len(choices))]
+
+
+def _place_ids(case: Any, draw: _Draw) -> None:
+    held = "spare" if case.method == "DELETE" else "kept"
+    if "sha256" in case.path_parameters and draw.real():
+        if case.method == "PUT":
+            body = case.body if isinstance(case.body, bytes) else b""
+            case.path_parameters["sha256"] = hashlib.sha256(body).hexdigest()
+        else:
+            case.path_parameters["sha256"] = draw.one(_WORLD["fields"][held])
+    if "id" in case.path_parameters and draw.real():
+        case.path_parameters["id"] = draw.one(_WORLD["jobs"]["spare" if case.method == "POST" else held])
+    if case.operation.label == "GET /jobs/{id}/events" and draw.real():
+        case.path_parameters["id"] = draw.one(_WORLD["jobs"]["ended"])  # the stream of an active one does not end
+    if "name" in case.path_parameters and draw.real():
+        case.path_parameters["name"] = draw.one(_WORLD["artifacts"])
+
+
+def _place_fields(body: dict[str, Any], draw: _Draw) -> None:
+    for member in ("scene", "object"):
+        if member in body and draw.real():
+            body[member] = draw.one(_WORLD["fields"]["ready"])
+    if isinstance(body.get("candidates"), list) and draw.real():
+        body["candidates"] = list(_WORLD["fields"]["ready"])
+    if "detection" in body and draw.real():
+        body["detection"] = _WORLD["detection"]

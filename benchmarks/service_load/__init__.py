@@ -1,0 +1,1 @@
+"""What the service shows under load: its overhead, several workers, many pollers, a soak."""
