@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
+import builtins
 import errno
 import fcntl
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import BinaryIO, TypeVar
 from uuid import uuid4
 
-from service.blobs import BlobEntry, StorageFullError, check_key
+from service.blobs import BlobEntry, StorageFullError, StorageUnavailableError, check_key
+from service.storage_patience import until_available
 
 _TEMPORARY = ".tmp"
 _FULL = {errno.ENOSPC, errno.EDQUOT}
-
-
-@contextmanager
-def _full_told_apart() -> Iterator[None]:
-    """Turns the system's "no space left" into StorageFullError."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in _FULL:
-            raise StorageFullError(error.errno, "no space is left in the blob store") from error
-        raise
+_Value = TypeVar("_Value")
 
 
 def _sync_folder(folder: Path) -> None:
@@ -43,70 +35,109 @@ class LocalBlobWriter(AbstractContextManager["LocalBlobWriter"]):
 
     def __init__(self, store: LocalBlobStore) -> None:
         self._store = store
-        self._path, self._file = self._create()
+        self._path, self._file = store.tried(self._create)
 
     def _create(self) -> tuple[Path, BinaryIO]:
         while True:
             path = self._store.temporary / uuid4().hex
-            with _full_told_apart():
-                file = path.open("xb")
+            file = path.open("xb")
             fcntl.flock(file, fcntl.LOCK_EX)
             if os.fstat(file.fileno()).st_nlink:
                 return path, file
             file.close()  # a sweep took it between its creation and its lock
 
     def write(self, data: bytes) -> int:
-        with _full_told_apart():
+        with self._store.told_apart():
             return self._file.write(data)
 
     def commit(self, key: str) -> None:
-        if not self._finish(key, replace=True):
+        if not self._store.tried(lambda: self._finish(key, replace=True)):
             raise AssertionError("a replacing commit always takes place")
 
     def commit_if_absent(self, key: str) -> bool:
         """Commit unless the key is taken."""
-        return self._finish(key, replace=False)
+        return self._store.tried(lambda: self._finish(key, replace=False))
 
     def _finish(self, key: str, replace: bool) -> bool:
         target = self._store.path_of(key)
-        with _full_told_apart():
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            while True:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    if replace:
-                        self._path.replace(target)
-                    else:
-                        os.link(self._path, target)
-                    _sync_folder(target.parent)
-                except FileExistsError:
-                    return False
-                except FileNotFoundError:
-                    if not self._path.exists():
-                        raise
-                    continue  # a deletion elsewhere removed the emptied folder: make it again
-                return True
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        while True:
+            self._store.require()  # before folders are made, which would be on another volume
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                if replace:
+                    self._path.replace(target)
+                else:
+                    os.link(self._path, target)
+                _sync_folder(target.parent)
+            except FileExistsError:
+                return False
+            except FileNotFoundError:
+                if not self._path.exists():
+                    raise
+                continue  # a deletion elsewhere removed the emptied folder: make it again
+            return True
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with suppress(OSError):  # closing flushes, which a full disk refuses; what was committed is flushed already
             self._file.close()
-        self._path.unlink(missing_ok=True)
+        with suppress(OSError):  # a volume that is away keeps it; a sweep takes it
+            self._path.unlink(missing_ok=True)
 
 
 class LocalBlobStore:
-    """A BlobStore in the folder ``root``, shared by any number of processes of one machine or one network volume."""
+    """A BlobStore in the folder ``root``, shared by any number of processes of one machine or one network volume.
 
-    def __init__(self, root: Path) -> None:
-        root.mkdir(mode=0o700, parents=True, exist_ok=True)
+    The folder for temporary files is made with the store: where it is missing, the volume is away, and that is waited
+    for, ``patience_s`` seconds at most; then StorageUnavailableError is raised. ``existing``: nothing is made.
+    """
+
+    def __init__(self, root: Path, patience_s: float = 0.0, existing: bool = False) -> None:
+        self._patience_s = patience_s
+        if not existing:
+            root.mkdir(mode=0o700, parents=True, exist_ok=True)
+            (root / _TEMPORARY).mkdir(exist_ok=True)
         self.root = root.resolve()
         self.temporary = self.root / _TEMPORARY
-        self.temporary.mkdir(exist_ok=True)
-        self.sweep()
+        if not existing:
+            self.sweep()
+
+    def require(self) -> None:
+        """Raises StorageUnavailableError while the store is away."""
+        if not self.temporary.is_dir():
+            raise StorageUnavailableError(errno.ENODEV, "the blob store is away")
+
+    @contextmanager
+    def told_apart(self) -> Iterator[None]:
+        """Tells a full volume, one that is away or fails, and a blob that is missing apart."""
+        try:
+            yield
+        except (StorageFullError, StorageUnavailableError):
+            raise
+        except FileNotFoundError:
+            self.require()
+            raise
+        except OSError as error:
+            if error.errno in _FULL:
+                raise StorageFullError(error.errno, "no space is left in the blob store") from error
+            raise StorageUnavailableError(error.errno, f"the blob store fails: {error.strerror}") from error
+
+    def tried(self, do: Callable[[], _Value]) -> _Value:
+        """What ``do`` returns once the store is there."""
+
+        def once() -> _Value:
+            with self.told_apart():
+                return do()
+
+        return until_available(once, self._patience_s)
 
     def sweep(self, older_than_s: float = 0.0) -> int:
+        return self.tried(lambda: self._sweep(older_than_s))
+
+    def _sweep(self, older_than_s: float) -> int:
         swept = 0
         oldest = time.time() - older_than_s
         for path in self.temporary.iterdir():
@@ -145,37 +176,48 @@ class LocalBlobStore:
             return writer.commit_if_absent(key)
 
     def open(self, key: str) -> BinaryIO:
-        return self.path_of(key).open("rb")
+        return self.tried(lambda: self.path_of(key).open("rb"))
 
     @contextmanager
     def local_copy(self, key: str) -> Iterator[Path]:
-        path = self.path_of(key)
-        if not path.is_file():
+        if not self.exists(key):
             raise FileNotFoundError(errno.ENOENT, "no such blob", key)
-        yield path
+        yield self.path_of(key)
 
     def exists(self, key: str) -> bool:
-        return self.path_of(key).is_file()
+        return self.tried(lambda: self._there(self.path_of(key).is_file()))
+
+    def _there(self, found: _Value) -> _Value:
+        """What was found; before nothing is said to be there, the store must be."""
+        if not found:
+            self.require()
+        return found
 
     def size(self, key: str) -> int:
-        return self.path_of(key).stat().st_size
+        return self.tried(lambda: self.path_of(key).stat().st_size)
 
     def list(self, prefix: str) -> Iterator[str]:
+        return iter(self.tried(lambda: self._there(self._keys(prefix))))
+
+    def _keys(self, prefix: str) -> builtins.list[str]:
         top = self.path_of(prefix) if prefix else self.root
         found = []
-        for folder, folders, files in os.walk(top):
+        for folder, folders, files in os.walk(top, onerror=_unless_missing):
             folders[:] = [name for name in folders if not name.startswith(".")]
             found += [(Path(folder) / name).relative_to(self.root).as_posix() for name in files]
-        return iter(sorted(found))
+        return sorted(found)
 
     def entries(self, prefix: str) -> Iterator[BlobEntry]:
         for key in self.list(prefix):
             with suppress(FileNotFoundError):
-                status = self.path_of(key).stat()
+                status = self.tried(lambda key=key: self.path_of(key).stat())  # type: ignore[misc]
                 yield BlobEntry(key, status.st_size, status.st_mtime)
 
     def delete(self, key: str) -> None:
-        path = self.path_of(key)
+        self.tried(lambda: self._delete(self.path_of(key)))
+
+    def _delete(self, path: Path) -> None:
+        self.require()
         path.unlink(missing_ok=True)
         for folder in path.parents:
             if folder == self.root:
@@ -188,3 +230,9 @@ class LocalBlobStore:
     def delete_prefix(self, prefix: str) -> None:
         for key in self.list(prefix):
             self.delete(key)
+
+
+def _unless_missing(error: OSError) -> None:
+    """What os.walk would pass over: a listing must not look complete when a folder could not be read."""
+    if not isinstance(error, FileNotFoundError):
+        raise error

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -21,9 +20,10 @@ from uuid import uuid4
 import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, PreconditionError
 
-from service.blobs import BlobEntry, StorageUnavailableError, check_key
+from service.blobs import BlobEntry, check_key
 from service.file_cache import FileCache
-from service.object_client import LONGEST_WAIT_S, object_client, told_apart
+from service.object_client import object_client, told_apart
+from service.storage_patience import until_available
 
 if TYPE_CHECKING:
     from obstore import GetOptions, ObjectMeta
@@ -149,17 +149,12 @@ class ObjectBlobStore:
 
         The client repeats by itself what certainly was not done; a write that was not answered is repeated here.
         """
-        end = time.monotonic() + self._patience_s
-        wait_s = 0.1
-        while True:
-            try:
-                with told_apart():
-                    return do()
-            except StorageUnavailableError:
-                if time.monotonic() + wait_s > end:
-                    raise
-            time.sleep(wait_s)
-            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+
+        def once() -> _Value:
+            with told_apart():
+                return do()
+
+        return until_available(once, self._patience_s)
 
     def writer(self) -> ObjectBlobWriter:
         return ObjectBlobWriter(self)

@@ -11,8 +11,8 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from service.blobs import StorageUnavailableError
+from service.storage_patience import LONGEST_WAIT_S
 
-LONGEST_WAIT_S = 2.0
 _CONNECT_TIMEOUT_S = 5.0
 _ENDPOINTS = ("AWS_ENDPOINT", "AWS_ENDPOINT_URL")
 

@@ -34,11 +34,14 @@ class Context:
     queue: JobQueue
 
     @classmethod
-    def from_settings(cls, settings: Settings) -> Context:
-        """Stores over Redis and the storage that the settings name. Raises NoRedisError."""
+    def from_settings(cls, settings: Settings, existing: bool = False) -> Context:
+        """Stores over Redis and the storage that the settings name. Raises NoRedisError.
+
+        ``existing``: for a job, which makes no storage of its own where that of its worker is away.
+        """
         if settings.redis_url is None:
             raise NoRedisError("set REGNF_REDIS_URL")
         redis = connect(settings.redis_url, retries=_RETRIES)
-        blobs = open_blobs(settings, _STORAGE_PATIENCE_S)
+        blobs = open_blobs(settings, _STORAGE_PATIENCE_S, existing)
         records = JournaledRecordStore(redis, settings.retention_s, blobs)
         return cls(settings, records, blobs, RqJobQueue(redis))

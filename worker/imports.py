@@ -18,7 +18,7 @@ from service.records import FieldRecord, StaleAttemptError
 from worker.context import Context
 from worker.engine import Importer
 from worker.patience import patiently
-from worker.problems import fault, new_incident, problem
+from worker.problems import are_files_away, fault, new_incident, problem
 
 _CLAIM_KEPT_S = 24 * 3600
 logger = logging.getLogger(__name__)
@@ -34,7 +34,8 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
 
     The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
     record, or one that has ended and an original of their own. Writes that Redis refuses for a while are waited for,
-    until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down.
+    until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down, and
+    OSError when a volume is away.
     """
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
@@ -54,6 +55,8 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except JobTimeoutException:
         _refuse(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
     except Exception as error:
+        if are_files_away(error):
+            raise
         incident = new_incident()
         logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
         _refuse(context, sha256, attempt, fault(error, incident))

@@ -15,7 +15,8 @@ def run_registration(job_id: str) -> None:
     from worker.registration import run_attempt
 
     settings = Settings()
-    run_attempt(Context.from_settings(settings), job_id, *delivery(), lambda: CoreEngine.on(settings.device))
+    context = Context.from_settings(settings, existing=True)
+    run_attempt(context, job_id, *delivery(), lambda: CoreEngine.on(settings.device))
 
 
 def run_import(sha256: str) -> None:
@@ -26,7 +27,8 @@ def run_import(sha256: str) -> None:
 
     settings = Settings()
     limits = ImportLimits(wall_s=settings.import_timeout_s, memory_bytes=settings.import_memory_bytes)
-    run_import_attempt(Context.from_settings(settings), sha256, *delivery(), core_importer(limits))
+    context = Context.from_settings(settings, existing=True)
+    run_import_attempt(context, sha256, *delivery(), core_importer(limits))
 
 
 def delivery() -> tuple[int, str]:

@@ -14,6 +14,7 @@ from service.reasons import REASONS
 _OUT_OF_MEMORY_PHRASES = ("can't allocate memory", "out of memory", "cannot allocate memory")
 _UNFORESEEN_STATUS = 422
 _FULL = {errno.ENOSPC, errno.EDQUOT}
+_AWAY = {errno.ENOENT, errno.EIO, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EROFS, errno.ESTALE}
 
 
 def problem(reason: str, detail: str | None = None, **extra: Any) -> dict[str, Any]:
@@ -38,6 +39,11 @@ def fault(error: Exception, incident: str) -> dict[str, Any]:
     if isinstance(error, StorageFullError) or (isinstance(error, OSError) and error.errno in _FULL):
         return problem("STORAGE_FULL")
     return problem("INTERNAL", f"A fault of ours. The log has it under incident {incident}.", incident=incident)
+
+
+def are_files_away(error: Exception) -> bool:
+    """Whether files of ours fail or are gone: the volume is away, as a rule, and it is worth another attempt."""
+    return isinstance(error, OSError) and error.errno in _AWAY
 
 
 def new_incident() -> str:

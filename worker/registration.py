@@ -22,7 +22,7 @@ from worker.engine import Candidate, RegistrationEngine
 from worker.fields import Fields, FieldsNotReadyError
 from worker.models import ObjectModels
 from worker.patience import patiently
-from worker.problems import fault, new_incident, problem
+from worker.problems import are_files_away, fault, new_incident, problem
 from worker.pulse import Pulse
 
 logger = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ def run_attempt(
 
     Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
     refuses for a while are waited for, until the job's time is over. Raises RedisError, StorageUnavailableError and
-    OSError of the network kind when the end cannot be written down; the worker's parent process then sees to it.
+    OSError when the end cannot be written down, or a volume is away; the worker's parent process then sees to it.
     """
     try:
         record = _update(context, job_id, attempt, status="running", phase="loading", worker=worker)
@@ -62,6 +62,8 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
         except RegnfError as error:
             _fail(context, job_id, attempt, problem(error.reason, str(error)))
         except Exception as error:
+            if are_files_away(error):
+                raise
             incident = new_incident()
             logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
             _fail(context, job_id, attempt, fault(error, incident))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import logging
 import os
 import shutil
 from contextlib import suppress
@@ -10,6 +11,7 @@ from pathlib import Path
 from uuid import uuid4
 
 _LOCK = ".lock"
+logger = logging.getLogger(__name__)
 
 
 class Scratch:
@@ -28,7 +30,13 @@ class Scratch:
             fcntl.flock(self._lock, fcntl.LOCK_EX)
 
     def empty(self) -> None:
-        """Delete whatever a job has left."""
+        """Delete whatever a job has left. What cannot be deleted now goes when the next worker starts."""
+        try:
+            self._empty()
+        except OSError as error:
+            logger.warning("temporary files stay for now: %s", error)
+
+    def _empty(self) -> None:
         for entry in self.folder.iterdir():
             if entry.name == _LOCK:
                 continue

@@ -27,9 +27,11 @@ def house_over(folder: Path, server: RestartableRedis, store: Store, redis_url: 
         listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
         address = f"http://127.0.0.1:{listener.getsockname()[1]}"
         client = stack.enter_context(httpx.Client(base_url=address, timeout=60))
-        (folder / "tmp").mkdir()
+        for name in ("tmp", "gates"):
+            (folder / name).mkdir()
         environment = plain_environment() | pace().settings | store.environment
         environment |= {"REGNF_REDIS_URL": redis_url or server.url, "TMPDIR": str(folder / "tmp")}
+        environment["REGNF_TEST_GATES"] = str(folder / "gates")
         made = House(folder, pace(), server, redis, store, environment, listener, client)
         stack.callback(made.stop)
         yield made

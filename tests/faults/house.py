@@ -44,6 +44,11 @@ class House:
         """The state folder of the API or of the workers."""
         return self.folder / (role if isinstance(self.store, Bucket) else "state")
 
+    @property
+    def gates(self) -> Path:
+        """Where jobs look whether they shall wait."""
+        return Path(self.environment["REGNF_TEST_GATES"])
+
     def start(self, *arguments: str, **variables: str) -> subprocess.Popen[bytes]:
         state = self.state(arguments[0])
         state.mkdir(exist_ok=True)
@@ -92,11 +97,10 @@ class House:
 
     def hold(self, gate: str = "hold") -> None:
         """Have jobs wait: in the engine (`hold`), or once their result stands (`hold-end`)."""
-        self.state("worker").mkdir(exist_ok=True)
-        (self.state("worker") / gate).write_bytes(b"")
+        (self.gates / gate).write_bytes(b"")
 
     def let_go(self, gate: str = "hold") -> None:
-        (self.state("worker") / gate).unlink()
+        (self.gates / gate).unlink()
 
     def request(self, seed: int = 0) -> dict[str, Any]:
         """A registration of two fields, which are uploaded if they are not there."""

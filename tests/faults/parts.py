@@ -1,8 +1,8 @@
 """The service's processes with an engine that does as it is told: `python -m tests.faults.parts`.
 
 api FD      the API on a socket it is handed. With REGNF_TEST_DIE it kills itself where a job would be queued.
-worker      a worker. Its jobs wait for as long as the file `hold` is in the state folder, and once more, when their
-            result stands, while `hold-end` is.
+worker      a worker. In the folder REGNF_TEST_GATES files make it wait: a registration in its engine (`hold`), once its
+            result stands (`hold-end`); an import (`hold-import`).
 """
 
 from __future__ import annotations
@@ -45,8 +45,12 @@ class DyingQueue(RqJobQueue):
 
 
 def wait_while(gate: str) -> None:
-    while (Settings().state_dir / gate).exists():
+    while is_held(gate):
         time.sleep(0.01)
+
+
+def is_held(gate: str) -> bool:
+    return (Path(os.environ["REGNF_TEST_GATES"]) / gate).exists()
 
 
 class HeldEngine(TinyEngine):
@@ -61,7 +65,7 @@ class HeldEngine(TinyEngine):
     def while_held(self, report: Report) -> None:
         while True:
             report("optimising", 0.5)
-            if not (Settings().state_dir / "hold").exists():
+            if not is_held("hold"):
                 return
             time.sleep(0.01)
 
@@ -77,11 +81,11 @@ def held_importer(upload: Path, folder: Path, description: dict[str, Any]) -> di
     return tiny_importer(upload, folder, description)
 
 
-def context() -> Context:
+def context(existing: bool = True) -> Context:
     """Everything real but the functions that the queue names."""
     settings = Settings()
     assert settings.redis_url is not None
-    return replace(Context.from_settings(settings), queue=RqJobQueue(connect(settings.redis_url), *FUNCTIONS))
+    return replace(Context.from_settings(settings, existing), queue=RqJobQueue(connect(settings.redis_url), *FUNCTIONS))
 
 
 def run_registration(job_id: str) -> None:
@@ -118,7 +122,7 @@ def serve_api(descriptor: int) -> None:
 def work() -> None:
     scratch = Scratch(Settings().scratch_dir)
     try:
-        RegnfWorker(context(), scratch).serve()
+        RegnfWorker(context(existing=False), scratch).serve()
     finally:
         scratch.remove()
 

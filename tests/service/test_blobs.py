@@ -4,7 +4,7 @@ import errno
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -258,3 +258,76 @@ def test_a_full_disk_is_told_apart_and_leaves_nothing(tmp_path: Path, monkeypatc
         store.put("a", b".")
     assert list(store.temporary.iterdir()) == []
     assert not store.exists("a")
+
+
+@pytest.fixture
+def away(tmp_path: Path) -> LocalBlobStore:
+    """A store whose volume is gone: its mount point is left, empty."""
+    store = LocalBlobStore(tmp_path / "blobs")
+    store.put("jobs/a/manifest.json", b"kept")
+    store.root.rename(tmp_path / "elsewhere")
+    store.root.mkdir()
+    return store
+
+
+def test_a_folder_that_is_away_is_no_empty_folder(away: LocalBlobStore, tmp_path: Path) -> None:
+    """Nothing is missing, nothing is listed, nothing is deleted, and nothing is written in its place."""
+    key = "jobs/a/manifest.json"
+    uses: list[Callable[[], object]] = [
+        lambda: away.open(key),
+        lambda: away.exists(key),
+        lambda: away.size(key),
+        lambda: list(away.list("jobs")),
+        lambda: away.delete(key),
+        lambda: away.delete_prefix("jobs"),
+        lambda: away.put(key, b"."),
+        lambda: away.put_if_absent(key, b"."),
+        lambda: away.sweep(),
+        away.probe,
+    ]
+    for use in uses:
+        with pytest.raises(StorageUnavailableError):
+            use()
+    assert list(away.root.iterdir()) == []
+    with pytest.raises(StorageUnavailableError):
+        LocalBlobStore(away.root, existing=True).exists(key)
+    assert list(away.root.iterdir()) == [], "whoever takes the store for existing makes none"
+    away.root.rmdir()
+    (tmp_path / "elsewhere").rename(away.root)
+    assert list(away.list("")) == [key]
+
+
+def test_a_folder_that_comes_back_in_time_was_never_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = LocalBlobStore(tmp_path / "blobs", patience_s=60.0)
+    with store.writer() as writer:
+        writer.write(b"half")
+        store.root.rename(tmp_path / "elsewhere")
+        waits: list[float] = []
+
+        def come_back(seconds: float) -> None:
+            waits.append(seconds)
+            if len(waits) == 3:
+                (tmp_path / "elsewhere").rename(store.root)
+
+        monkeypatch.setattr("time.sleep", come_back)
+        writer.commit("jobs/a/1/x")
+    assert waits == [0.1, 0.2, 0.4]
+    assert list(store.list("")) == ["jobs/a/1/x"]
+    assert list(store.temporary.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_read_makes_no_list_look_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = LocalBlobStore(tmp_path / "blobs")
+    store.put("jobs/a/x", b".")
+    real = os.scandir
+
+    def fail(path: str) -> object:
+        if str(path).endswith("/a"):
+            raise OSError(errno.EIO, "Input/output error")
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", fail)
+    with pytest.raises(StorageUnavailableError):
+        list(store.list(""))

@@ -1,5 +1,6 @@
 """Storage that stays away longer than the worker's patience: the work is done once more, nobody is told a fault."""
 
+import errno
 import os
 from pathlib import Path
 
@@ -9,11 +10,12 @@ from service.blobs import StorageUnavailableError
 from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from service.records import FieldRecord, JobRecord
 from service.settings import Settings
-from tests.worker.tiny_engine import TinyEngine, tiny_importer
+from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
 from worker import kernel
 from worker.context import Context
 from worker.imports import run_import_attempt
 from worker.registration import run_attempt
+from worker.scratch import Scratch
 from worker.settle import HorseEnd, settle_import, settle_registration
 
 SHA = "a" * 64
@@ -87,3 +89,31 @@ def test_work_in_a_child_changes_nothing_here(tmp_path: Path) -> None:
     assert kernel.in_child(tell)
     assert int((tmp_path / "pid").read_text()) != parent
     assert not kernel.in_child(lambda: os.kill(os.getpid(), 9))
+
+
+class FileLosingEngine(TinyEngine):
+    """Finds a field's file gone, as on a volume that is no longer mounted."""
+
+    def succeed(self, report: Report) -> None:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+
+
+def test_a_job_whose_files_are_gone_is_run_again(context: Context, store: AwayStore) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
+    store.put(f"fields/{SHA}/field.safetensors", b"f")
+    request = {"scene": SHA, "object": SHA, "options": {"do": "succeed"}}
+    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+    with pytest.raises(FileNotFoundError):
+        run_attempt(context, "j1", 1, "w", FileLosingEngine)
+    settle_registration(context, "j1", 1, "w", HorseEnd())
+    again = context.records.get_job("j1")
+    assert again is not None
+    assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)
+
+
+def test_a_worker_whose_temporary_files_are_out_of_reach_goes_on(tmp_path: Path) -> None:
+    scratch = Scratch(tmp_path / "scratch")
+    (tmp_path / "scratch").rename(tmp_path / "elsewhere")
+    scratch.empty()
+    assert not (tmp_path / "scratch").exists()
