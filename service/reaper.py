@@ -29,6 +29,8 @@ _LEADER_KEY = f"{PREFIX}reaper"
 _LEADS_FOR_S = 60
 _UNHELD_FOR_S = 15.0
 """Work that has been in no queue for so long was lost on its way, or with its worker."""
+_LEAST_UNBROKEN_S = 30.0
+"""Rounds that are twice as far apart as usual still follow on one another, however early a job is taken for lost."""
 _IMPORT_RETRIES = 2
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
@@ -67,7 +69,8 @@ class Reaper:
         self._blobs = blobs
         self._rebuilder = rebuilder
         self._housekeeper = housekeeper
-        self._stillness = Stillness(unbroken_s=settings.lost_after_s / 2, clock=clock)
+        unbroken = max(settings.lost_after_s / 2, _LEAST_UNBROKEN_S)
+        self._stillness = Stillness(unbroken_s=unbroken, clock=clock)
         self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
     def run_once(self) -> Reaped:

@@ -36,10 +36,9 @@ class World:
         self.records = InMemoryRecordStore(retention_s=3600, clock=lambda: self.time)
         self.reaper = self.new_reaper()
 
-    def new_reaper(self) -> Reaper:
-        return Reaper(
-            self.records, self.queue, self.redis, Settings(lost_after_s=90), self.blobs, clock=lambda: self.own_time
-        )
+    def new_reaper(self, lost_after_s: float = 90) -> Reaper:
+        settings = Settings(lost_after_s=lost_after_s)
+        return Reaper(self.records, self.queue, self.redis, settings, self.blobs, clock=lambda: self.own_time)
 
     def accept(self, job_id: str = "j1", queued: bool = True) -> None:
         self.records.create_job(JobRecord(job_id, "registration", "accepted", {}, {}, self.time, self.time), 100)
@@ -100,6 +99,13 @@ def test_a_silent_job_is_requeued_once_and_then_lost(world: World) -> None:
     assert record.error is not None
     assert (record.status, record.attempt, record.error["reason"]) == ("failed", 2, "WORKER_LOST")
     assert world.after(90) == Reaped()
+
+
+def test_a_job_may_be_taken_for_lost_sooner_than_rounds_come(world: World) -> None:
+    world.reaper = world.new_reaper(lost_after_s=10)
+    world.run()
+    assert world.pass_by(15) == Reaped(), "seen for the first time"
+    assert world.pass_by(15) == Reaped(requeued=("j1",))
 
 
 def test_a_silent_job_that_was_to_stop_is_dismissed(world: World) -> None:
