@@ -63,6 +63,14 @@ class House:
         self.processes.append(process)
         return process
 
+    def start_both(self) -> tuple[subprocess.Popen[bytes], subprocess.Popen[bytes]]:
+        """The API and a worker, at the same time."""
+        worker = self.start("worker")
+        api = self.start_api()
+        eventually(lambda: self.live_workers() or worker.poll() is not None, self.log)
+        assert worker.poll() is None, self.log()
+        return api, worker
+
     def start_api(self, **variables: str) -> subprocess.Popen[bytes]:
         process = self.start("api", str(self.listener.fileno()), **variables)
         eventually(lambda: self._answers() or process.poll() is not None, self.log)

@@ -22,7 +22,7 @@ class Pace:
 
 _WHOLE = Pace(whole=True, settings={VARIABLE: "whole"})
 _SHORT = Pace(
-    whole=False, settings={"REGNF_HEARTBEAT_S": "0.2", "REGNF_LOST_AFTER_S": "3", "REGNF_SHUTDOWN_GRACE_S": "0.5"}
+    whole=False, settings={"REGNF_HEARTBEAT_S": "0.2", "REGNF_LOST_AFTER_S": "2.4", "REGNF_SHUTDOWN_GRACE_S": "0.5"}
 )
 
 

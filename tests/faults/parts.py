@@ -104,9 +104,9 @@ def shorten_patience() -> None:
     if pace().whole:
         return
     app._REAP_EVERY_S = 0.5
-    app._STORAGE_PATIENCE_S = 2.0
+    app._STORAGE_PATIENCE_S = 0.7
     reaper._UNHELD_FOR_S = 2.0
-    object_blobs._REQUEST_TIMEOUT_S = 1.0
+    object_blobs._REQUEST_TIMEOUT_S = 0.7
 
 
 def serve_api(descriptor: int) -> None:

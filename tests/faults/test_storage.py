@@ -25,8 +25,7 @@ MIB = 1 << 20
 
 def outlive(house: House, go_away: Callable[[], None], come_back: Callable[[], None]) -> int:
     """The storage is away while a job ends and callers come. How many attempts the job took."""
-    house.start_api()
-    worker = house.start_worker()
+    _, worker = house.start_both()
     job_id, request, field = house.running(), house.request(seed=9), field_bytes("another")
     with fault() as one:
         begun = time.monotonic()
@@ -115,8 +114,7 @@ def fill(house: House, leave: int = 0) -> Path:
 def test_a_disk_that_fills_up_during_an_upload(small_house: House) -> None:
     """The upload is told 507 and leaves nothing; once there is room it is taken."""
     house = small_house
-    house.start_api()
-    house.start_worker()
+    house.start_both()
     before = house.submit()
     check_promise(house, [before])
     data = field_bytes("large", 12 * MIB)
@@ -136,8 +134,7 @@ def test_a_disk_that_fills_up_during_an_upload(small_house: House) -> None:
 def test_a_disk_that_fills_up_before_a_result(small_house: House) -> None:
     """The job has failed with STORAGE_FULL and leaves nothing; it is said once Redis, on the same disk, can write."""
     house = small_house
-    house.start_api()
-    worker = house.start_worker()
+    _, worker = house.start_both()
     job_id = house.running()
     with fault() as one:
         filler = fill(house)
