@@ -36,7 +36,8 @@ ROOMS = ("ac-room", "atbl-room", "mix-room")
 SINGLE_VIEW_ROOM = "ac-room"
 PERCENTS = (1, 3, 10)
 KINDS = ("objects", "rooms", "single")
-OBJECT_OPTIONS = ReconstructionOptions()
+OBJECT_OPTIONS = ReconstructionOptions(observation_voxels=0)
+"""What was seen of an object is not asked for."""
 ROOM_OPTIONS = replace(
     OBJECT_OPTIONS,
     grid=HashGridConfig.from_top_resolution(1024, levels=8, log2_table_size=17),
@@ -46,6 +47,8 @@ ROOM_OPTIONS = replace(
     colour_rays=32,
     band=0.006,
     band_behind=0.002,
+    level_interval=0.1,
+    observation_voxels=160,
 )
 SINGLE_OPTIONS = replace(ROOM_OPTIONS, iterations=2000)
 

@@ -8,6 +8,8 @@ VERDICT_REASONS: dict[str, str] = {
     "LOW_OVERLAP": "Too small a share of the two surfaces agrees.",
     "LARGE_RESIDUAL": "The surfaces stay too far apart where they should coincide.",
     "FREE_SPACE_VIOLATED": "Too much of the object would stand where the scene is free.",
+    "SURFACE_UNEXPLAINED": "Close to the object the scene has surface that is no part of it: a look-alike, or something"
+    " attached.",
     "SCENE_UNEXPLAINED": "The object explains too little of what stands in the box.",
     "TOO_LITTLE_SURFACE": "Too much of the object would lie within the scene's matter: too little is seen to judge by.",
 }

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation, observation_of
+from regnf_core.sim3 import Sim3
 
 
 class AdjustedField:
@@ -29,6 +31,12 @@ class AdjustedField:
         """That of the field."""
         return self.field.device
 
+    @property
+    def observation(self) -> Observation | None:
+        """What the field rests on, new unit; None where it is not known."""
+        seen = observation_of(self.field)
+        return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
+
     def to(self, device: torch.device | str) -> AdjustedField:
         """The same field with its parameters on another device."""
         return AdjustedField(self.field.to(device), self.scale, self.sign)
@@ -41,3 +49,9 @@ class AdjustedField:
         """Signed distance (N,) and its gradient (N, 3) at points (N, 3), new unit."""
         distance, gradient = self.field.signed_distance_and_gradient(points / self.scale)
         return distance * (self.sign * self.scale), gradient * self.sign
+
+
+def _scaling(scale: float) -> Sim3:
+    return Sim3(
+        torch.tensor(scale, dtype=torch.float64), torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    )

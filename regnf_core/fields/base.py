@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from regnf_core.fields.observation import Observation
 
 
 @runtime_checkable
@@ -73,6 +76,10 @@ class CountingField:
     @property
     def device(self) -> torch.device:
         return self.field.device
+
+    @property
+    def observation(self) -> Observation | None:
+        return getattr(self.field, "observation", None)
 
     def to(self, device: torch.device | str) -> CountingField:
         moved = CountingField(self.field.to(device))

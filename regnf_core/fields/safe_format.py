@@ -43,7 +43,7 @@ def write_safe_field(
     """
     parsed = parse_description(description)
     specs = {name: TensorSpec(array.shape, _type_name(name, array)) for name, array in tensors.items()}
-    parsed.check_tensors(specs)
+    parsed.check(specs)
     for name, array in tensors.items():
         if not np.isfinite(array).all():
             raise FieldFormatError(f"{name} holds a number that is not finite", reason="FIELD_NOT_FINITE")
@@ -97,7 +97,7 @@ def _read_header(path: str | os.PathLike[str]) -> tuple[FieldDescription, list[s
     except SafetensorError as error:
         raise FieldFormatError(f"not a safetensors file: {error}", reason="SAFE_FORMAT_INVALID") from error
     description = _parse_metadata(metadata)
-    description.check_tensors(specs)
+    description.check(specs)
     return description, sorted(specs)
 
 

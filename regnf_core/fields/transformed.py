@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.sim3 import Sim3
 
 
@@ -31,6 +32,12 @@ class TransformedField:
     def device(self) -> torch.device:
         """That of the field."""
         return self.field.device
+
+    @property
+    def observation(self) -> Observation | None:
+        """What the field rests on, new frame; None where it is not known."""
+        seen = observation_of(self.field)
+        return None if seen is None else seen.seen_in(self.T_field_frame)
 
     def to(self, device: torch.device | str) -> TransformedField:
         """The same field with its parameters on another device."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
+from regnf_core.fields.kinds.observation_grid import OBSERVATION
 from regnf_core.importing.picture import PICTURE_NAME
 from regnf_core.importing.report import ImportLimits
 from regnf_core.importing.sandbox import confine
@@ -52,7 +53,7 @@ def convert_file(
     _require_text(converted.description)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
-    parameters = sum(array.size for array in converted.tensors.values())
+    parameters = sum(array.size for name, array in converted.tensors.items() if name != OBSERVATION)
     family, why, warnings = converted.family, converted.why, converted.warnings
     bounds, label = converted.description["bounds"], converted.description["label"]
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]

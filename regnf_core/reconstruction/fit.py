@@ -15,12 +15,15 @@ import torch
 
 from regnf_core.datasets.posed_images import PosedImages
 from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
+from regnf_core.fields.kinds.observation_grid import OBSERVATION
 from regnf_core.fields.neus_facto import NeusFactoField
+from regnf_core.fields.observation import Observation
 from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.pictures.field_picture import field_picture
 from regnf_core.reconstruction.checkpoint import read_checkpoint, write_checkpoint
 from regnf_core.reconstruction.held_out import judge
 from regnf_core.reconstruction.network import DEGREE, RadianceField
+from regnf_core.reconstruction.observing import observe
 from regnf_core.reconstruction.options import ReconstructionOptions, ReconstructionProgress, ReconstructionReport
 from regnf_core.reconstruction.preparation import prepare
 from regnf_core.reconstruction.sdfstudio_export import write_sdfstudio
@@ -66,7 +69,7 @@ def reconstruct(
     rng = np.random.default_rng(seed)
     prepared = prepare(images, options.start, rng)
     trainer = Trainer(prepared, options, seed, torch_device, rng)
-    write = _Writer(options, prepared.bounds, label, source or {})
+    write = _Writer(options, prepared.bounds, label, source or {}, observe(images, options.observation_voxels))
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
@@ -149,9 +152,10 @@ class _Writer:
     bounds: torch.Tensor
     label: str | None
     source: dict[str, Any]
+    observation: Observation | None
 
     def __call__(self, field: RadianceField, path: Path) -> None:
-        description = {
+        description: dict[str, Any] = {
             "family": "neus_facto",
             "hash": asdict(self.options.grid),
             "positional_encoding": {"degree": DEGREE, "two_pi": False},
@@ -162,7 +166,11 @@ class _Writer:
             "label": self.label,
             "source": self.source,
         }
-        write_safe_field(path, description, field.tensors())
+        tensors = field.tensors()
+        if self.observation is not None:
+            grid, tensors[OBSERVATION] = self.observation.stored()
+            description[OBSERVATION] = asdict(grid)
+        write_safe_field(path, description, tensors)
 
 
 def _key(images: PosedImages, options: ReconstructionOptions, seed: int) -> str:

@@ -82,6 +82,8 @@ class ReconstructionOptions:
     final_rate: float = 0.01
     """The learning rates' share that is left at the end of their cosine decay."""
     start: Start = "auto"
+    observation_voxels: int = 160
+    """Voxels along the longest side of the grid that tells what was seen, where there are depths; 0: none is kept."""
     half_table: bool = True
     """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
 

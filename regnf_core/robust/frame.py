@@ -9,6 +9,8 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.kinds.observation_grid import SURFACE, UNSEEN
+from regnf_core.fields.observation import Observation
 from regnf_core.sim3 import Sim3
 
 
@@ -53,6 +55,21 @@ class WorkingField:
 
     def _own(self, points: Tensor) -> Tensor:
         return self.frame.out_of(points).float().to(self.field.device)
+
+
+class WorkingObservation:
+    """What was seen of a field, in its working frame: at (M, 3) float32 points on the CPU."""
+
+    def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
+        self._observation = observation.seen_in(frame.to_field())
+
+    def on_surface(self, points: Tensor) -> Tensor:
+        """(M,) bool: a surface was measured there."""
+        return self._observation.at(points) == SURFACE
+
+    def nobody_looked(self, points: Tensor, _values: Tensor) -> Tensor:
+        """(M,) bool: neither a surface was measured there, nor anything seen through it."""
+        return self._observation.at(points) == UNSEEN
 
 
 def _finite(values: Tensor) -> Tensor:

@@ -28,6 +28,8 @@ _CLEAN_VIOLATIONS, _VIOLATIONS_PER_NOISE = 0.05, 20.0
 _CLEAN_SHARE, _SHARE_PER_NOISE = 0.87, 45.0
 """Where the inliers agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing
 (a chair without its cushion); where they agree to a hundredth, it may be the fields' errors."""
+_EXTRA, _EXTRA_PER_NOISE, _EXTRA_PER_NOISE_SEEN = 0.03, 20.0, 4.0
+"""A fit to images invents surface where nobody looked, the more the noisier it is; what was measured is there."""
 _COARSE = 2.0  # inlier distances
 _LEAST_COARSE = 0.68
 _ROUGH, _ROUGH_SCORE, _SCORE_PER_INCOHERENCE = 0.022, 0.5, 12.0
@@ -61,8 +63,13 @@ class Evidence:
     """How long the residuals' tail is: 3 for normal errors that are alike everywhere."""
     explained_coarsely: Tensor
     """Scene samples, near or not, that the object explains at twice the distance."""
+    extra: Tensor
+    """Scene samples near the object that are no part of it, being farther from its surface than twice the inlier
+    distance, of all that are near."""
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
+    partial: bool = False
+    """Part of the scene is known not to have been seen; what was not is set aside, and the rest was measured."""
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
@@ -75,6 +82,7 @@ class Evidence:
             "free_space_violations": float(self.violations[index]),
             "residual_rms": float(self.residual_rms[index]),
             "coarse_agreement": float(self.coarse[index]),
+            "extra_share_scene": float(self.extra[index]),
             "surface_offset": float(self.offsets[index]),
         }
 
@@ -93,11 +101,13 @@ def gather_evidence(
     n = r.scene_count
     forth, back = r.values[:, :n], r.values[:, n:]
     inlier = (r.values.abs() <= options.inlier_distance) & (r.cosines >= _SAME_SIDE)
-    hidden = (back < -options.inlier_distance) & ~inlier[:, n:]
-    violating = back > options.inlier_distance
+    seen = torch.ones_like(back, dtype=torch.bool) if r.unseen is None else ~r.unseen[:, n:]
+    hidden = (~seen | (back < -options.inlier_distance)) & ~inlier[:, n:]
+    violating = (back > options.inlier_distance) & seen
     open_ = (~hidden).sum(1).clamp_min(1)
     near = forth.abs() <= _REACH
-    coarse, explained_coarsely = _coarse(forth, back, near, _COARSE * options.inlier_distance)
+    distance = _COARSE * options.inlier_distance
+    coarse, explained_coarsely = _coarse(forth, back, near, seen, distance)
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
     return Evidence(
         scores=disagreement(r, _SCORE_WIDTH),
@@ -108,18 +118,20 @@ def gather_evidence(
         violations=violating.sum(1) / open_,
         residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
         coarse=coarse,
-        tail=_tail(r.values),
+        tail=_tail(r.values if r.unseen is None else r.values.masked_fill(r.unseen, torch.nan)),
         explained_coarsely=explained_coarsely,
+        extra=(near & (forth.abs() > distance)).sum(1) / near.sum(1).clamp_min(1),
         offsets=offsets,
+        partial=r.unseen is not None,
     )
 
 
-def _coarse(forth: Tensor, back: Tensor, near: Tensor, distance: float) -> tuple[Tensor, Tensor]:
-    """``coarse`` and ``explained_coarsely`` of the evidence, (H,) each."""
+def _coarse(forth: Tensor, back: Tensor, near: Tensor, seen: Tensor, distance: float) -> tuple[Tensor, Tensor]:
+    """``coarse`` and ``explained_coarsely`` of the evidence, (H,) each. seen: (H, M), where the scene was looked at."""
     explained = forth.abs() <= distance
     of_near = explained.sum(1) / near.sum(1).clamp_min(1)
-    of_object = (back.abs() <= distance).float().mean(1)
-    free = (back > distance).sum(1) / (back >= -distance).sum(1).clamp_min(1)
+    of_object = (seen & (back.abs() <= distance)).sum(1) / seen.sum(1).clamp_min(1)
+    free = (seen & (back > distance)).sum(1) / (seen & (back >= -distance)).sum(1).clamp_min(1)
     return torch.minimum(of_near, of_object) - free, explained.float().mean(1)
 
 
@@ -132,6 +144,8 @@ def verdict(
     """
     if not float(evidence.hidden[index]) <= options.max_hidden_share:
         return "rejected", "TOO_LITTLE_SURFACE"
+    if evidence.partial and not float(evidence.extra[index]) <= _most_extra(evidence, index):
+        return "rejected", "SURFACE_UNEXPLAINED"
     reason = _disagreement(evidence, index, options)
     if reason and not _is_roughness(evidence, index, options, incoherence):
         return "rejected", reason
@@ -141,7 +155,7 @@ def verdict(
 
 
 def _tail(values: Tensor) -> Tensor:
-    core, tail = torch.quantile(values.abs(), torch.tensor([_CORE, _TAIL]), dim=1)
+    core, tail = torch.nanquantile(values.abs(), torch.tensor([_CORE, _TAIL]), dim=1)
     longer: Tensor = tail / core.clamp_min(1e-9)
     return longer
 
@@ -169,6 +183,14 @@ def _disagreement(evidence: Evidence, index: int, options: RobustOptions) -> str
         return "LOW_OVERLAP"
     if not float(evidence.share_scene[index]) >= max(options.min_inlier_share, _CLEAN_SHARE - _SHARE_PER_NOISE * noise):
         return "LOW_OVERLAP"
+    if not float(evidence.extra[index]) <= _most_extra(evidence, index):
+        return "SURFACE_UNEXPLAINED"
     if not float(evidence.share_explained[index]) >= options.min_explained_share:
         return "SCENE_UNEXPLAINED"
     return ""
+
+
+def _most_extra(evidence: Evidence, index: int) -> float:
+    """How much of the surface near the object may be no part of it: more where it may never have been seen."""
+    per_noise = _EXTRA_PER_NOISE_SEEN if evidence.partial else _EXTRA_PER_NOISE
+    return _EXTRA + per_noise * float(evidence.residual_rms[index])

@@ -53,8 +53,7 @@ def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
 
     The nearest surface to them is the border of the unseen, and would draw them there.
     """
-    unseen = r.unseen()
-    return width if unseen is None else torch.where(unseen, _UNSEEN_WIDTH * width, width)
+    return width if r.unseen is None else torch.where(r.unseen, _UNSEEN_WIDTH * width, width)
 
 
 def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
@@ -161,6 +160,10 @@ def _choose_residuals(better: Tensor, first: Residuals, second: Residuals) -> Re
         torch.where(better[:, None, None], first.jacobian, second.jacobian),
         torch.where(better[:, None], first.cosines, second.cosines),
         first.scene_count,
-        first.partial,
-        None if first.offset is None or second.offset is None else torch.where(better, first.offset, second.offset),
+        _choose_some(better[:, None], first.unseen, second.unseen),
+        _choose_some(better, first.offset, second.offset),
     )
+
+
+def _choose_some(better: Tensor, first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    return None if first is None or second is None else torch.where(better, first, second)

@@ -28,23 +28,29 @@ class DistanceModel(Protocol):
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
+class Unseen(Protocol):
+    """Tells where nobody looked: (M,) bool for points (M, 3) of the samples' frame, signed distances (M,) there."""
+
+    def __call__(self, points: Tensor, values: Tensor, /) -> Tensor: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Samples:
     """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
 
-    partial: the surface was seen from one side, and what lies behind it is not known.
+    unseen: where the field rests on nothing; None: all was seen.
     """
 
     points: Tensor
     values: Tensor
     normals: Tensor
-    partial: bool = False
+    unseen: Unseen | None = None
 
     def __len__(self) -> int:
         return int(self.points.shape[0])
 
     def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.points[index], self.values[index], self.normals[index], self.partial)
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unseen)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) carried onto the surface along their normals."""
@@ -56,30 +62,24 @@ class Residuals:
     """Residuals (H, N + M) of H poses, scene samples first; Jacobian (H, N + M, 7); agreement of the normals.
 
     ``cosines`` (H, N + M): cosine between a sample's normal and the other field's gradient where the pose carries it.
-    partial: the scene was seen from one side · offset: (H,) how much farther out the scene's surface lies than the
-    object's, object units; already taken out of the values.
+    unseen: (H, N + M) bool, object samples that come to lie where nobody looked into the scene; None: all was seen ·
+    offset: (H,) how much farther out the scene's surface lies than the object's, object units; already taken out of
+    the values.
     """
 
     values: Tensor
     jacobian: Tensor
     cosines: Tensor
     scene_count: int
-    partial: bool = False
+    unseen: Tensor | None = None
     offset: Tensor | None = None
-
-    def unseen(self) -> Tensor | None:
-        """(H, N + M) bool: object samples within a partial scene's matter, where nobody looked; None: all was seen."""
-        if not self.partial:
-            return None
-        inside = self.values < 0
-        inside[:, : self.scene_count] = False
-        return inside
 
     def of(self, poses: Tensor) -> Residuals:
         """Those of some poses."""
+        unseen = None if self.unseen is None else self.unseen[poses]
         offset = None if self.offset is None else self.offset[poses]
         return Residuals(
-            self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, self.partial, offset
+            self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, unseen, offset
         )
 
 
@@ -93,7 +93,7 @@ def residuals(
     T = T.to(A.points)
     s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
     forth, J_forth, cos_forth = _scene_to_object(obj, A, s, R, t)
-    back, J_back, cos_back = _object_to_scene(scene, B, s, R, t)
+    back, J_back, cos_back, unseen = _object_to_scene(scene, B, s, R, t, A.unseen)
     if offset is not None:
         forth, back = forth - offset[:, None].to(forth), back + offset[:, None].to(back)
     return Residuals(
@@ -101,7 +101,7 @@ def residuals(
         torch.cat([J_forth, J_back], 1),
         torch.cat([cos_forth, cos_back], 1),
         len(A),
-        A.partial,
+        None if unseen is None else torch.cat([torch.zeros_like(forth, dtype=torch.bool), unseen], 1),
         offset,
     )
 
@@ -116,15 +116,18 @@ def _scene_to_object(obj: DistanceModel, A: Samples, s: Tensor, R: Tensor, t: Te
 
 
 def _object_to_scene(
-    scene: DistanceModel, B: Samples, s: Tensor, R: Tensor, t: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+    scene: DistanceModel, B: Samples, s: Tensor, R: Tensor, t: Tensor, unseen: Unseen | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     arm = B.points - t  # z - t, (H, M, 3)
-    value, g = _ask(scene, (arm @ R) / s[..., None])
+    w = (arm @ R) / s[..., None]
+    value, g = _ask(scene, w)
     turned = g @ R.mT  # R g_a
     seen = s * value
     lever = seen - (turned * arm).sum(-1)
     J = torch.cat([-torch.linalg.cross(arm, turned), -turned, lever[..., None]], dim=-1)
-    return seen - B.values, J, _cosine(turned, B.normals.expand_as(turned))
+    residual = seen - B.values
+    hidden = None if unseen is None else unseen(w.reshape(-1, 3), residual.reshape(-1)).reshape(residual.shape)
+    return residual, J, _cosine(turned, B.normals.expand_as(turned)), hidden
 
 
 def _ask(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:

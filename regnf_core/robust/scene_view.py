@@ -6,16 +6,18 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
+from torch import Tensor
 
 from regnf_core.box import OrientedBox
 from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.observation import observation_of
 from regnf_core.options import RobustOptions
-from regnf_core.robust.frame import WorkingField, WorkingFrame
+from regnf_core.robust.frame import WorkingField, WorkingFrame, WorkingObservation
 from regnf_core.robust.levenberg import MOST_OFFSET
 from regnf_core.robust.proxy import ProxyField, proxy_of
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.samples import sample_scene_surface
-from regnf_core.robust.shadow import shadow_walls
+from regnf_core.robust.residuals import Samples, Unseen
+from regnf_core.robust.samples import SampledField, sample_scene_surface
+from regnf_core.robust.shadow import behind_surfaces, shadow_walls
 from regnf_core.robust.smoothing import smoothed
 from regnf_core.robust.support import support
 
@@ -69,11 +71,31 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions, 
     generator = torch.Generator().manual_seed(seed)
     counted = CountingField(scene)
     sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
-    walls = shadow_walls(sampled.samples, generator)
-    seen = replace(sampled.samples[~walls], partial=bool(walls.any()))
-    foreground = seen[~support(seen, generator)]
+    walls, unseen = _what_is_not_known(counted, sampled, generator)
+    seen = replace(sampled.samples[~walls], unseen=unseen)
+    outside = None if unseen is None else ~_within(seen, detection)
+    foreground = seen[~support(seen, generator, outside)]
     if len(foreground) < _FEWEST:
         foreground = seen if len(seen) >= _FEWEST else sampled.samples
     return SceneView(
         sampled.frame, detection, foreground, sampled.spacing, float(walls.float().mean()), counted.evaluations
     )
+
+
+def _what_is_not_known(
+    scene: SdfField, sampled: SampledField, generator: torch.Generator
+) -> tuple[Tensor, Unseen | None]:
+    """Which samples (N,) rest on nothing, and where else nobody looked: as the field says, or by its shadows."""
+    observation = observation_of(scene)
+    if observation is not None:
+        seen = WorkingObservation(observation, sampled.frame)
+        return ~seen.on_surface(sampled.samples.points), seen.nobody_looked
+    walls = shadow_walls(sampled.samples, generator)
+    return walls, behind_surfaces if bool(walls.any()) else None
+
+
+def _within(samples: Samples, detection: OrientedBox) -> Tensor:
+    """(N,) bool: which samples lie in the detection box itself."""
+    half = (detection.size / detection.diagonal / 2).to(samples.points)
+    within: Tensor = ((samples.points @ detection.rotation.to(samples.points)).abs() <= half).all(-1)
+    return within

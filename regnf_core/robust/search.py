@@ -45,9 +45,8 @@ def disagreement(r: Residuals, width: float) -> Tensor:
     """
     agreement = width**2 / (r.values.square() + width**2) * r.cosines.clamp(0.0, 1.0)
     loss = 1.0 - agreement
-    unseen = r.unseen()
-    if unseen is not None:
-        loss = torch.where(unseen, loss.clamp_max(_UNSEEN_LOSS), loss)
+    if r.unseen is not None:
+        loss = torch.where(r.unseen, loss.clamp_max(_UNSEEN_LOSS), loss)
     return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
 
 

@@ -37,6 +37,11 @@ def shadow_walls(samples: Samples, generator: torch.Generator) -> Tensor:
     return walls
 
 
+def behind_surfaces(_points: Tensor, values: Tensor) -> Tensor:
+    """(M,) bool: what was seen from one side alone is not known behind its surface. values: signed distances (M,)."""
+    return values < 0.0
+
+
 def _viewpoint(points: Tensor, normals: Tensor, generator: torch.Generator) -> Tensor | None:
     """(3,) from where everything is seen from its front; None where there is no such point."""
     guesses = _meeting_points(points, normals, generator)

@@ -29,11 +29,16 @@ _ROUGH = (0.02, 0.06)  # incoherence of accurate fits, and of those stopped afte
 _MOST_BEHIND_ROUGH = 0.7  # of the plane's own samples, where the surface is so rough
 _BROAD = 0.15  # of the samples: only planes with more are forgiven their crumbs
 _FAR_SIDE = (-0.9, -0.5)  # largest cosine of what is the far side of a floor, smooth and rough
+_LEAST_OUTSIDE = 0.15  # of a plane's samples: a floor goes on beyond the detection box
 _MOST_PLANES = 3
 
 
-def support(samples: Samples, generator: torch.Generator) -> Tensor:
-    """(N,) bool: which samples lie on a supporting plane, or behind it. Points in working units, box diagonal 1."""
+def support(samples: Samples, generator: torch.Generator, outside: Tensor | None = None) -> Tensor:
+    """(N,) bool: which samples lie on a supporting plane, or behind it. Points in working units, box diagonal 1.
+
+    outside: (N,) bool, samples beyond the detection box; where given, only planes that go on out there are supports.
+    That is for scenes seen in part: there is nothing behind an object's faces there either.
+    """
     on_support = torch.zeros(len(samples), dtype=torch.bool)
     if len(samples) == 0:
         return on_support
@@ -44,14 +49,14 @@ def support(samples: Samples, generator: torch.Generator) -> Tensor:
         rest = (~on_support).nonzero().squeeze(-1)
         if rest.numel() < 10:
             break
-        found = _best_plane(surface[rest], generator)
+        found = _best_plane(surface[rest], generator, None if outside is None else outside[rest])
         if found is None:
             break
         on_support[rest[found]] = True
     return on_support
 
 
-def _best_plane(surface: Smoothed, generator: torch.Generator) -> Tensor | None:
+def _best_plane(surface: Smoothed, generator: torch.Generator, outside: Tensor | None) -> Tensor | None:
     """(N,) bool: points on and behind the most populated supporting plane; None when there is none."""
     points, normals = surface.points, surface.normals
     total = points.shape[0]
@@ -72,6 +77,8 @@ def _best_plane(surface: Smoothed, generator: torch.Generator) -> Tensor | None:
     crumbs = torch.where(counts > _BROAD * total, _MOST_BEHIND_ROUGH * rough * counts, 0.0)
     allowed = crumbs.clamp_min(_MOST_BEHIND * total)
     counts[against > allowed] = 0
+    if outside is not None:
+        counts[(on_plane & outside[:, None]).sum(0) < _LEAST_OUTSIDE * counts] = 0
     best = int(counts.argmax())
     if counts[best] < _LEAST_SHARE * total:
         return None

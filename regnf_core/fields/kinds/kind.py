@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le, MaxLen
 
+from regnf_core.fields.kinds.observation_grid import OBSERVATION, ObservationGrid
 from regnf_core.fields.kinds.tensor_check import TensorSpec
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ class FieldDescription(ABC):
     label: Annotated[str, MaxLen(200)] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     """Free notes on the field's origin."""
+    observation: ObservationGrid | None = None
+    """What was seen of the volume, if it is known; its states are one more tensor."""
 
     @property
     def function_bounds(self) -> tuple[Corner, Corner]:
@@ -50,9 +53,16 @@ class FieldDescription(ABC):
         s = self.world_scale
         return (ax / s, ay / s, az / s), (bx / s, by / s, bz / s)
 
+    def check(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of all tensors that is not as described."""
+        if self.observation is not None:
+            self.observation.check_tensors(tensors)
+            tensors = {name: spec for name, spec in tensors.items() if name != OBSERVATION}
+        self.check_tensors(tensors)
+
     @abstractmethod
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
-        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of the function's tensors that is amiss."""
 
     @abstractmethod
     def build(self, tensors: Mapping[str, Tensor]) -> SdfField:

@@ -8,6 +8,7 @@ const HINTS = {
   LOW_OVERLAP: 'The surfaces touch only in part. A box that encloses the whole object, and nothing else, helps most.',
   SEVERAL_POSES_AGREE: 'Choose the pose you mean below. Where things stand upright, the option robust.up_axis leaves out those that do not.',
   SCENE_UNEXPLAINED: 'Something else, or more than the object, stands in the box. A tighter box or another library object may help.',
+  SURFACE_UNEXPLAINED: 'Most often it is a look-alike, like a chair without its cushion. If something lies on the object, a tighter box may help.',
   FREE_SPACE_VIOLATED: 'Most often it is another object, or the scene’s field lacks parts of this one.',
   TOO_LITTLE_SURFACE: 'Hardly anything of the object was seen. More views in the scene’s field help, or a box round more of the object.',
   LARGE_RESIDUAL: 'Most often it is another object. The preset robust, or more iterations, may find a better pose of the right one.',

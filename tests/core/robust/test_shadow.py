@@ -53,14 +53,15 @@ def test_the_cost_of_unseen_samples_and_its_slope() -> None:
     """The normal equations' right side is half the gradient of the cost, also where the kernel is narrower."""
     values = torch.tensor([[0.01, -0.02, -0.004, 0.03]], dtype=torch.float64)
     J = torch.randn(1, 4, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    unseen = torch.tensor([[False, False, True, False]])
     width = 0.02
 
     def cost(step: Tensor) -> Tensor:
-        return robust_cost(Residuals(values + (J @ step), J, torch.ones_like(values), 2, partial=True), width)[0]
+        return robust_cost(Residuals(values + (J @ step), J, torch.ones_like(values), 2, unseen), width)[0]
 
     step = torch.zeros(7, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(cost(step), step)
-    _, b = normal_equations(Residuals(values, J, torch.ones_like(values), 2, partial=True), width)
+    _, b = normal_equations(Residuals(values, J, torch.ones_like(values), 2, unseen), width)
     torch.testing.assert_close(b[0] / width**2, gradient)
     seen = robust_cost(Residuals(values, J, torch.ones_like(values), 2), width)
     assert float(cost(torch.zeros(7).double())) < float(seen)

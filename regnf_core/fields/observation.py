@@ -1,0 +1,106 @@
+"""What a field rests on: where a surface was measured, what was seen to be free, and where nobody looked.
+
+A field has a value everywhere, whether anything was measured there or not. Fields that were fitted to images or depths
+can say which is which; those that cannot have no observation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.kinds.observation_grid import UNSEEN, ObservationGrid
+from regnf_core.sim3 import Sim3
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A grid of cubic voxels, each UNSEEN, FREE or SURFACE (one was measured in it).
+
+    states: (X, Y, Z) uint8 · low: (3,) float64, the grid's lowest corner · voxel: edge · T_grid_frame: from the frame
+    that points are given in to the grid's; None: the same.
+    """
+
+    states: Tensor
+    low: Tensor
+    voxel: float
+    T_grid_frame: Sim3 | None = None
+
+    def at(self, points: Tensor) -> Tensor:
+        """The states (N,) at points (N, 3) on the CPU; UNSEEN beyond the grid."""
+        if self.T_grid_frame is not None:
+            points = self.T_grid_frame.apply(points.double())
+        cells = ((points - self.low.to(points)) / self.voxel).floor().long()
+        counts = torch.tensor(self.states.shape)
+        within = ((cells >= 0) & (cells < counts)).all(-1)
+        x, y, z = cells.clamp_min(0).minimum(counts - 1).unbind(-1)
+        return torch.where(within, self.states[x, y, z], UNSEEN)
+
+    def stored(self) -> tuple[ObservationGrid, NDArray[np.int32]]:
+        """The grid and the tensor that a file keeps, both of the grid's own frame."""
+        low, counts = self.low.tolist(), list(self.states.shape)
+        grid = ObservationGrid((low[0], low[1], low[2]), self.voxel, (counts[0], counts[1], counts[2]))
+        return grid, grid.pack(self.states.numpy())
+
+    def seen_in(self, T_frame_new: Sim3) -> Observation:
+        """The same for points of a new frame, which ``T_frame_new`` carries to the present one."""
+        T = T_frame_new if self.T_grid_frame is None else self.T_grid_frame @ T_frame_new
+        return replace(self, T_grid_frame=T)
+
+
+@runtime_checkable
+class Observed(Protocol):
+    """A field that may know what it rests on."""
+
+    @property
+    def observation(self) -> Observation | None:
+        """In the field's own frame; None where it is not known."""
+        ...
+
+
+class ObservedField:
+    """A field that knows what it rests on."""
+
+    def __init__(self, field: SdfField, observation: Observation) -> None:
+        self.field = field
+        self.observation: Observation | None = observation
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU, own frame."""
+        return self.field.bounds
+
+    @property
+    def device(self) -> torch.device:
+        """That of the field."""
+        return self.field.device
+
+    def to(self, device: torch.device | str) -> ObservedField:
+        """The same field with its parameters on another device; the observation stays on the CPU."""
+        assert self.observation is not None
+        return ObservedField(self.field.to(device), self.observation)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3)."""
+        return self.field.signed_distance(points)
+
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
+        return self.field.signed_distance_and_gradient(points)
+
+
+def stored_observation(grid: ObservationGrid, words: Tensor) -> Observation:
+    """The observation that ``grid`` describes; ``words``: its tensor as stored."""
+    states = torch.from_numpy(grid.unpack(words.cpu().numpy()))
+    return Observation(states, torch.tensor(grid.low, dtype=torch.float64), grid.voxel)
+
+
+def observation_of(field: SdfField) -> Observation | None:
+    """What ``field`` rests on, its own frame; None where it cannot say."""
+    return field.observation if isinstance(field, Observed) else None
