@@ -33,7 +33,7 @@ from tests.contract.live import Live, live_service
 _ROOT = Path(__file__).resolve().parents[1]
 _HERE = Path(__file__).resolve().parent
 _ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
-_SPARE_FIELDS = 8
+_SPARE_FIELDS = 4
 SETTINGS: dict[str, object] = {
     "threads": 1,
     "max_queued_jobs": 1_000_000,

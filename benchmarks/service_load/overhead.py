@@ -96,7 +96,7 @@ def table(services: Sequence[Service], jobs: int) -> list[str]:
     lines = [
         f"{jobs} jobs each, in turn. Seconds: median, tenth and ninetieth percentile.",
         "",
-        "| service | POST to result | p10 | p90 | by its own clock | p10 | p90 | until a child has it | the engine itself |",
+        "| service | POST to result | p10 | p90 | by its own clock | p10 | p90 | until a child has it | engine |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for service in services:

@@ -1,0 +1,144 @@
+"""A service of separate processes, each of which may be killed and started again: Redis, the API, workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+from redis import Redis
+
+from service.redis_client import connect
+from tests.restartable_redis import RestartableRedis, restartable_redis
+from tests.worker.bench import children_of, eventually
+
+
+@dataclass
+class House:
+    """The running processes. ``settings`` of the i-th worker are those of all with ``worker_settings[i]`` on top."""
+
+    folder: Path
+    redis: RestartableRedis
+    listener: socket.socket
+    settings: dict[str, object]
+    worker_settings: list[dict[str, object]]
+    api: subprocess.Popen[bytes] | None = None
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    restarts: int = 0
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.listener.getsockname()[1]}"
+
+    def start(self, workers: int) -> None:
+        """The API, and so many workers; returns once it is ready."""
+        self.api = self._launch("api", ["regnf_cli.api_process", str(self.listener.fileno())], {})
+        self.workers = [self._worker(index) for index in range(workers)]
+        eventually(self._ready, self.log)
+
+    def kill_worker(self, index: int) -> None:
+        """Kill a worker (its child dies with it), and start another."""
+        self.workers[index].kill()
+        self.workers[index].wait()
+        self.workers[index] = self._worker(index)
+
+    def kill_job(self, index: int) -> bool:
+        """Kill the process of the job that a worker runs; whether there was one."""
+        for child in children_of(self.workers[index].pid):
+            with suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+                return True
+        return False
+
+    def empty_redis(self) -> None:
+        """Everything that it holds is lost."""
+        with connect(self.redis.url) as client:
+            client.flushall()
+
+    def api_memory(self) -> int:
+        """What the API's process holds, bytes."""
+        assert self.api is not None
+        assert self.api.poll() is None, self.log()
+        return _status(self.api.pid, "VmRSS")
+
+    def redis_memory(self, client: Redis) -> int:
+        """What Redis says that it uses, bytes."""
+        return int(client.info("memory")["used_memory"])
+
+    def temporary_files(self) -> list[str]:
+        """What no process should have left behind."""
+        state = self.folder / "state"
+        roots = (state / "scratch", state / "blobs" / ".tmp")
+        return [
+            str(path.relative_to(state))
+            for root in roots
+            for path in root.rglob("*")
+            if path.is_file() and path.name != ".lock"
+        ]
+
+    def log(self) -> str:
+        return "\n".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("*.log")))
+
+    def end(self) -> None:
+        for process in (*self.workers, *([self.api] if self.api is not None else [])):
+            process.terminate()
+        for process in (*self.workers, *([self.api] if self.api is not None else [])):
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _worker(self, index: int) -> subprocess.Popen[bytes]:
+        self.restarts += 1
+        extra = self.worker_settings[index % len(self.worker_settings)] if self.worker_settings else {}
+        return self._launch(f"worker-{index}", ["worker.main"], extra)
+
+    def _launch(self, name: str, module: list[str], extra: dict[str, object]) -> subprocess.Popen[bytes]:
+        plain = {key: value for key, value in os.environ.items() if not key.startswith("REGNF_")}
+        usual = {"redis_url": self.redis.url, "state_dir": self.folder / "state", "device": "cpu"}
+        chosen = usual | self.settings | extra
+        environment = plain | {f"REGNF_{key.upper()}": str(value) for key, value in chosen.items()}
+        with (self.folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, "-m", *module],
+                env=environment,
+                stdout=log,
+                stderr=log,
+                pass_fds=[self.listener.fileno()],
+            )
+
+    def _ready(self) -> bool:
+        assert self.api is not None
+        assert self.api.poll() is None, self.log()
+        try:
+            return httpx.get(f"{self.address}/readyz", timeout=5).status_code == 200
+        except httpx.TransportError:
+            return False
+
+
+def _status(pid: int, entry: str) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(entry))
+
+
+@contextmanager
+def running_house(
+    folder: Path, workers: int, worker_settings: list[dict[str, object]] | None = None, **settings: object
+) -> Iterator[House]:
+    """Start everything below ``folder``; ready once this yields."""
+    (folder / "state").mkdir(parents=True, exist_ok=True)
+    with restartable_redis(folder / "redis") as redis, socket.create_server(("127.0.0.1", 0)) as listener:
+        house = House(folder, redis, listener, dict(settings), worker_settings or [])
+        try:
+            house.start(workers)
+            yield house
+        finally:
+            house.end()
