@@ -2,11 +2,15 @@
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.settings import Settings
 from tests.redis_server import private_redis
 from tests.worker.refusals import RefusingRedis
+from worker.context import Context
 
 
 @pytest.fixture
@@ -21,3 +25,10 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 def redis() -> Iterator[RefusingRedis]:
     with private_redis() as url, RefusingRedis.from_url(url) as client:
         yield client
+
+
+@pytest.fixture
+def context(tmp_path: Path) -> Context:
+    """Everything in memory, and heart beats that do not keep a test waiting."""
+    settings = Settings(state_dir=tmp_path, heartbeat_s=0.05)
+    return Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())

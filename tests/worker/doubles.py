@@ -1,0 +1,35 @@
+"""A job and an import over stores in memory, as a worker's process finds them."""
+
+from __future__ import annotations
+
+from service.records import FieldRecord, JobRecord
+from worker.context import Context
+
+SHA = "a" * 64
+
+
+def accept(context: Context, do: str = "succeed") -> None:
+    now = context.records.now()
+    if context.records.get_field(SHA) is None:
+        context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
+        context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
+    request = {"scene": SHA, "object": SHA, "options": {"do": do}}
+    context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
+
+
+def job(context: Context) -> JobRecord:
+    record = context.records.get_job("j1")
+    assert record is not None
+    return record
+
+
+def begin_import(context: Context, data: bytes = b"f") -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
+    context.blobs.put(f"fields/{SHA}/original", data)
+
+
+def field(context: Context) -> FieldRecord:
+    record = context.records.get_field(SHA)
+    assert record is not None
+    return record

@@ -1,0 +1,100 @@
+"""One attempt at a registration, against stores in memory."""
+
+from pathlib import Path
+
+import pytest
+
+from regnf_core.errors import CancelledError
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from service.records import FieldRecord
+from service.settings import Settings
+from tests.worker.doubles import SHA, accept, job
+from tests.worker.tiny_engine import TinyEngine
+from worker.artifacts import publish, read_manifest
+from worker.context import Context
+from worker.pulse import Pulse
+from worker.registration import run_attempt
+
+
+def test_an_attempt_that_is_not_to_be_had_does_nothing(context: Context) -> None:
+    accept(context)
+    run_attempt(context, "j1", 2, "w", TinyEngine)
+    run_attempt(context, "j9", 1, "w", TinyEngine)
+    assert job(context).status == "accepted"
+
+
+def test_a_rerun_returns_the_result_that_stands(context: Context) -> None:
+    accept(context, "crash")
+    standing = {"attempt": 7, "artifacts": []}
+    publish(context.blobs, "j1", standing)
+    run_attempt(context, "j1", 1, "w", TinyEngine)
+    assert job(context).status == "successful"
+    assert read_manifest(context.blobs, "j1") == standing
+
+
+def test_a_result_that_came_second_is_dropped(context: Context) -> None:
+    accept(context)
+    standing = {"attempt": 7, "artifacts": []}
+
+    class Slow(TinyEngine):
+        def succeed(self, report: object) -> None:
+            publish(context.blobs, "j1", standing)
+
+    run_attempt(context, "j1", 1, "w", Slow)
+    assert job(context).status == "successful"
+    assert list(context.blobs.list("jobs")) == ["jobs/j1/manifest.json"]
+
+
+def test_a_deleted_field_is_told(context: Context) -> None:
+    accept(context)
+    context.records.delete_field(SHA)
+    run_attempt(context, "j1", 1, "w", TinyEngine)
+    error = job(context).error
+    assert error is not None
+    assert error["reason"] == "FIELD_NOT_FOUND"
+
+
+def test_fields_that_are_still_imported_send_the_job_back(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
+    accept(context)
+    monkeypatch.setattr("worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
+    run_attempt(context, "j1", 1, "w", TinyEngine)
+    assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
+    assert isinstance(context.queue, InMemoryJobQueue)
+    assert context.queue.registrations == [("j1", 2)]
+
+
+def test_a_field_that_is_never_imported_fails_the_job_at_last(tmp_path: Path) -> None:
+    time = [1000.0]
+    records = InMemoryRecordStore(clock=lambda: time[0])
+    context = Context(Settings(state_dir=tmp_path), records, InMemoryBlobStore(), InMemoryJobQueue())
+    records.create_field(FieldRecord(SHA, "validating", 1, 1000.0, 1000.0))
+    accept(context)
+    time[0] += 2 * (120 + 90) + 1
+    run_attempt(context, "j1", 1, "w", TinyEngine)
+    error = job(context).error
+    assert error is not None
+    assert error["reason"] == "FIELD_IMPORT_TIMEOUT"
+
+
+def test_progress_is_written_a_few_times_a_second_but_every_phase(context: Context) -> None:
+    accept(context)
+    context.records.update_job("j1", 1, status="running")
+    with Pulse(context.records, "j1", 1, 60) as pulse:
+        for step in range(1000):
+            pulse.report("optimising", step / 1000)
+        for phase in ("verifying", "exporting"):
+            pulse.report(phase, 0.999)
+    events = context.records.events("j1", None, 0)
+    assert [event.data["phase"] for event in events][-2:] == ["verifying", "exporting"]
+    assert len(events) < 50
+
+
+def test_a_job_hears_that_another_attempt_has_taken_over(context: Context) -> None:
+    accept(context)
+    context.records.update_job("j1", 1, status="running")
+    context.records.requeue_job("j1", 1)
+    with Pulse(context.records, "j1", 1, 60) as pulse, pytest.raises(CancelledError):
+        pulse.report("optimising", 0.5)
+    assert pulse.superseded

@@ -1,0 +1,65 @@
+"""One attempt at an import, against stores in memory."""
+
+import json
+from pathlib import Path
+
+from tests.worker.doubles import SHA, begin_import, field
+from tests.worker.tiny_engine import tiny_importer
+from worker.context import Context
+from worker.imports import run_import_attempt
+from worker.settle import HorseEnd, settle_import
+
+
+def test_of_two_deliveries_of_an_import_one_does_the_work(context: Context) -> None:
+    begin_import(context)
+    context.records.remember(f"import:{SHA}:1", "other", 60)
+    run_import_attempt(context, SHA, 1, "w", tiny_importer)
+    settle_import(context, SHA, 1, "w", HorseEnd(signal=9))
+    assert field(context).state == "validating"
+    run_import_attempt(context, SHA, 1, "other", tiny_importer)
+    assert field(context).state == "ready"
+
+
+def test_an_import_that_died_after_its_work_is_not_done_again(context: Context) -> None:
+    begin_import(context)
+    context.blobs.put(
+        f"fields/{SHA}/report.json", json.dumps({"description": {}, "report": {"family": "found before"}}).encode()
+    )
+    context.blobs.delete(f"fields/{SHA}/original")
+    run_import_attempt(context, SHA, 1, "w", tiny_importer)
+    assert (field(context).state, field(context).report) == ("ready", {"family": "found before"})
+
+
+def test_a_field_deleted_while_it_is_imported_leaves_nothing(context: Context) -> None:
+    begin_import(context)
+
+    def importer(upload: Path, folder: Path, description: dict[str, object]) -> dict[str, object]:
+        context.records.delete_field(SHA)
+        return tiny_importer(upload, folder, description)
+
+    run_import_attempt(context, SHA, 1, "w", importer)
+    assert list(context.blobs.list("")) == []
+
+
+def test_an_upload_after_a_deletion_owes_nothing_to_the_import_before_it(context: Context) -> None:
+    begin_import(context)
+
+    def importer(upload: Path, folder: Path, description: dict[str, object]) -> dict[str, object]:
+        context.records.delete_field(SHA)
+        begin_import(context)
+        return tiny_importer(upload, folder, description)
+
+    run_import_attempt(context, SHA, 1, "w", importer)
+    settle_import(context, SHA, 1, "w", HorseEnd())
+    assert field(context).state == "validating"
+    assert list(context.blobs.list("")) == [f"fields/{SHA}/original"]
+    run_import_attempt(context, SHA, field(context).attempt, "other", tiny_importer)
+    assert field(context).state == "ready"
+
+
+def test_a_report_for_another_description_does_not_count(context: Context) -> None:
+    begin_import(context)
+    standing = {"description": {"contraction": "linf"}, "report": {"family": "found before"}}
+    context.blobs.put(f"fields/{SHA}/report.json", json.dumps(standing).encode())
+    run_import_attempt(context, SHA, 1, "w", tiny_importer)
+    assert (field(context).state, field(context).report) == ("ready", {"family": "tiny"})
