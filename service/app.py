@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
-import logging
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI
 from redis import Redis
-from redis.exceptions import RedisError
 from starlette.middleware import Middleware
 from starlette.staticfiles import StaticFiles
 
@@ -20,30 +15,23 @@ from regnf_core import __version__
 from service import problems
 from service.blobs import BlobStore
 from service.contract import build_contract
-from service.dependencies import Services, off_loop
-from service.housekeeping import Housekeeper
+from service.dependencies import Services
 from service.journaled_records import JournaledRecordStore
-from service.metrics import Measured, Metrics, served
+from service.lifespan import lifespan_of
+from service.metrics import Measured, Metrics
 from service.middleware import RequestContext, TokenGate
 from service.query import refuse_unknown_parameters
 from service.queue import JobQueue
 from service.rate_limits import RateGate, RateLimiter, RedisRateLimiter
-from service.reaper import Reaper
-from service.rebuild import Rebuilder
 from service.records import RecordStore
 from service.redis_client import connect
 from service.redis_queue import RqJobQueue
 from service.routes import fields, jobs, meta, pages, registrations, results, uploads
 from service.settings import Settings
-from service.shutdown import stopping_on_signals
 from service.storage import open_blobs
-from service.tokens import read_callers
-from service.waiting import pause
-from service.webhooks.service import deliver_until_stopped, webhooks_of
+from service.tokens import Callers, read_callers
+from service.webhooks.service import webhooks_of
 
-logger = logging.getLogger(__name__)
-_REAP_EVERY_S = 15.0
-_CLEARING_UP_S = 5.0
 _STORAGE_PATIENCE_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
 _ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
@@ -70,19 +58,7 @@ def create_app(
     """
     settings = settings or Settings()
     callers = read_callers(settings.api_tokens, settings.api_tokens_file)
-    redis: Redis | None = None
-    if records is None or queue is None:
-        if settings.redis_url is None:
-            raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
-        redis = connect(settings.redis_url)
-        blobs = blobs or open_blobs(settings, _STORAGE_PATIENCE_S)
-        records = records or JournaledRecordStore(redis, settings.retention_s, blobs)
-        queue = queue or RqJobQueue(redis)
-        if limiter is None and settings.calls_per_s:
-            limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
-    services = Services(
-        settings, records, blobs or open_blobs(settings, _STORAGE_PATIENCE_S), queue, webhooks_of(settings, redis)
-    )
+    services, redis, limiter = _open(settings, records, blobs, queue, limiter)
     metrics = Metrics(services, redis)
     app = FastAPI(
         title="regnf",
@@ -91,18 +67,8 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
-        lifespan=_lifespan_of(services, redis, metrics),
-        middleware=[
-            Middleware(RequestContext),
-            Middleware(Measured, metrics=metrics),
-            Middleware(
-                TokenGate,
-                callers=callers,
-                needs_token=settings.needs_token,
-                allow_unauthenticated=settings.allow_unauthenticated,
-            ),
-            *([Middleware(RateGate, limiter=limiter)] if limiter is not None else []),
-        ],
+        lifespan=lifespan_of(services, redis, metrics),
+        middleware=_middleware(settings, callers, metrics, limiter),
     )
     app.state.services = services
     app.state.metrics = metrics
@@ -114,49 +80,45 @@ def create_app(
     return app
 
 
+def _middleware(
+    settings: Settings, callers: Callers, metrics: Metrics, limiter: RateLimiter | None
+) -> list[Middleware]:
+    """What every request passes through, outermost first."""
+    gate = Middleware(
+        TokenGate,
+        callers=callers,
+        needs_token=settings.needs_token,
+        allow_unauthenticated=settings.allow_unauthenticated,
+    )
+    limits = [Middleware(RateGate, limiter=limiter)] if limiter is not None else []
+    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), gate, *limits]
+
+
+def _open(
+    settings: Settings,
+    records: RecordStore | None,
+    blobs: BlobStore | None,
+    queue: JobQueue | None,
+    limiter: RateLimiter | None,
+) -> tuple[Services, Redis | None, RateLimiter | None]:
+    """The stores that were not given, over Redis, which is None if none is needed, and the storage of the settings."""
+    needs_redis = records is None or queue is None
+    if needs_redis and settings.redis_url is None:
+        raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
+    redis = connect(settings.redis_url) if needs_redis and settings.redis_url is not None else None
+    blobs = blobs or open_blobs(settings, _STORAGE_PATIENCE_S)
+    if redis is not None:
+        records = records or JournaledRecordStore(redis, settings.retention_s, blobs)
+        queue = queue or RqJobQueue(redis)
+        if limiter is None and settings.calls_per_s:
+            limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
+    assert records is not None, "given, or made just now"
+    assert queue is not None, "given, or made just now"
+    return Services(settings, records, blobs, queue, webhooks_of(settings, redis)), redis, limiter
+
+
 def _include_routers(app: FastAPI, **how: Any) -> None:
     for router in _ROUTERS:
         app.include_router(router, dependencies=_STRICT, **how)
     for router in _LENIENT_ROUTERS:
         app.include_router(router, **how)
-
-
-def _lifespan_of(
-    services: Services, redis: Redis | None, metrics: Metrics
-) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
-    @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.openapi()  # takes a while, so not while somebody waits for an answer
-        reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
-        delivering = asyncio.create_task(deliver_until_stopped(services, redis)) if redis is not None else None
-        at = services.settings
-        with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
-            yield
-        services.stopping.set()
-        # the server has broken off what was still arriving, and does not wait for it to be cleared away
-        await services.uploads.emptied(_CLEARING_UP_S)
-        if delivering is not None:
-            await delivering
-        if reaping is not None:
-            await reaping
-        if redis is not None:
-            redis.close()
-
-    return lifespan
-
-
-async def _reap(services: Services, redis: Redis) -> None:
-    """Look after lost jobs every fifteen seconds until the service stops."""
-    records, rebuilder, housekeeper = services.records, None, None
-    if isinstance(records, JournaledRecordStore):
-        rebuilder = Rebuilder(records, services.queue, services.blobs)
-        housekeeper = Housekeeper(records, services.blobs, redis, services.settings)
-    reaper = Reaper(records, services.queue, redis, services.settings, services.blobs, rebuilder, housekeeper)
-    while not services.stopping.is_set():
-        try:
-            await off_loop(reaper.run_once)
-        except (RedisError, OSError) as error:
-            logger.warning("the reaper found a store away: %s", type(error).__name__)
-        except Exception:
-            logger.exception("a fault of ours ended the reaper's round; the next one comes")
-        await pause(_REAP_EVERY_S, services.stopping)

@@ -18,7 +18,7 @@ from typing import Any
 
 import uvicorn
 
-from service import app, object_blobs, reaper
+from service import app, lifespan, object_blobs, reaper
 from service.blobs import BlobStore
 from service.logs import configure_logging
 from service.redis_client import connect
@@ -103,7 +103,7 @@ def shorten_patience() -> None:
     """What no setting shortens; nothing in the whole version."""
     if pace().whole:
         return
-    app._REAP_EVERY_S = 0.5
+    lifespan._REAP_EVERY_S = 0.5
     app._STORAGE_PATIENCE_S = 0.7
     reaper._UNHELD_FOR_S = 2.0
     object_blobs._REQUEST_TIMEOUT_S = 0.7
