@@ -10,8 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from redis import Redis
+from redis.exceptions import RedisError
 
+from service import lifespan
 from service.app import ConfigurationError, create_app
+from service.dependencies import Services
+from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from service.settings import Settings
 from service.shutdown import stopping_on_signals
 from service.waiting import pause, wait_for
@@ -54,3 +59,32 @@ def test_waiting_ends_when_the_service_stops() -> None:
         return await wait_for(lambda: 1, lambda _: False, 60.0, stopping)
 
     assert asyncio.run(asyncio.wait_for(run(), 20)) == 1
+
+
+def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    faults: list[Exception] = [RedisError("away"), OSError("away"), KeyError("of ours")]
+
+    async def run() -> None:
+        stores = InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()
+        services = Services(Settings(state_dir=tmp_path), *stores)
+        loop = asyncio.get_running_loop()
+
+        class FaultyReaper:
+            def __init__(self, *_: object) -> None:
+                pass
+
+            def run_once(self) -> None:
+                if not faults:
+                    loop.call_soon_threadsafe(services.stopping.set)
+                    return
+                raise faults.pop()
+
+        monkeypatch.setattr(lifespan, "Reaper", FaultyReaper)
+        monkeypatch.setattr(lifespan, "_REAP_EVERY_S", 0.001)
+        await asyncio.wait_for(lifespan._reap(services, Redis()), 20)
+
+    asyncio.run(run())
+    assert not faults
+    assert [record.levelname for record in caplog.records] == ["ERROR", "WARNING", "WARNING"]
