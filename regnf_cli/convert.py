@@ -32,6 +32,14 @@ def convert(
     description: Annotated[
         Path | None, typer.Option(help="JSON: what the file does not carry.", exists=True, dir_okay=False)
     ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="The posed depth images that the field was fitted to: keep what they have seen with the safe field.",
+            exists=True,
+            file_okay=False,
+        ),
+    ] = None,
 ) -> None:
     """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
 
@@ -43,22 +51,34 @@ def convert(
     if not output.parent.is_dir():
         raise InvalidOptionsError(f"no such folder: {output.parent}")
     given = read_object(description, "description") if description else None
+    if images is not None and output.suffix.lower() != ".safetensors":
+        raise InvalidOptionsError("--images goes with a safe field (.safetensors)")
     if output.suffix.lower() == ".safetensors":
-        _to_safe_field(field, output, given)
+        _to_safe_field(field, output, given, images)
     else:
         _evaluated(field, output, resolution, given)
 
 
-def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None) -> None:
+def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None, images: Path | None) -> None:
     from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as folder:
         with err.status("importing"):
             report = import_field(field, Path(folder), given, ImportLimits())
+        if images is not None:
+            with err.status("looking at what was seen"):
+                _keep_what_was_seen(Path(folder) / FIELD_NAME, images)
         os.replace(Path(folder) / FIELD_NAME, output)
     _say(output, f"{report.family}, {report.parameters:,} parameters")
     for warning in report.warnings:
         err.print(f"warning: {warning}", markup=False, soft_wrap=True)
+
+
+def _keep_what_was_seen(field: Path, images: Path) -> None:
+    from regnf_core.datasets.sdfstudio import load_dataset
+    from regnf_core.reconstruction.observing import attach_observation
+
+    attach_observation(field, load_dataset(images))
 
 
 def _evaluated(field: Path, output: Path, resolution: int, given: dict[str, Any] | None) -> None:

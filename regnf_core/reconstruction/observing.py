@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
+from pathlib import Path
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.numpy import load_file
 from torch import Tensor
 
 from regnf_core.datasets.posed_images import PosedImages
-from regnf_core.fields.kinds.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.errors import DatasetError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.kinds.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
 from regnf_core.fields.observation import Observation
+from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
 
 _MARGIN = 1.0
 """Voxels before a measured surface that may be matter as well."""
+_CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
+"""So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
 
 
 def observe(images: PosedImages, voxels: int) -> Observation | None:
@@ -70,3 +79,34 @@ def _ends(images: PosedImages, image: int) -> Tensor:
     rays = np.stack([column + 0.5, row + 0.5, np.ones_like(z)], -1) @ np.linalg.inv(images.intrinsics[image]).T
     T = images.T_world_camera[image]
     return torch.from_numpy((rays * z[:, None]) @ T[:3, :3].T + T[:3, 3])
+
+
+def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Observation:
+    """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
+
+    Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
+    images saw one; FieldFormatError as :func:`regnf_core.fields.safe_format.open_field`.
+    """
+    seen = observe(images, voxels)
+    if seen is None:
+        raise DatasetError("what was seen is told from depths, and there are none", reason="DATASET_DEPTH_MISSING")
+    _check_frame(open_field(path), seen)
+    description = read_description(path)
+    scale = float(description["world_scale"])
+    grid, words = replace(seen, low=seen.low / scale, voxel=seen.voxel / scale).stored()
+    tensors = {**load_file(path), OBSERVATION: words}
+    write_safe_field(path, {**description, OBSERVATION: asdict(grid)}, tensors)
+    return seen
+
+
+def _check_frame(field: SdfField, seen: Observation) -> None:
+    """Raise DatasetError (DATASET_OF_ANOTHER_FRAME) unless the field's surface runs where one was measured."""
+    cells = (seen.states == SURFACE).nonzero()
+    cells = cells[:: max(1, len(cells) // _CHECKED)]
+    points = ((cells + 0.5) * seen.voxel + seen.low).float()
+    distance = field.signed_distance(points.to(field.device)).abs().cpu()
+    if len(cells) == 0 or not float((distance <= _NEAR * seen.voxel).float().mean()) >= _AGREEING:
+        raise DatasetError(
+            "the field has no surface where the images saw one: are they of the same scene, in the same frame?",
+            reason="DATASET_OF_ANOTHER_FRAME",
+        )

@@ -9,8 +9,12 @@ import pytest
 import torch
 import trimesh
 
+from regnf_core.datasets.sdfstudio import write_dataset
+from regnf_core.fields.observation import observation_of
 from regnf_core.fields.safe_format import open_field, read_description
+from regnf_core.reconstruction.observing import observe
 from tests.cli.conftest import DATA, Run
+from tests.core.reconstruction.scenes import BALL_CENTRE, BALL_RADIUS, BOX_CENTRE, BOX_HALF, images
 
 
 @pytest.fixture
@@ -56,3 +60,25 @@ def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
     assert outcome.code == 2
     assert outcome.stderr.startswith(f"{reason} ")
     assert {path.name for path in tmp_path.iterdir()} <= {"field.ckpt", "cache"}
+
+
+@pytest.mark.usefixtures("cache")
+def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTRE)
+    box = trimesh.creation.box(extents=2.0 * BOX_HALF).apply_translation(BOX_CENTRE)
+    trimesh.util.concatenate([ball, box]).export(tmp_path / "scene.glb")
+    box.export(tmp_path / "other.glb")
+    seen = images()
+    write_dataset(seen, tmp_path / "images")
+    safe = tmp_path / "scene.safetensors"
+    outcome = run("convert", tmp_path / "scene.glb", safe, "--images", tmp_path / "images")
+    assert outcome.code == 0, outcome.stderr
+    kept, made = observation_of(open_field(safe)), observe(seen, 160)
+    assert kept is not None
+    assert made is not None
+    assert (kept.states == made.states).float().mean() > 0.999  # depths are stored in steps
+    refused = run("convert", tmp_path / "other.glb", tmp_path / "other.safetensors", "--images", tmp_path / "images")
+    assert (refused.code, "DATASET_OF_ANOTHER_FRAME" in refused.stderr) == (2, True)
+    unsafe = run("convert", tmp_path / "scene.glb", tmp_path / "scene.ply", "--images", tmp_path / "images")
+    assert (unsafe.code, "INVALID_OPTIONS" in unsafe.stderr) == (2, True)
+    assert {path.name for path in tmp_path.iterdir()} <= {"scene.glb", "other.glb", "images", safe.name, "cache"}
