@@ -26,7 +26,8 @@ from service.settings import Settings
 from service.stillness import Stillness
 
 _LEADER_KEY = f"{PREFIX}reaper"
-_LEADS_FOR_S = 60
+_LEADS_FOR_S = 30
+"""A leader that is killed during a round keeps the others waiting for so long."""
 _UNHELD_FOR_S = 15.0
 """Work that has been in no queue for so long was lost on its way, or with its worker."""
 _LEAST_UNBROKEN_S = 30.0

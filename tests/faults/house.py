@@ -49,13 +49,13 @@ class House:
         """Where jobs look whether they shall wait."""
         return Path(self.environment["REGNF_TEST_GATES"])
 
-    def start(self, *arguments: str, **variables: str) -> subprocess.Popen[bytes]:
-        state = self.state(arguments[0])
+    def start(self, role: str, *arguments: str, **variables: str) -> subprocess.Popen[bytes]:
+        state = self.state(role)
         state.mkdir(exist_ok=True)
         environment = self.environment | {"REGNF_STATE_DIR": str(state)} | variables
-        with (self.folder / f"{arguments[0]}-{len(self.processes)}.log").open("wb") as log:
+        with (self.folder / f"{role}-{len(self.processes)}.log").open("wb") as log:
             process = subprocess.Popen(
-                [sys.executable, "-m", "tests.faults.parts", *arguments],
+                [sys.executable, "-m", f"tests.faults.{role}", *arguments],
                 env=environment,
                 stderr=log,
                 pass_fds=[self.listener.fileno()],

@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass, field
 
 VARIABLE = "REGNF_TEST_PACE"
+REQUEST_TIMEOUT_S = 0.7
+"""Of a request to the object store, in the short version."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,54 @@
+"""The API, with short patience unless in the whole version: `python -m tests.faults.api FD`, a socket it is handed.
+
+With REGNF_TEST_DIE it kills itself where a job would be queued.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+
+import uvicorn
+
+from service import app, lifespan, object_blobs, reaper
+from service.logs import configure_logging
+from service.redis_client import connect
+from service.redis_queue import RqJobQueue
+from service.settings import Settings
+from tests.faults.pace import REQUEST_TIMEOUT_S, pace
+
+FUNCTIONS = ("tests.faults.worker.run_registration", "tests.faults.worker.run_import")
+
+
+class DyingQueue(RqJobQueue):
+    """A queue that the process does not reach."""
+
+    def enqueue_registration(self, job_id: str, attempt: int) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def shorten_patience() -> None:
+    """What no setting shortens."""
+    lifespan._REAP_EVERY_S = 0.5
+    app._STORAGE_PATIENCE_S = 0.7
+    reaper._UNHELD_FOR_S = 2.0
+    reaper._LEADS_FOR_S = 3
+    object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
+
+
+def serve(descriptor: int) -> None:
+    settings = Settings()
+    assert settings.redis_url is not None
+    kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else RqJobQueue
+    application = app.create_app(settings, queue=kind(connect(settings.redis_url), *FUNCTIONS))
+    config = uvicorn.Config(application, log_config=None, access_log=False, lifespan="on", timeout_graceful_shutdown=2)
+    uvicorn.Server(config).run(sockets=[socket.socket(fileno=descriptor)])
+
+
+if __name__ == "__main__":
+    configure_logging("text")
+    if not pace().whole:
+        shorten_patience()
+    serve(int(sys.argv[1]))
