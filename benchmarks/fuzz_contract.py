@@ -129,8 +129,9 @@ def _outcome(live: Live, report: dict[str, Any], told: subprocess.CompletedProce
     failures = [told.stdout] if told.returncode else []
     ended = [name for name, process in (("API", live.api), ("worker", live.worker)) if process and process.poll()]
     failures += [f"the {name} ended" for name in ended]
-    if "Traceback" in live.log():
-        failures.append(f"a traceback in the log: {live.log()[-3000:]}")
+    before, traceback, after = live.log().partition("Traceback")
+    if traceback:
+        failures.append(f"a traceback in the log: {before[-500:]}{traceback}{after[:3000]}")
     statuses: dict[str, int] = {}
     covered = {}
     for operation, phases in report["valid_rates"].items():

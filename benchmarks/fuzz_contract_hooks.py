@@ -22,6 +22,7 @@ _FILES: list[bytes] = [Path(name).read_bytes() for name in _WORLD["files"]]
 _FIELD_FILES = st.one_of(st.sampled_from(_FILES), st.binary(min_size=1, max_size=400))
 _REAL_OF_FOUR = 3
 _LONGEST_WAIT_S = 1
+_NOT_THERE_YET = "EnsureResourceAvailability"
 
 BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
     "POST /register": frozenset(
@@ -52,6 +53,15 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
 
 schemathesis.openapi.media_type("application/octet-stream", _FIELD_FILES)
 schemathesis.openapi.format("binary", _FIELD_FILES)
+
+
+@schemathesis.hook
+def filter_failure(context: Any, failure: Any, case: Any, response: Any) -> bool:  # noqa: ARG001
+    """All failures but one: an upload's picture is made by its import, later or not at all.
+
+    ``links.preview`` is tried, not promised, so 404 right after the upload is what the contract says.
+    """
+    return not (type(failure).__name__ == _NOT_THERE_YET and case.path == "/fields/{sha256}/preview.png")
 
 
 def _keeps_to_the_contract(case: Any) -> bool:

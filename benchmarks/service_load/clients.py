@@ -15,7 +15,6 @@ from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair
 from regnf_cli.remote import RemoteService
 
 ENDS = ("successful", "failed", "dismissed")
-_SEEDS = 6
 _PATIENCE_S = 180.0
 _TIMES = 5
 """How often a job that was lost for good by two deaths is posted again."""
@@ -37,12 +36,12 @@ class Expected:
     results: list[dict[str, Any]]
 
     @classmethod
-    def of(cls, address: str, pair: SmallPair) -> Expected:
-        """Ask every question once. The first job makes the object's model for all others."""
+    def of(cls, address: str, pair: SmallPair, questions: int) -> Expected:
+        """Ask so many questions, which differ in their seeds. The first job makes the object's model for all others."""
         with RemoteService(address) as service:
             request = {**pair.upload(service), "options": _OPTIONS}
             results = []
-            for seed in range(_SEEDS):
+            for seed in range(questions):
                 job = service.submit({**request, "seed": seed})["id"]
                 service.follow(job)
                 results.append(comparable(service.result(job)))
@@ -50,19 +49,35 @@ class Expected:
 
     def question(self, number: int) -> tuple[str, dict[str, Any]]:
         """The kind of the n-th job and its request. Its label makes it a job of its own, and changes nothing else."""
-        kind = "cancelled" if number % 10 == 9 else "no surface" if number % 10 % 3 == 2 else "registration"
+        kind = "cancelled" if number % 10 == 8 else "no surface" if number % 2 else "registration"
         box = EMPTY_BOX if kind == "no surface" else self.request["detection"]
-        return kind, {**self.request, "detection": {**box, "label": f"job {number}"}, "seed": number % _SEEDS}
+        return kind, {**self.request, "detection": {**box, "label": f"job {number}"}, "seed": self._place(number)}
+
+    def result(self, number: int) -> dict[str, Any]:
+        """What the n-th job's result has to be, where it has one."""
+        return self.results[self._place(number)]
+
+    def _place(self, number: int) -> int:
+        return number // 2 % len(self.results)
 
 
 class Client:
-    """One client. What it had to come back for is counted in ``troubles``, how its jobs ended in ``outcomes``."""
+    """A client, for several threads at once.
+
+    What it had to come back for is counted in ``troubles``, how its jobs ended in ``outcomes``.
+    """
 
     def __init__(self, address: str, expected: Expected, outcomes: Counter[str], troubles: Counter[str]) -> None:
         self._http = httpx.Client(base_url=address, timeout=60)
         self._expected = expected
         self._outcomes = outcomes
         self._troubles = troubles
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._http.close()
 
     def run(self, number: int) -> str | None:
         """One job from its POST to its compared result; what is wrong with how it ended, if anything is."""
@@ -100,7 +115,7 @@ class Client:
         if job["status"] != "successful":
             return f"job {number} ({kind}): {job['status']} {reason}"
         result = comparable(self._ask("GET", f"/jobs/{job['id']}/result", (200,)))
-        expected = self._expected.results[number % _SEEDS]
+        expected = self._expected.result(number)
         differing = [name for name in expected if result.get(name) != expected[name]]
         return f"job {number} has another result: {differing}" if differing else None
 

@@ -16,22 +16,21 @@ import httpx
 from redis import Redis
 
 from service.redis_client import connect
+from service.redis_queue import RqJobQueue
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import children_of, eventually
 
 
 @dataclass
 class House:
-    """The running processes. ``settings`` of the i-th worker are those of all with ``worker_settings[i]`` on top."""
+    """The running processes."""
 
     folder: Path
     redis: RestartableRedis
     listener: socket.socket
     settings: dict[str, object]
-    worker_settings: list[dict[str, object]]
     api: subprocess.Popen[bytes] | None = None
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
-    restarts: int = 0
 
     @property
     def address(self) -> str:
@@ -39,9 +38,9 @@ class House:
 
     def start(self, workers: int) -> None:
         """The API, and so many workers; returns once it is ready."""
-        self.api = self._launch("api", ["regnf_cli.api_process", str(self.listener.fileno())], {})
+        self.api = self._launch("api", ["regnf_cli.api_process", str(self.listener.fileno())])
         self.workers = [self._worker(index) for index in range(workers)]
-        eventually(self._ready, self.log)
+        eventually(self._ready if workers else self._answers, self.log)
 
     def kill_worker(self, index: int) -> None:
         """Kill a worker (its child dies with it), and start another."""
@@ -57,6 +56,16 @@ class House:
                 return True
         return False
 
+    def have_workers(self, count: int) -> None:
+        """So many workers from now on, all of them live."""
+        while len(self.workers) > count:
+            worker = self.workers.pop()
+            worker.terminate()
+            worker.wait(30)
+        self.workers += [self._worker(index) for index in range(len(self.workers), count)]
+        with connect(self.redis.url) as client:
+            eventually(lambda: RqJobQueue(client).live_workers() == count, self.log)
+
     def empty_redis(self) -> None:
         """Everything that it holds is lost."""
         with connect(self.redis.url) as client:
@@ -66,7 +75,12 @@ class House:
         """What the API's process holds, bytes."""
         assert self.api is not None
         assert self.api.poll() is None, self.log()
-        return _status(self.api.pid, "VmRSS")
+        return _entry(self.api.pid, "VmRSS")
+
+    def api_peak(self) -> int:
+        """The most that the API's process has ever held, bytes."""
+        assert self.api is not None
+        return _entry(self.api.pid, "VmHWM")
 
     def redis_memory(self, client: Redis) -> int:
         """What Redis says that it uses, bytes."""
@@ -97,14 +111,12 @@ class House:
                 process.wait()
 
     def _worker(self, index: int) -> subprocess.Popen[bytes]:
-        self.restarts += 1
-        extra = self.worker_settings[index % len(self.worker_settings)] if self.worker_settings else {}
-        return self._launch(f"worker-{index}", ["worker.main"], extra)
+        return self._launch(f"worker-{index}", ["worker.main"])
 
-    def _launch(self, name: str, module: list[str], extra: dict[str, object]) -> subprocess.Popen[bytes]:
+    def _launch(self, name: str, module: list[str]) -> subprocess.Popen[bytes]:
         plain = {key: value for key, value in os.environ.items() if not key.startswith("REGNF_")}
         usual = {"redis_url": self.redis.url, "state_dir": self.folder / "state", "device": "cpu"}
-        chosen = usual | self.settings | extra
+        chosen = usual | self.settings
         environment = plain | {f"REGNF_{key.upper()}": str(value) for key, value in chosen.items()}
         with (self.folder / f"{name}.log").open("ab") as log:
             return subprocess.Popen(
@@ -116,27 +128,31 @@ class House:
             )
 
     def _ready(self) -> bool:
+        return self._status("/readyz") == 200
+
+    def _answers(self) -> bool:
+        return self._status("/healthz") == 200
+
+    def _status(self, path: str) -> int:
         assert self.api is not None
         assert self.api.poll() is None, self.log()
         try:
-            return httpx.get(f"{self.address}/readyz", timeout=5).status_code == 200
+            return httpx.get(self.address + path, timeout=5).status_code
         except httpx.TransportError:
-            return False
+            return 0
 
 
-def _status(pid: int, entry: str) -> int:
+def _entry(pid: int, entry: str) -> int:
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(entry))
 
 
 @contextmanager
-def running_house(
-    folder: Path, workers: int, worker_settings: list[dict[str, object]] | None = None, **settings: object
-) -> Iterator[House]:
+def running_house(folder: Path, workers: int, **settings: object) -> Iterator[House]:
     """Start everything below ``folder``; ready once this yields."""
     (folder / "state").mkdir(parents=True, exist_ok=True)
     with restartable_redis(folder / "redis") as redis, socket.create_server(("127.0.0.1", 0)) as listener:
-        house = House(folder, redis, listener, dict(settings), worker_settings or [])
+        house = House(folder, redis, listener, dict(settings))
         try:
             house.start(workers)
             yield house

@@ -2,9 +2,9 @@
 
     python -m benchmarks.service_load.soak [--jobs 1000] [--seed 1] [--output benchmarks/results/service_soak.md]
 
-Two workers, one of which loads the engine beforehand (REGNF_PRELOAD); eight clients, each of which posts a job, waits
-for its end, compares its result with that of the same question asked in peace, and goes on. Of ten jobs six are small
-registrations, three fail for want of a surface, one is cancelled. Meanwhile, every few seconds: a worker is killed, or
+Two workers that load the engine beforehand (REGNF_PRELOAD); eight clients, each of which posts a job, waits for its
+end, compares its result with that of the same question asked in peace, and goes on. Of ten jobs four are small
+registrations, five fail for want of a surface, one is cancelled. Meanwhile, every few seconds: a worker is killed, or
 the process of a job, or Redis is killed and started again, or emptied. Jobs are forgotten two minutes after their end,
 so that memory has to stay as it is. Ends with status 1 when a job ends otherwise, memory grows, or files are left.
 """
@@ -31,12 +31,29 @@ from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
 from service.redis_client import connect
 
-_CLIENTS = 8
-_PAUSES_S = (4.0, 16.0)
 _SAMPLE_S = 5.0
 _MOST_GROWTH = 0.05
-_SETTINGS: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 10.0, "retention_s": 120}
-_WORKERS: list[dict[str, object]] = [{"preload": True}, {}]
+_SETTINGS: dict[str, object] = {
+    "threads": 1,
+    "heartbeat_s": 1.0,
+    "lost_after_s": 10.0,
+    "retention_s": 120,
+    "preload": True,
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run. ``deeds`` weighs what is done to the service, ``pauses_s`` bounds the time between two of them."""
+
+    jobs: int
+    seed: int
+    clients: int = 8
+    workers: int = 2
+    questions: int = 6
+    deeds: tuple[tuple[str, int], ...] = (("worker", 4), ("job", 4), ("redis", 2), ("emptied", 1))
+    pauses_s: tuple[float, float] = (4.0, 16.0)
+    most_deeds: int = 1_000_000
 
 
 @dataclass
@@ -53,10 +70,11 @@ class Samples:
         return statistics.median(values[-fifth:]) / statistics.median(values[fifth : 2 * fifth]) - 1.0
 
 
-def disturb(house: House, random: Random, stop: threading.Event, done: Counter[str]) -> None:
+def disturb(house: House, plan: Plan, stop: threading.Event, done: Counter[str]) -> None:
     """Kill something every few seconds."""
-    while not stop.wait(random.uniform(*_PAUSES_S)):
-        what = random.choices(("worker", "job", "redis", "emptied"), (4, 4, 2, 1))[0]
+    random, (names, weights) = Random(plan.seed), zip(*plan.deeds, strict=True)
+    while done.total() < plan.most_deeds and not stop.wait(random.uniform(*plan.pauses_s)):
+        what = random.choices(names, weights)[0]
         worker = random.randrange(len(house.workers))
         if what == "worker":
             house.kill_worker(worker)
@@ -87,7 +105,7 @@ def watch(house: House, stop: threading.Event, samples: Samples) -> None:
 class Run:
     """How a soak went."""
 
-    jobs: int
+    plan: Plan
     seconds: float
     outcomes: Counter[str]
     troubles: Counter[str]
@@ -97,7 +115,7 @@ class Run:
     faults: list[str]
 
 
-def soak(folder: Path, jobs: int, seed: int) -> Run:
+def soak(folder: Path, plan: Plan) -> Run:
     """The whole run."""
     pair = write_small_pair(folder)
     outcomes, troubles, done, samples, stop = (
@@ -107,19 +125,21 @@ def soak(folder: Path, jobs: int, seed: int) -> Run:
         Samples(),
         threading.Event(),
     )
-    with running_house(folder, 2, _WORKERS, **_SETTINGS) as house:
-        expected = Expected.of(house.address, pair)
+    with running_house(folder, plan.workers, **_SETTINGS) as house:
+        expected = Expected.of(house.address, pair, plan.questions)
         threads = [
-            threading.Thread(target=disturb, args=(house, Random(seed), stop, done)),
+            threading.Thread(target=disturb, args=(house, plan, stop, done)),
             threading.Thread(target=watch, args=(house, stop, samples)),
         ]
         begun = time.monotonic()
         for thread in threads:
             thread.start()
         try:
-            with ThreadPoolExecutor(_CLIENTS) as pool:
-                clients = [Client(house.address, expected, outcomes, troubles) for _ in range(_CLIENTS)]
-                faults = list(filter(None, pool.map(lambda n: clients[n % _CLIENTS].run(n), range(jobs))))
+            with (
+                Client(house.address, expected, outcomes, troubles) as client,
+                ThreadPoolExecutor(plan.clients) as pool,
+            ):
+                faults = list(filter(None, pool.map(client.run, range(plan.jobs))))
         finally:
             stop.set()
             for thread in threads:
@@ -127,7 +147,7 @@ def soak(folder: Path, jobs: int, seed: int) -> Run:
         seconds = time.monotonic() - begun
         left = house.temporary_files()
     faults += [f"left behind: {name}" for name in left]
-    return Run(jobs, seconds, outcomes, troubles, done, samples, faults)
+    return Run(plan, seconds, outcomes, troubles, done, samples, faults)
 
 
 def judged(run: Run) -> list[str]:
@@ -143,7 +163,8 @@ def judged(run: Run) -> list[str]:
 def table(run: Run, faults: list[str]) -> list[str]:
     api, redis = run.samples.api, run.samples.redis
     return [
-        f"{run.jobs} jobs in {run.seconds / 60:.0f} minutes, two workers of one thread, eight clients. "
+        f"{run.plan.jobs} jobs in {run.seconds / 60:.0f} minutes, {run.plan.workers} workers of one thread, "
+        f"{run.plan.clients} clients. "
         + ("All ended as they should; nothing was left behind." if not faults else f"{len(faults)} faults:"),
         *[f"- {fault}" for fault in faults[:20]],
         "",
@@ -171,7 +192,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="regnf-soak-") as name:
-        run = soak(Path(name), arguments.jobs, arguments.seed)
+        run = soak(Path(name), Plan(arguments.jobs, arguments.seed))
     faults = judged(run)
     command = f"python -m benchmarks.service_load.soak --jobs {arguments.jobs} --seed {arguments.seed}"
     write("A soak", headed(command, run.samples.loads, table(run, faults)), arguments.output)
