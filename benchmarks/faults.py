@@ -51,15 +51,15 @@ def table(found: dict[str, list[tuple[float, float]]]) -> str:
     rows = [
         f"Measured {datetime.now(UTC):%Y-%m-%d}, {machine}, Python {platform.python_version()}.",
         "",
-        "| fault | what happens | lasted, s | over after, s |",
-        "|---|---|---|---|",
+        "| fault | what happens | lasted, s | over after, s | `-k` |",
+        "|---|---|---|---|---|",
     ]
     for name, what in faults():
         if name in found:
             lasted, took = (max(values) for values in zip(*found[name], strict=True))
             shown = f"{lasted:.0f}" if lasted >= 1 else "-"
             title = name.removeprefix("test_").replace("_s_", "'s ").replace("_", " ")
-            rows.append(f"| `{name}`: {title} | {what} | {shown} | {took:.1f} |")
+            rows.append(f"| {title} | {what} | {shown} | {took:.1f} | `{name}` |")
     return "\n".join(rows)
 
 

@@ -47,9 +47,9 @@ ROOM_OPTIONS = replace(
     colour_rays=32,
     band=0.006,
     band_behind=0.002,
-    level_interval=0.1,
-    observation_voxels=160,
 )
+LONG_OPTIONS = replace(ROOM_OPTIONS, level_interval=0.1)
+"""Fine levels of the grid so late that none is half learnt after a tenth of the training."""
 SINGLE_OPTIONS = replace(ROOM_OPTIONS, iterations=2000)
 
 
@@ -91,7 +91,7 @@ def fits(images: Path) -> Iterator[Fit]:
         elif "-single-" in name:
             yield Fit("single", name, name, SINGLE_OPTIONS)
         elif name.endswith("-long"):
-            yield Fit("rooms", name, name.removesuffix("-long"), ROOM_OPTIONS, PERCENTS)
+            yield Fit("rooms", name, name.removesuffix("-long"), LONG_OPTIONS, PERCENTS)
         elif name.endswith("-short"):
             yield Fit("rooms", name, name, ROOM_OPTIONS)
 

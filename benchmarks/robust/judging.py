@@ -29,6 +29,8 @@ _METRICS = (
     "free_space_violations",
     "residual_rms",
     "coarse_agreement",
+    "extra_share_scene",
+    "verdict_margin",
     "surface_offset",
     "field_evaluations",
 )

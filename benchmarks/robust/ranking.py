@@ -20,6 +20,6 @@ def area_under_roc(right: Sequence[float], wrong: Sequence[float]) -> float:
     return float(mannwhitneyu(right, wrong).statistic / (len(right) * len(wrong)))
 
 
-def score_of(run: Run) -> float:
-    """1 - score: the larger, the better the fields agree; no result counts as the least."""
-    return float("-inf") if run["category"] == FAILED else 1.0 - float(run["score"])
+def margin_of(run: Run) -> float:
+    """The verdict's margin: the larger, the surer the pose is right; no result counts as the least."""
+    return float("-inf") if run["category"] == FAILED else float(run["verdict_margin"])

@@ -1,4 +1,4 @@
-"""Table 14: how well the score tells right objects from wrong ones on fields fitted to posed images.
+"""Table 14: how well the verdict's margin tells right objects from wrong ones on fields fitted to posed images.
 
 FIELDS is the folder of benchmarks.make_image_fields.
 """
@@ -10,7 +10,7 @@ from functools import partial
 
 from benchmarks.robust.imperfect import pairs_by_kind
 from benchmarks.robust.judging import FAILED, NOT_AMONG, REJECTED, SUCCESSES, WRONG
-from benchmarks.robust.ranking import area_under_roc, score_of
+from benchmarks.robust.ranking import area_under_roc, margin_of
 from benchmarks.robust.report import Bar, Section, Table, by_group, count, of_kind
 from benchmarks.robust.runs import Context, Job, Run, run_all
 
@@ -40,8 +40,8 @@ def table(context: Context) -> Table:
         [
             Section(
                 "The area is the share of all pairs of a right and a wrong run in which the right one has the larger "
-                "1 - score; runs without a result have the least. Found: right objects whose pose is within 5 % MSSD, "
-                "whatever the verdict.",
+                "verdict_margin; runs without a result have the least. Found: right objects whose pose is within 5 % "
+                "MSSD, whatever the verdict.",
                 _HEAD,
                 [_row(name, some) for name, some in (*kinds.items(), ("**all**", runs))],
             )
@@ -60,11 +60,11 @@ _HEAD = (
     "area, found ones",
     "right runs",
     "successes",
-    "least 1 - score of the found",
+    "least verdict_margin of the found",
     "wrong runs",
     "registered",
     "ambiguous",
-    "largest 1 - score of the wrong",
+    "largest verdict_margin of the wrong",
 )
 
 
@@ -86,12 +86,12 @@ def _row(name: str, runs: Sequence[Run]) -> list[str]:
 
 
 def _extreme(choose: Callable[[list[float]], float], runs: Sequence[Run]) -> str:
-    values = [score_of(run) for run in runs if run["category"] != FAILED]
+    values = [margin_of(run) for run in runs if run["category"] != FAILED]
     return f"{choose(values):.3f}" if values else ""
 
 
 def _area(right: Sequence[Run], wrong: Sequence[Run]) -> float:
-    return area_under_roc([score_of(run) for run in right], [score_of(run) for run in wrong])
+    return area_under_roc([margin_of(run) for run in right], [margin_of(run) for run in wrong])
 
 
 def _parted(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:

@@ -12,7 +12,7 @@ from regnf_core.result import Alternative, Verdict
 from regnf_core.robust.covariance import covariance, in_object_units
 from regnf_core.robust.engine import Outcome, Problem
 from regnf_core.robust.finalists import LAST
-from regnf_core.robust.judgement import verdict
+from regnf_core.robust.judgement import decide
 from regnf_core.robust.levenberg import fitting_width
 from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.relation import relation
@@ -49,23 +49,24 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     best = float(evidence.scores[winner])
     close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
     rivals = [i for i in ranked.tolist() if i != winner and close[i]]
-    decision, reason = verdict(evidence, winner, len(rivals), options.robust, problem.view.incoherence)
+    decision = decide(evidence, winner, len(rivals), options.robust, problem.view.incoherence)
     T_work = select(poses, torch.tensor(winner))
     T = problem.in_field_frames(T_work)
     alternatives = []
     axis = problem.model.symmetry.axis
-    for i in rivals if decision != "rejected" else []:
+    for i in rivals if decision.verdict != "rejected" else []:
         other = problem.in_field_frames(select(poses, torch.tensor(i)))
         alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T, axis)))
     diameter = problem.model.frame.length
     metrics = {
         **evidence.of(winner),
+        "verdict_margin": decision.margin,
         "object_diameter": diameter,
         "shadow_share_scene": problem.view.shadow_share,
         "iterations": float(len(outcome.finalists.trail.steps)),
         "finalists": float(evidence.scores.numel()),
     }
-    return Conclusion(decision, reason, winner, T_work, T, metrics, alternatives)
+    return Conclusion(decision.verdict, decision.reason, winner, T_work, T, metrics, alternatives)
 
 
 def pose_covariance(problem: Problem, T_work: Sim3, offset: Tensor) -> Tensor:

@@ -11,10 +11,10 @@ from torch import Tensor
 from regnf_core.cameras import axis_vector
 from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
+from regnf_core.robust.evidence import Evidence, gather_evidence
 from regnf_core.robust.finalists import LAST, STAGES, Finalists, Trail, run_stage
 from regnf_core.robust.frame import WorkingField
 from regnf_core.robust.hypotheses import seeds, seeds_about
-from regnf_core.robust.judgement import Evidence, gather_evidence
 from regnf_core.robust.object_model import ObjectModel
 from regnf_core.robust.poses import displacement, join, select
 from regnf_core.robust.residuals import Samples

@@ -1,8 +1,4 @@
-"""The verdict, on samples that the refinement has not seen.
-
-Two-sided: how much of the object's surface the scene confirms, and how much of the scene's surface the object explains.
-Where the scene is free although the object should be there, the pose is wrong; where the scene holds matter instead,
-the part may just never have been seen (fields are solid behind what was seen), and counts for nothing.
+"""The verdict, on samples that the refinement has not seen, and by what margin it was reached.
 
 Where the scene's field is rough, the right object misses the distance that accurate fields keep to, and normals say
 little. There a second measure may stand in: what agrees at twice the distance, whatever the normals, less the share of
@@ -11,186 +7,104 @@ the object that lies in free space by more than that. Another thing's shape is w
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-
-import torch
-from torch import Tensor
 
 from regnf_core.options import RobustOptions
 from regnf_core.result import Verdict
-from regnf_core.robust.residuals import DistanceModel, Samples, residuals
-from regnf_core.robust.search import disagreement
-from regnf_core.sim3 import Sim3
+from regnf_core.robust.evidence import Evidence
 
-_SCORE_WIDTH = 0.015  # object diameters
-_REACH = 0.1  # object diameters from the object's surface: scene points farther off belong to something else
 _CLEAN_VIOLATIONS, _VIOLATIONS_PER_NOISE = 0.05, 20.0
 _CLEAN_SHARE, _SHARE_PER_NOISE = 0.87, 45.0
 """Where the inliers agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing
 (a chair without its cushion); where they agree to a hundredth, it may be the fields' errors."""
 _EXTRA, _EXTRA_PER_NOISE, _EXTRA_PER_NOISE_SEEN = 0.03, 20.0, 4.0
 """A fit to images invents surface where nobody looked, the more the noisier it is; what was measured is there."""
-_COARSE = 2.0  # inlier distances
 _LEAST_COARSE = 0.68
 _ROUGH, _ROUGH_SCORE, _SCORE_PER_INCOHERENCE = 0.022, 0.5, 12.0
 """From so incoherent normals on a field counts as rough, and the score may be as bad as they explain."""
-_CORE, _TAIL, _LONGEST_TAIL = 0.3, 0.75, 5.5
-"""Quantiles of the residuals' sizes, and the most that one may be of the other: 3 for normal errors everywhere. Another
-thing's residuals are small where it is alike and large where it is not."""
-_SAME_SIDE = 0.5  # least cosine of the normals of an inlier
+_LONGEST_TAIL = 5.5
+"""3 for normal errors everywhere. Another thing's residuals are small where it is alike and large where it is not."""
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What the held-out samples say of the poses (H,): shares 0..1, lengths in object diameters."""
+@dataclass(frozen=True)
+class Decision:
+    """A verdict, its reason (a stable UPPER_SNAKE word), and by what share 0..1 the narrowest of its criteria was met;
+    negative where it was missed, that is, where the pose is rejected."""
 
-    scores: Tensor
-    share_object: Tensor
-    """Object samples that the scene confirms, of those that it does not hide."""
-    share_scene: Tensor
-    """Scene samples near the object that it explains."""
-    share_explained: Tensor
-    """Scene samples, near or not, that the object explains."""
-    hidden: Tensor
-    """Object samples within the scene's matter."""
-    violations: Tensor
-    """Object samples in the scene's free space, of those that it does not hide."""
-    residual_rms: Tensor
-    """Root mean square of the inliers' residuals."""
-    coarse: Tensor
-    """What both directions agree on at twice the distance, whatever the normals, less the share in free space."""
-    tail: Tensor
-    """How long the residuals' tail is: 3 for normal errors that are alike everywhere."""
-    explained_coarsely: Tensor
-    """Scene samples, near or not, that the object explains at twice the distance."""
-    extra: Tensor
-    """Scene samples near the object that are no part of it, being farther from its surface than twice the inlier
-    distance, of all that are near."""
-    offsets: Tensor
-    """How much farther out the scene's surface lies than the object's."""
-    partial: bool = False
-    """Part of the scene is known not to have been seen; what was not is set aside, and the rest was measured."""
-
-    def of(self, index: int) -> dict[str, float]:
-        """The numbers of one pose, by the names that results carry."""
-        return {
-            "score": float(self.scores[index]),
-            "inlier_share_object": float(self.share_object[index]),
-            "inlier_share_scene": float(self.share_scene[index]),
-            "explained_share_scene": float(self.share_explained[index]),
-            "hidden_share_object": float(self.hidden[index]),
-            "free_space_violations": float(self.violations[index]),
-            "residual_rms": float(self.residual_rms[index]),
-            "coarse_agreement": float(self.coarse[index]),
-            "extra_share_scene": float(self.extra[index]),
-            "surface_offset": float(self.offsets[index]),
-        }
+    verdict: Verdict
+    reason: str
+    margin: float
 
 
-def gather_evidence(
-    scene: DistanceModel,
-    obj: DistanceModel,
-    A: Samples,
-    B: Samples,
-    T: Sim3,
-    options: RobustOptions,
-    offsets: Tensor,
-) -> Evidence:
-    """Judge all poses T (H,), offsets (H,), on held-out samples A of the scene and B of the object, working frames."""
-    r = residuals(scene, obj, A, B, T, offsets)
-    n = r.scene_count
-    forth, back = r.values[:, :n], r.values[:, n:]
-    inlier = (r.values.abs() <= options.inlier_distance) & (r.cosines >= _SAME_SIDE)
-    seen = torch.ones_like(back, dtype=torch.bool) if r.unseen is None else ~r.unseen[:, n:]
-    hidden = (~seen | (back < -options.inlier_distance)) & ~inlier[:, n:]
-    violating = (back > options.inlier_distance) & seen
-    open_ = (~hidden).sum(1).clamp_min(1)
-    near = forth.abs() <= _REACH
-    distance = _COARSE * options.inlier_distance
-    coarse, explained_coarsely = _coarse(forth, back, near, seen, distance)
-    squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
-    return Evidence(
-        scores=disagreement(r, _SCORE_WIDTH),
-        share_object=inlier[:, n:].sum(1) / open_,
-        share_scene=inlier[:, :n].sum(1) / near.sum(1).clamp_min(1),
-        share_explained=inlier[:, :n].float().mean(1),
-        hidden=hidden.float().mean(1),
-        violations=violating.sum(1) / open_,
-        residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
-        coarse=coarse,
-        tail=_tail(r.values if r.unseen is None else r.values.masked_fill(r.unseen, torch.nan)),
-        explained_coarsely=explained_coarsely,
-        extra=(near & (forth.abs() > distance)).sum(1) / near.sum(1).clamp_min(1),
-        offsets=offsets,
-        partial=r.unseen is not None,
-    )
+@dataclass(frozen=True)
+class _Criterion:
+    """slack: by how much it is met, negative where it is not."""
+
+    reason: str
+    slack: float
+
+    @property
+    def met(self) -> bool:
+        """False for a number that is none."""
+        return self.slack >= 0.0
 
 
-def _coarse(forth: Tensor, back: Tensor, near: Tensor, seen: Tensor, distance: float) -> tuple[Tensor, Tensor]:
-    """``coarse`` and ``explained_coarsely`` of the evidence, (H,) each. seen: (H, M), where the scene was looked at."""
-    explained = forth.abs() <= distance
-    of_near = explained.sum(1) / near.sum(1).clamp_min(1)
-    of_object = (seen & (back.abs() <= distance)).sum(1) / seen.sum(1).clamp_min(1)
-    free = (seen & (back > distance)).sum(1) / (seen & (back >= -distance)).sum(1).clamp_min(1)
-    return torch.minimum(of_near, of_object) - free, explained.float().mean(1)
+def decide(evidence: Evidence, index: int, rivals: int, options: RobustOptions, incoherence: float = 0.0) -> Decision:
+    """What is to be said of one pose that has ``rivals`` equals. incoherence: of the scene's normals.
 
-
-def verdict(
-    evidence: Evidence, index: int, rivals: int, options: RobustOptions, incoherence: float = 0.0
-) -> tuple[Verdict, str]:
-    """The verdict on one pose that has ``rivals`` equals, and its reason, a stable UPPER_SNAKE word.
-
-    incoherence: of the scene's normals. Written so that a number that is none can only lead to a rejection.
+    Written so that a number that is none can only lead to a rejection.
     """
-    if not float(evidence.hidden[index]) <= options.max_hidden_share:
-        return "rejected", "TOO_LITTLE_SURFACE"
-    if evidence.partial and not float(evidence.extra[index]) <= _most_extra(evidence, index):
-        return "rejected", "SURFACE_UNEXPLAINED"
-    reason = _disagreement(evidence, index, options)
-    if reason and not _is_roughness(evidence, index, options, incoherence):
-        return "rejected", reason
+    always = list(_always(evidence, index, options))
+    accurate = list(_of_accurate_fields(evidence, index, options))
+    agreement = max(_least(accurate), _least(_of_rough_fields(evidence, index, options, incoherence)))
+    margin = min(_least(always), agreement)
+    missed = [one for one in (*always, *accurate) if not one.met]
+    if not margin >= 0.0:
+        return Decision("rejected", missed[0].reason, margin)
     if rivals:
-        return "ambiguous", "SEVERAL_POSES_AGREE"
-    return "registered", "SURFACES_AGREE"
+        return Decision("ambiguous", "SEVERAL_POSES_AGREE", margin)
+    return Decision("registered", "SURFACES_AGREE", margin)
 
 
-def _tail(values: Tensor) -> Tensor:
-    core, tail = torch.nanquantile(values.abs(), torch.tensor([_CORE, _TAIL]), dim=1)
-    longer: Tensor = tail / core.clamp_min(1e-9)
-    return longer
+def _least(criteria: Iterable[_Criterion]) -> float:
+    """The smallest slack; -1 where one is no number."""
+    return min((-1.0 if math.isnan(one.slack) else one.slack for one in criteria), default=-1.0)
 
 
-def _is_roughness(evidence: Evidence, index: int, options: RobustOptions, incoherence: float) -> bool:
-    """Whether the disagreement is what a field as rough as this leads to at the right pose."""
-    most = _ROUGH_SCORE + _SCORE_PER_INCOHERENCE * (incoherence - _ROUGH)
-    return (
-        incoherence >= _ROUGH
-        and float(evidence.scores[index]) <= most
-        and float(evidence.tail[index]) <= _LONGEST_TAIL
-        and float(evidence.coarse[index]) >= _LEAST_COARSE
-        and float(evidence.explained_coarsely[index]) >= options.min_explained_share
-    )
+def _always(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Criterion]:
+    yield _Criterion("TOO_LITTLE_SURFACE", options.max_hidden_share - float(evidence.hidden[index]))
+    if evidence.partial:
+        yield _extra(evidence, index)
 
 
-def _disagreement(evidence: Evidence, index: int, options: RobustOptions) -> str:
-    """Why the pose is to be rejected by what is asked of accurate fields; empty where it is not."""
+def _of_accurate_fields(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Criterion]:
     noise = float(evidence.residual_rms[index])
-    if not float(evidence.violations[index]) <= min(
-        options.max_free_space_violations, _CLEAN_VIOLATIONS + _VIOLATIONS_PER_NOISE * noise
-    ):
-        return "FREE_SPACE_VIOLATED"
-    if not float(evidence.share_object[index]) >= options.min_inlier_share:
-        return "LOW_OVERLAP"
-    if not float(evidence.share_scene[index]) >= max(options.min_inlier_share, _CLEAN_SHARE - _SHARE_PER_NOISE * noise):
-        return "LOW_OVERLAP"
-    if not float(evidence.extra[index]) <= _most_extra(evidence, index):
-        return "SURFACE_UNEXPLAINED"
-    if not float(evidence.share_explained[index]) >= options.min_explained_share:
-        return "SCENE_UNEXPLAINED"
-    return ""
+    violations = min(options.max_free_space_violations, _CLEAN_VIOLATIONS + _VIOLATIONS_PER_NOISE * noise)
+    of_scene = max(options.min_inlier_share, _CLEAN_SHARE - _SHARE_PER_NOISE * noise)
+    yield _Criterion("FREE_SPACE_VIOLATED", violations - float(evidence.violations[index]))
+    yield _Criterion("LOW_OVERLAP", float(evidence.share_object[index]) - options.min_inlier_share)
+    yield _Criterion("LOW_OVERLAP", float(evidence.share_scene[index]) - of_scene)
+    yield _extra(evidence, index)
+    yield _Criterion("SCENE_UNEXPLAINED", float(evidence.share_explained[index]) - options.min_explained_share)
 
 
-def _most_extra(evidence: Evidence, index: int) -> float:
-    """How much of the surface near the object may be no part of it: more where it may never have been seen."""
+def _of_rough_fields(
+    evidence: Evidence, index: int, options: RobustOptions, incoherence: float
+) -> Iterable[_Criterion]:
+    """Whether the disagreement is what a field as rough as this leads to at the right pose."""
+    if not incoherence >= _ROUGH:
+        return
+    score = _ROUGH_SCORE + _SCORE_PER_INCOHERENCE * (incoherence - _ROUGH)
+    yield _Criterion("LOW_OVERLAP", score - float(evidence.scores[index]))
+    yield _Criterion("LOW_OVERLAP", 1.0 - float(evidence.tail[index]) / _LONGEST_TAIL)
+    yield _Criterion("LOW_OVERLAP", float(evidence.coarse[index]) - _LEAST_COARSE)
+    yield _Criterion("SCENE_UNEXPLAINED", float(evidence.explained_coarsely[index]) - options.min_explained_share)
+
+
+def _extra(evidence: Evidence, index: int) -> _Criterion:
+    """Surface near the object that is no part of it: more may be where it may never have been seen."""
     per_noise = _EXTRA_PER_NOISE_SEEN if evidence.partial else _EXTRA_PER_NOISE
-    return _EXTRA + per_noise * float(evidence.residual_rms[index])
+    most = _EXTRA + per_noise * float(evidence.residual_rms[index])
+    return _Criterion("SURFACE_UNEXPLAINED", most - float(evidence.extra[index]))

@@ -12,7 +12,7 @@ import torch
 from benchmarks.robust.cases import Case
 from benchmarks.robust.imperfect import LONG, SINGLE, of_pair
 from benchmarks.robust.published import Errors, better, mean_errors, nearest_equal, paper_errors
-from benchmarks.robust.ranking import area_under_roc, score_of
+from benchmarks.robust.ranking import area_under_roc, margin_of
 from benchmarks.robust.symmetries import declared, turn
 from regnf_core import RegistrationResult, Sim3
 
@@ -29,8 +29,8 @@ def test_the_area_is_the_share_of_pairs_in_the_right_order() -> None:
 
 
 def test_a_run_without_a_result_ranks_below_all_others() -> None:
-    assert score_of({"category": "failed"}) < score_of({"category": "rejected", "score": 1.0})
-    assert area_under_roc([0.2], [score_of({"category": "failed"})]) == 1.0
+    assert margin_of({"category": "failed"}) < margin_of({"category": "rejected", "verdict_margin": -1.0})
+    assert area_under_roc([0.2], [margin_of({"category": "failed"})]) == 1.0
 
 
 def test_the_nearest_equal_of_the_truth_is_the_one_that_was_found() -> None:

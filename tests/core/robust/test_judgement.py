@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from regnf_core.options import RobustOptions
-from regnf_core.robust.judgement import Evidence, gather_evidence, verdict
+from regnf_core.robust.evidence import Evidence, gather_evidence
+from regnf_core.robust.judgement import decide
 from regnf_core.robust.residuals import Samples
 from regnf_core.sim3 import Sim3
 
@@ -54,9 +59,10 @@ def test_matter_around_the_object_is_no_free_space() -> None:
 
 def test_roughness_is_forgiven_on_rough_fields_alone() -> None:
     found = judged([0.005] * 4 + [0.02] * 5 + [-0.02] * 1, [0.005] * 4 + [0.02] * 3 + [-0.02] * 3)
-    assert verdict(found, 0, 0, RobustOptions())[0] == "rejected"
-    assert verdict(found, 0, 0, RobustOptions(), incoherence=ROUGH) == ("registered", "SURFACES_AGREE")
-    assert verdict(found, 0, 1, RobustOptions(), incoherence=ROUGH)[0] == "ambiguous"
+    assert decide(found, 0, 0, RobustOptions()).verdict == "rejected"
+    forgiven = decide(found, 0, 0, RobustOptions(), incoherence=ROUGH)
+    assert (forgiven.verdict, forgiven.reason) == ("registered", "SURFACES_AGREE")
+    assert decide(found, 0, 1, RobustOptions(), incoherence=ROUGH).verdict == "ambiguous"
 
 
 @pytest.mark.parametrize(
@@ -69,15 +75,15 @@ def test_roughness_is_forgiven_on_rough_fields_alone() -> None:
     ],
 )
 def test_another_shape_is_not_forgiven(forth: list[float], back: list[float]) -> None:
-    assert verdict(judged(forth, back), 0, 0, RobustOptions(), incoherence=ROUGH)[0] == "rejected"
+    assert decide(judged(forth, back), 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "rejected"
 
 
 def test_the_score_may_be_as_bad_as_the_normals_explain() -> None:
     found = judged([0.005] * 4 + [0.02] * 5 + [-0.02] * 1, [0.005] * 4 + [0.02] * 3 + [-0.02] * 3)
     # Four tenths lose 1 - 0.015^2 / (0.015^2 + 0.005^2) = 0.1, six tenths 1 - 0.015^2 / (0.015^2 + 0.02^2) = 0.64.
     assert float(found.scores[0]) == pytest.approx(0.4 * 0.1 + 0.6 * 0.64)
-    assert verdict(found, 0, 0, RobustOptions(), incoherence=0.021)[0] == "rejected"
-    assert verdict(found, 0, 0, RobustOptions(), incoherence=0.023)[0] == "registered"
+    assert decide(found, 0, 0, RobustOptions(), incoherence=0.021).verdict == "rejected"
+    assert decide(found, 0, 0, RobustOptions(), incoherence=0.023).verdict == "registered"
 
 
 def test_errors_in_one_place_alone_are_another_shape() -> None:
@@ -85,10 +91,41 @@ def test_errors_in_one_place_alone_are_another_shape() -> None:
     apart = judged([0.001] * 5 + [0.02] * 5, [0.001] * 5 + [0.02] * 4 + [0.02] * 1)
     assert float(alike.tail[0]) == pytest.approx(5.0)
     assert float(apart.tail[0]) == pytest.approx(20.0)
-    assert verdict(alike, 0, 0, RobustOptions(), incoherence=ROUGH)[0] == "registered"
-    assert verdict(apart, 0, 0, RobustOptions(), incoherence=ROUGH)[0] == "rejected"
+    assert decide(alike, 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "registered"
+    assert decide(apart, 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "rejected"
+
+
+def test_surface_that_is_no_part_of_the_object_by_hand() -> None:
+    # 10 of the 11 are near; one of these is farther than 0.03: 0.1, against 0.03 + 20 * 0.002 of accurate fields.
+    found = judged([0.002] * 9 + [0.05] + [0.4], [0.002] * 10)
+    assert float(found.extra[0]) == pytest.approx(0.1)
+    decision = decide(found, 0, 0, RobustOptions())
+    assert (decision.verdict, decision.reason) == ("rejected", "SURFACE_UNEXPLAINED")
+    assert decision.margin == pytest.approx(0.03 + 20 * 0.002 - 0.1, abs=1e-6)
+
+
+def test_what_was_measured_is_there_however_rough_the_field() -> None:
+    rough = [0.005] * 4 + [0.02] * 5 + [-0.05]
+    found = judged(rough, rough)
+    assert decide(found, 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "registered"
+    decision = decide(replace(found, partial=True), 0, 0, RobustOptions(), incoherence=ROUGH)
+    assert (decision.verdict, decision.reason) == ("rejected", "SURFACE_UNEXPLAINED")
+
+
+@given(
+    forth=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
+    back=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
+    incoherence=st.floats(0.0, 0.1),
+    partial=st.booleans(),
+)
+def test_the_margin_is_negative_for_rejections_alone(
+    forth: list[float], back: list[float], incoherence: float, partial: bool
+) -> None:
+    decision = decide(replace(judged(forth, back), partial=partial), 0, 0, RobustOptions(), incoherence)
+    assert (decision.margin < 0.0) == (decision.verdict == "rejected")
+    assert decision.margin <= 1.0
 
 
 def test_numbers_that_are_none_are_rejected() -> None:
     nothing = float("nan")
-    assert verdict(judged([nothing] * 5, [nothing] * 5), 0, 0, RobustOptions(), incoherence=ROUGH)[0] == "rejected"
+    assert decide(judged([nothing] * 5, [nothing] * 5), 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "rejected"
