@@ -1,4 +1,4 @@
-"""How many things of a kind a caller may have going on at once in this process."""
+"""How many things of a kind may go on at once in this process: of each caller, and of all together."""
 
 from __future__ import annotations
 
@@ -52,3 +52,24 @@ class Slots:
     def taken(self) -> int:
         """How many are taken by all callers together."""
         return self._taken.total()
+
+
+class Waiters:
+    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many."""
+
+    def __init__(self, looks_per_s: float = 200.0) -> None:
+        self._looks_per_s = looks_per_s
+        self._held = 0
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """One answer is held while the block runs."""
+        self._held += 1
+        try:
+            yield
+        finally:
+            self._held -= 1
+
+    def pause_s(self, wanted_s: float) -> float:
+        """Seconds until one of them looks again: what it would like, or more where others look too."""
+        return max(wanted_s, self._held / self._looks_per_s)

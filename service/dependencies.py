@@ -14,7 +14,7 @@ from fastapi import Depends, Query
 from starlette.requests import Request
 
 from service.blobs import BlobStore
-from service.concurrency import Slots
+from service.concurrency import Slots, Waiters
 from service.queue import JobQueue
 from service.records import Quota, RecordStore
 from service.settings import Settings
@@ -35,6 +35,7 @@ class Services:
     queue: JobQueue
     webhooks: Webhooks = field(default_factory=Webhooks)
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    waiters: Waiters = field(default_factory=Waiters)
     # threads of their own: uploads to a slow disk must not keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
 

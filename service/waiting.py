@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from service.dependencies import off_loop
+from service.dependencies import Services, off_loop
 
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.25
@@ -25,14 +25,15 @@ async def pause(seconds: float, stopping: asyncio.Event) -> bool:
 
 
 async def wait_for(
-    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, stopping: asyncio.Event
+    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services
 ) -> _Value:
     """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops."""
     deadline = time.monotonic() + seconds
     step = _FIRST_PAUSE_S
-    while True:
-        value = await off_loop(fetch)
-        left = deadline - time.monotonic()
-        if enough(value) or left <= 0 or await pause(min(step, left), stopping):
-            return value
-        step = min(step * 1.5, _LONGEST_PAUSE_S)
+    with services.waiters.held():
+        while True:
+            value = await off_loop(fetch)
+            left = deadline - time.monotonic()
+            if enough(value) or left <= 0 or await pause(min(services.waiters.pause_s(step), left), services.stopping):
+                return value
+            step = min(step * 1.5, _LONGEST_PAUSE_S)

@@ -54,7 +54,7 @@ async def get_field(
     200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
     """
     record = await wait_for(
-        lambda: _require(services, caller, sha256), lambda found: found.state != "validating", wait, services.stopping
+        lambda: _require(services, caller, sha256), lambda found: found.state != "validating", wait, services
     )
     headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
     if record.state == "validating":

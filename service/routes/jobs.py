@@ -123,12 +123,17 @@ async def get_job(
     """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
 
     def look() -> _Seen:
-        return _seen(services, find_job(services, id, caller))
+        record = find_job(services, id, caller)
+        if if_none_match is None and wait:
+            return _Seen(record, None, None)  # its state is all that is waited for
+        return _seen(services, record)
 
     def is_news(seen: _Seen) -> bool:
         return seen.record.status not in ACTIVE or (if_none_match is not None and _etag(seen) != if_none_match)
 
-    seen = await wait_for(look, is_news, wait, services.stopping)
+    seen = await wait_for(look, is_news, wait, services)
+    if if_none_match is None and wait:
+        seen = await off_loop(_seen, services, seen.record)
     response = _answer(services, seen, prefix, 200)
     if if_none_match is not None and response.headers["ETag"] == if_none_match:
         return Response(status_code=304, headers={"ETag": if_none_match})

@@ -139,7 +139,7 @@ async def register(
             lambda: services.records.get_job(record.id) or record,
             lambda found: found.status in FINISHED,
             wait,
-            services.stopping,
+            services,
         )
     response = await job_answer(services, record, prefix, 200 if record.status in FINISHED else 202)
     response.headers["Location"] = f"{prefix}/jobs/{record.id}"

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,13 @@ from redis.exceptions import RedisError
 
 from service import lifespan
 from service.app import ConfigurationError, create_app
+from service.concurrency import Waiters
 from service.dependencies import Services
 from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from service.settings import Settings
 from service.shutdown import stopping_on_signals
 from service.waiting import pause, wait_for
+from tests.contract.world import make_world
 
 
 def test_the_application_loads_neither_torch_nor_open3d() -> None:
@@ -52,13 +55,25 @@ def test_signals_end_long_answers_and_reach_the_server_too() -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_waiting_ends_when_the_service_stops() -> None:
+def test_waiting_ends_when_the_service_stops(tmp_path: Path) -> None:
+    services = make_world(tmp_path).app.state.services
+
     async def run() -> int:
-        stopping = asyncio.Event()
-        asyncio.get_running_loop().call_later(0.05, stopping.set)
-        return await wait_for(lambda: 1, lambda _: False, 60.0, stopping)
+        asyncio.get_running_loop().call_later(0.05, services.stopping.set)
+        return await wait_for(lambda: 1, lambda _: False, 60.0, services)
 
     assert asyncio.run(asyncio.wait_for(run(), 20)) == 1
+
+
+def test_the_more_answers_are_held_the_more_seldom_each_looks() -> None:
+    waiters = Waiters(looks_per_s=10.0)
+    with ExitStack() as stack:
+        stack.enter_context(waiters.held())
+        assert waiters.pause_s(0.25) == 0.25
+        for _ in range(9):
+            stack.enter_context(waiters.held())
+        assert (waiters.pause_s(0.25), waiters.pause_s(2.0)) == (1.0, 2.0)
+    assert waiters.pause_s(0.02) == 0.02
 
 
 def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
