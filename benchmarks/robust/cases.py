@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.robust.symmetries import declared, in_frame
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core import open_field as open_safe_field
+from regnf_core.fields.observation import ObservedField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.symmetry import Symmetries
 
@@ -48,6 +49,10 @@ class Case:
             truth,
             in_frame(self.symmetries, T_new_object),
         )
+
+    def unobserved(self) -> Case:
+        """The same by a scene's field that does not say what was seen of it, as other trainers' fields do not."""
+        return replace(self, scene=self.scene.field) if isinstance(self.scene, ObservedField) else self
 
     def in_box(self, detection: OrientedBox) -> Case:
         """The same with another detection box."""

@@ -6,11 +6,12 @@ FIELDS is the folder of benchmarks.make_image_fields.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from benchmarks.robust.cases import MAIN, Pair, load_pairs
+from benchmarks.robust.cases import MAIN, Case, Pair, load_pairs
 from benchmarks.robust.judging import AMONG, FAILED, NOT_AMONG, REJECTED, RIGHT, SUCCESSES, WRONG
 from benchmarks.robust.published import (
     MEAN_OF_SOLVED,
@@ -26,7 +27,7 @@ from benchmarks.robust.published import (
 from benchmarks.robust.report import Bar, Section, Table, by_group, count, failures_of, median, share_bar, successes
 from benchmarks.robust.runs import Context, Job, Run, run_all
 
-NAME = "imperfect"
+NAME, UNOBSERVED = "imperfect", "unobserved"
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,26 @@ def pairs_by_kind(folder: Path) -> Iterator[tuple[Kind, Pair]]:
 
 def table(context: Context) -> Table:
     """All lists of pairs that the folder has."""
+    return table_of(context, NAME, "Imperfect fields", Pair.case)
+
+
+def unobserved_table(context: Context) -> Table:
+    """The same without what the fields say was seen of them."""
+    title = "Imperfect fields that do not say what was seen of them"
+    return table_of(context, UNOBSERVED, title, lambda pair: pair.case().unobserved())
+
+
+def table_of(context: Context, name: str, title: str, make: Callable[[Pair], Case]) -> Table:
+    """All lists of pairs that the folder has; ``make``: the case that a pair is tried as."""
     jobs = [
-        Job(pair.case, kind.name, seed) for kind, pair in pairs_by_kind(context.folder) for seed in range(context.seeds)
+        Job(partial(make, pair), kind.name, seed)
+        for kind, pair in pairs_by_kind(context.folder)
+        for seed in range(context.seeds)
     ]
     runs = run_all(jobs, context, paper_errors)
     return Table(
-        NAME,
-        "Imperfect fields",
+        name,
+        title,
         list(_bars(runs)),
         [
             Section(
