@@ -104,8 +104,7 @@ def _best_direction(scene: Surfels, up: Floats) -> Floats:
 
 
 def _panel(cloud: Surfels, nearest: NDArray[np.int64], view: View) -> Image.Image:
-    picture = paint(cloud, nearest, view, _BACKGROUND)
-    large = Image.fromarray((255 * np.clip(picture, 0.0, 1.0)).round().astype(np.uint8))
+    large = Image.fromarray(paint(cloud, nearest, view, _BACKGROUND))
     return large.resize((_PANEL, _PANEL), Image.Resampling.LANCZOS)
 
 

@@ -60,7 +60,7 @@ def render(surfels: Surfels, view: View, size: int, radius: float, background: F
 
     Discs turned away from the viewer are lit from behind as well, so that hollow shapes stay readable.
     """
-    return paint(surfels, nearest_surfels(surfels, view, size, radius), view, background)
+    return paint(surfels, nearest_surfels(surfels, view, size, radius), view, background) / 255.0
 
 
 def nearest_surfels(surfels: Surfels, view: View, size: int, radius: float) -> NDArray[np.int64]:
@@ -70,13 +70,12 @@ def nearest_surfels(surfels: Surfels, view: View, size: int, radius: float) -> N
     return _nearest(seen, towards, size, radius * view.pixels_per_unit).reshape(size, size)
 
 
-def paint(surfels: Surfels, nearest: NDArray[np.int64], view: View, background: Floats) -> Floats:
-    """The picture (size, size, 3) of what ``nearest_surfels`` found, in the colours of ``surfels``."""
+def paint(surfels: Surfels, nearest: NDArray[np.int64], view: View, background: Floats) -> NDArray[np.uint8]:
+    """The picture (size, size, 3), in bytes, of what ``nearest_surfels`` found, in the colours of ``surfels``."""
     shaded = surfels.colours * _shade(_towards_viewer(surfels, view))[:, None]
-    picture = np.broadcast_to(background, (*nearest.shape, 3)).copy()
-    hit = nearest >= 0
-    picture[hit] = shaded[nearest[hit]]
-    return picture
+    colours = np.concatenate([shaded, background[None]])  # where there is no disc, -1 takes the last
+    painted: NDArray[np.uint8] = (255 * np.clip(colours, 0.0, 1.0)).round().astype(np.uint8)[nearest]
+    return painted
 
 
 def _towards_viewer(surfels: Surfels, view: View) -> Floats:
