@@ -2,8 +2,8 @@
 
     python -m benchmarks.robust FIELDS [--only NAME ...] [--seeds 10] [--limit N] [--output FOLDER]
 
-FIELDS is the folder that benchmarks.make_fields wrote; for imperfect, unobserved and roc, which run only when named, that
-of benchmarks.make_image_fields. With --output every table is written to FOLDER as NAME.md and,
+FIELDS is the folder that benchmarks.make_fields wrote; for imperfect, unobserved and roc, which run only when named,
+that of benchmarks.make_image_fields. With --output every table is written to FOLDER as NAME.md and,
 with each single run, NAME.json. --limit is for a look beforehand: at most N registrations a table.
 """
 

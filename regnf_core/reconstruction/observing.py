@@ -20,6 +20,8 @@ from regnf_core.fields.safe_format import open_field, read_description, write_sa
 
 _MARGIN = 1.0
 """Voxels before a measured surface that may be matter as well."""
+_PIXELS = 1.2
+"""Widths of a pixel that a voxel is across at least: narrower ones would fall between the pixels' rays."""
 _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
 """So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
 
@@ -28,13 +30,13 @@ def observe(images: PosedImages, voxels: int) -> Observation | None:
     """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colours): what
     a camera looked through is free, where a depth ends there is a surface, nobody looked at the rest.
 
-    voxels: along the longest side of the bounds. None without depths, or for 0. Voxels are judged by their centres, in
-    every image that shows them.
+    voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
+    Voxels are judged by their centres, in every image that shows them.
     """
     if images.depths is None or voxels == 0:
         return None
     low, high = torch.from_numpy(images.bounds)
-    voxel = float((high - low).max()) / voxels
+    voxel = max(float((high - low).max()) / voxels, _PIXELS * _pixel_width(images))
     counts = [int(n) for n in ((high - low) / voxel - 1e-9).ceil().clamp_min(1)]
     states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
     axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
@@ -49,6 +51,13 @@ def observe(images: PosedImages, voxels: int) -> Observation | None:
     x, y, z = cells[((cells >= 0) & (cells < torch.tensor(counts))).all(-1)].unbind(-1)
     states.view(counts)[x, y, z] = SURFACE
     return Observation(states.view(counts), low, voxel)
+
+
+def _pixel_width(images: PosedImages) -> float:
+    """The median width of a pixel where its depth ends; 0 where none does."""
+    assert images.depths is not None
+    widths = (images.depths / images.intrinsics[:, 0, 0, None, None])[images.depths > 0.0]
+    return float(np.median(widths)) if widths.size else 0.0
 
 
 def _looked_through(centres: Tensor, images: PosedImages, image: int, margin: float) -> Tensor:
