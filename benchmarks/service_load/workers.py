@@ -1,6 +1,6 @@
 """How many registrations two workers do in the time that one does: REGNF_THREADS=1 each, on two cores.
 
-    python -m benchmarks.service_load.workers [--jobs 24] [--rounds 3] [--output benchmarks/results/service_workers.md]
+    python -m benchmarks.service_load.workers [--jobs 16] [--rounds 3] [--output benchmarks/results/service_workers.md]
 
 One service. Batches of jobs of the kind benchmarks.service_load.overhead posts are worked off now by one worker, now by
 two, in turn, so that whatever else the machine does hits both alike. The time is that from the first job's start to the
@@ -81,7 +81,7 @@ def _cell(values: list[float], digits: int) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--jobs", type=int, default=24)
+    parser.add_argument("--jobs", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
