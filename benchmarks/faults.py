@@ -2,7 +2,7 @@
 
     python -m benchmarks.faults [arguments of pytest, such as -k sigterm]
 
-Half an hour. Rewrites the table in docs/faults.md; with arguments, or when a test fails, prints it instead.
+Forty minutes. Rewrites the table in docs/faults.md; with arguments, or when a test fails, prints it instead.
 """
 
 from __future__ import annotations

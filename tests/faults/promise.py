@@ -94,7 +94,7 @@ def check_promise(house: House, successful: list[str], failed: dict[str, str] | 
     for job_id, document in documents.items():
         expected = ("failed", failed[job_id]) if job_id in failed else ("successful", None)
         assert (document["status"], (document.get("error") or {}).get("reason")) == expected, house.log()
-    listed = [job["id"] for job in house.client.get("/jobs").raise_for_status().json()["jobs"]]
+    listed = [job["id"] for job in house.client.get("/jobs?limit=200").raise_for_status().json()["jobs"]]
     assert sorted(listed) == sorted(documents)
     for job_id in successful:
         check_result(house, job_id)

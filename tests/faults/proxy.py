@@ -75,12 +75,12 @@ class Proxy:
         await asyncio.gather(*self._tasks)
 
     async def _break_off(self) -> int:
-        broken = len(self._open)
-        for writer in self._open:
+        whole = [writer for writer in self._open if not writer.is_closing()]
+        for writer in whole:
             if (one := writer.get_extra_info("socket")).family == socket.AF_INET:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             writer.transport.abort()
-        return broken
+        return len(whole)
 
     async def _join(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()

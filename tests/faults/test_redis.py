@@ -119,7 +119,7 @@ def test_redis_out_of_memory(house: House) -> None:
 
 
 def test_redis_100_ms_away(far_house: House, network: Proxy) -> None:
-    """Every job takes some five seconds longer, and nothing else changes."""
+    """Each of eight jobs takes some six seconds longer, and nothing else changes."""
     house = far_house
     house.environment["REGNF_HEARTBEAT_S"] = "1"
     house.start_both()

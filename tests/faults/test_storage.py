@@ -57,7 +57,7 @@ def test_an_object_store_that_hangs(house: House, objects: ObjectServer) -> None
 
 
 def test_an_object_store_that_is_away(tmp_path: Path, objects: ObjectServer, server: RestartableRedis) -> None:
-    """The same."""
+    """The same as when it hangs."""
     with Proxy(to_port(objects.port)) as network:
         store = Bucket(objects, objects.new_bucket(), f"http://127.0.0.1:{network.port}")
         with house_over(tmp_path, server, store) as house:
@@ -66,7 +66,7 @@ def test_an_object_store_that_is_away(tmp_path: Path, objects: ObjectServer, ser
 
 @pytest.mark.parametrize("gone", ["blobs", "."], ids=["of_results", "of_all_files"])
 def test_a_volume_that_is_away(folder_house: House, gone: str) -> None:
-    """The same, though a job that finds its files gone is run once more; nothing is written in the volume's place."""
+    """The same, but a job that finds its files gone is run once more; nothing is written in the volume's place."""
     volume = folder_house.state("worker") / gone
     elsewhere = folder_house.folder / "elsewhere"
 
