@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,10 +26,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import httpx
+
 from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_small_pair
 from regnf_cli.remote import RemoteService
 from service.paging import encode_token
-from tests.contract.live import Live, live_service
+from tests.contract.live import Live, eventually, live_service
+from tests.worker.bench import children_of
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HERE = Path(__file__).resolve().parent
@@ -39,6 +43,7 @@ SETTINGS: dict[str, object] = {
     "max_queued_jobs": 1_000_000,
     "max_uploads_per_caller": 1000,
     "job_timeout_s": 86400,
+    "lost_after_s": 86400,
 }
 """Limits out of the way: a full queue is a refusal like another, but no fault to be found here."""
 
@@ -74,6 +79,7 @@ def prepare(live: Live, folder: Path) -> dict[str, Any]:
         spare = [client.post("/fields", content=path.read_bytes()).json()["sha256"] for path in spare_files]
         running = [client.post("/register", json={**request, "options": _ENDLESS, "seed": n}).json() for n in range(20)]
         client.post(f"/jobs/{running[-1]['id']}/cancel")
+        _halt(live, client, running[0]["id"])
         created = [client.get("/jobs", params={"limit": 2}).json(), client.get("/fields", params={"limit": 2}).json()]
     jobs = [job["id"] for job in running]
     return {
@@ -84,6 +90,14 @@ def prepare(live: Live, folder: Path) -> dict[str, Any]:
         "detection": pair.detection,
         "page_tokens": [page["next_page_token"] for page in created] + [encode_token(time.time(), "z")],
     }
+
+
+def _halt(live: Live, client: httpx.Client, job_id: str) -> None:
+    """Stop the process of the job that runs, so that it goes on running, and all others waiting, at no cost."""
+    assert live.worker is not None
+    eventually(lambda: client.get(f"/jobs/{job_id}").json()["status"] == "running", "a job that runs")
+    for child in children_of(live.worker.pid):
+        os.kill(child, signal.SIGSTOP)
 
 
 def _broken(pair: SmallPair) -> bytes:
