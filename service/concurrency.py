@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -71,5 +72,8 @@ class Waiters:
             self._held -= 1
 
     def pause_s(self, wanted_s: float) -> float:
-        """Seconds until one of them looks again: what it would like, or more where others look too."""
-        return max(wanted_s, self._held / self._looks_per_s)
+        """Seconds until one of them looks again: what it would like, or more where others look too.
+
+        Up to a quarter more or less, so that those that began together do not look together ever after.
+        """
+        return max(wanted_s, self._held / self._looks_per_s) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -22,6 +22,7 @@ from service.uploads import Upload, open_upload
 from service.webhooks.policy import Webhooks
 
 _UPLOAD_THREADS = 4
+_LOOK_THREADS = 2
 _Result = TypeVar("_Result")
 
 
@@ -36,8 +37,9 @@ class Services:
     webhooks: Webhooks = field(default_factory=Webhooks)
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
-    # threads of their own: uploads to a slow disk must not keep a poll waiting for one
+    # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
+    look_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_LOOK_THREADS))
 
     @cached_property
     def quota(self) -> Quota:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from anyio import to_thread
+
 from service.dependencies import Services, off_loop
 
 _FIRST_PAUSE_S = 0.02
@@ -31,9 +33,10 @@ async def wait_for(
     deadline = time.monotonic() + seconds
     step = _FIRST_PAUSE_S
     with services.waiters.held():
+        value = await off_loop(fetch)
         while True:
-            value = await off_loop(fetch)
             left = deadline - time.monotonic()
             if enough(value) or left <= 0 or await pause(min(services.waiters.pause_s(step), left), services.stopping):
                 return value
+            value = await to_thread.run_sync(fetch, limiter=services.look_limiter)
             step = min(step * 1.5, _LONGEST_PAUSE_S)
