@@ -1,6 +1,6 @@
 """Two hundred pollers at once while registrations run and 150 MB are uploaded and imported.
 
-    python -m benchmarks.service_load.pollers [--seconds 40] [--output benchmarks/results/service_pollers.md]
+    python -m benchmarks.service_load.pollers [--seconds 45] [--output benchmarks/results/service_pollers.md]
 
 A hundred jobs wait or run. Each is asked for once a second by one, as `Retry-After` tells it to, and by another who
 holds a long poll (`?wait=10`) until it has ended. The first are timed by their answers' latency, the others by how long
@@ -37,7 +37,7 @@ _POLLERS = 100
 _EVERY_S = 1.0
 _LONG_WAIT_S = 10
 _OPTIONS = {"robust": {"up_axis": "z"}}
-_CALM_S = 10.0
+_CALM_S = 15.0
 """How long the pollers poll before the upload begins."""
 
 
@@ -67,7 +67,7 @@ async def poll(port: int, job_id: str, until: float, seen: Seen) -> None:
 async def hold(port: int, job_id: str, until: float, seen: Seen) -> None:
     """One long poller: asks until its job has ended."""
     job: dict[str, Any] = {"status": "accepted"}
-    await asyncio.sleep(random.uniform(0.0, _EVERY_S))
+    await asyncio.sleep(random.uniform(0.0, _LONG_WAIT_S))  # clients come when they come, not all at once
     async with Connection(port) as connection:
         while job["status"] in ("accepted", "running") and time.monotonic() < until:
             status, body = await connection.get(f"/jobs/{job_id}?wait={_LONG_WAIT_S}")
@@ -154,7 +154,7 @@ def table(seen: Seen, sent: tuple[float, float], size: int, peak: int, ended: bo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=40.0)
+    parser.add_argument("--seconds", type=float, default=45.0)
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="regnf-") as folder:
