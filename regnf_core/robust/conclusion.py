@@ -11,6 +11,7 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, Verdict
 from regnf_core.robust.covariance import covariance, in_object_units
 from regnf_core.robust.engine import Outcome, Problem
+from regnf_core.robust.extra_surface import extra_share
 from regnf_core.robust.finalists import LAST
 from regnf_core.robust.judgement import decide
 from regnf_core.robust.levenberg import fitting_width
@@ -49,8 +50,11 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     best = float(evidence.scores[winner])
     close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
     rivals = [i for i in ranked.tolist() if i != winner and close[i]]
-    decision = decide(evidence, winner, len(rivals), options.robust, problem.view.incoherence)
     T_work = select(poses, torch.tensor(winner))
+    extra = extra_share(
+        problem.scene_field, problem.object_field, problem.A_held, T_work, evidence.offsets[winner], options.robust
+    )
+    decision = decide(evidence, winner, len(rivals), options.robust, problem.view.incoherence, extra)
     T = problem.in_field_frames(T_work)
     alternatives = []
     axis = problem.model.symmetry.axis
@@ -60,6 +64,7 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     diameter = problem.model.frame.length
     metrics = {
         **evidence.of(winner),
+        "extra_share_scene": extra,
         "verdict_margin": decision.margin,
         "object_diameter": diameter,
         "shadow_share_scene": problem.view.shadow_share,

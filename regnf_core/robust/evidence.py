@@ -18,7 +18,7 @@ from regnf_core.robust.search import disagreement
 from regnf_core.sim3 import Sim3
 
 _SCORE_WIDTH = 0.015  # object diameters
-_REACH = 0.1  # object diameters from the object's surface: scene points farther off belong to something else
+REACH = 0.1  # object diameters from the object's surface: scene points farther off belong to something else
 _COARSE = 2.0  # inlier distances
 _CORE, _TAIL = 0.3, 0.75
 """Quantiles of the residuals' sizes."""
@@ -48,9 +48,6 @@ class Evidence:
     """How long the residuals' tail is: 3 for normal errors that are alike everywhere."""
     explained_coarsely: Tensor
     """Scene samples, near or not, that the object explains at twice the distance."""
-    extra: Tensor
-    """Scene samples near the object that are no part of it, being farther from its surface than twice the inlier
-    distance, of all that are near."""
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
     partial: bool = False
@@ -67,7 +64,6 @@ class Evidence:
             "free_space_violations": float(self.violations[index]),
             "residual_rms": float(self.residual_rms[index]),
             "coarse_agreement": float(self.coarse[index]),
-            "extra_share_scene": float(self.extra[index]),
             "surface_offset": float(self.offsets[index]),
         }
 
@@ -90,7 +86,7 @@ def gather_evidence(
     hidden = (~seen | (back < -options.inlier_distance)) & ~inlier[:, n:]
     violating = (back > options.inlier_distance) & seen
     open_ = (~hidden).sum(1).clamp_min(1)
-    near = forth.abs() <= _REACH
+    near = forth.abs() <= REACH
     distance = _COARSE * options.inlier_distance
     coarse, explained_coarsely = _coarse(forth, back, near, seen, distance)
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
@@ -105,7 +101,6 @@ def gather_evidence(
         coarse=coarse,
         tail=_tail(r.values if r.unseen is None else r.values.masked_fill(r.unseen, torch.nan)),
         explained_coarsely=explained_coarsely,
-        extra=(near & (forth.abs() > distance)).sum(1) / near.sum(1).clamp_min(1),
         offsets=offsets,
         partial=r.unseen is not None,
     )

@@ -16,10 +16,11 @@ from regnf_core.result import Verdict
 from regnf_core.robust.evidence import Evidence
 
 _CLEAN_VIOLATIONS, _VIOLATIONS_PER_NOISE = 0.05, 20.0
-_CLEAN_SHARE, _SHARE_PER_NOISE = 0.87, 45.0
+_CLEAN_SHARE, _SHARE_PER_NOISE = 0.89, 45.0
 """Where the inliers agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing
 (a chair without its cushion); where they agree to a hundredth, it may be the fields' errors."""
-_EXTRA, _EXTRA_PER_NOISE, _EXTRA_PER_NOISE_SEEN = 0.03, 20.0, 4.0
+_EXTRA, _EXTRA_PER_NOISE = 0.03, 20.0
+_EXTRA_MEASURED, _EXTRA_PER_NOISE_MEASURED = 0.05, 4.0
 """A fit to images invents surface where nobody looked, the more the noisier it is; what was measured is there."""
 _LEAST_COARSE = 0.68
 _ROUGH, _ROUGH_SCORE, _SCORE_PER_INCOHERENCE = 0.022, 0.5, 12.0
@@ -51,18 +52,27 @@ class _Criterion:
         return self.slack >= 0.0
 
 
-def decide(evidence: Evidence, index: int, rivals: int, options: RobustOptions, incoherence: float = 0.0) -> Decision:
-    """What is to be said of one pose that has ``rivals`` equals. incoherence: of the scene's normals.
+def decide(
+    evidence: Evidence,
+    index: int,
+    rivals: int,
+    options: RobustOptions,
+    incoherence: float = 0.0,
+    extra: float = 0.0,
+) -> Decision:
+    """What is to be said of one pose that has ``rivals`` equals. incoherence: of the scene's normals · extra: share of
+    the surface near the object that is no part of it, see :mod:`regnf_core.robust.extra_surface`.
 
     Written so that a number that is none can only lead to a rejection.
     """
-    always = list(_always(evidence, index, options))
+    hidden = _Criterion("TOO_LITTLE_SURFACE", options.max_hidden_share - float(evidence.hidden[index]))
     accurate = list(_of_accurate_fields(evidence, index, options))
+    joined = _extra(evidence, index, extra)
     agreement = max(_least(accurate), _least(_of_rough_fields(evidence, index, options, incoherence)))
-    margin = min(_least(always), agreement)
-    missed = [one for one in (*always, *accurate) if not one.met]
+    margin = min(_least([hidden, joined]), agreement)
     if not margin >= 0.0:
-        return Decision("rejected", missed[0].reason, margin)
+        asked = [hidden, accurate[0], joined, *accurate[1:]] if not agreement >= 0.0 else [hidden, joined]
+        return Decision("rejected", next(one.reason for one in asked if not one.met), margin)
     if rivals:
         return Decision("ambiguous", "SEVERAL_POSES_AGREE", margin)
     return Decision("registered", "SURFACES_AGREE", margin)
@@ -73,12 +83,6 @@ def _least(criteria: Iterable[_Criterion]) -> float:
     return min((-1.0 if math.isnan(one.slack) else one.slack for one in criteria), default=-1.0)
 
 
-def _always(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Criterion]:
-    yield _Criterion("TOO_LITTLE_SURFACE", options.max_hidden_share - float(evidence.hidden[index]))
-    if evidence.partial:
-        yield _extra(evidence, index)
-
-
 def _of_accurate_fields(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Criterion]:
     noise = float(evidence.residual_rms[index])
     violations = min(options.max_free_space_violations, _CLEAN_VIOLATIONS + _VIOLATIONS_PER_NOISE * noise)
@@ -86,7 +90,6 @@ def _of_accurate_fields(evidence: Evidence, index: int, options: RobustOptions) 
     yield _Criterion("FREE_SPACE_VIOLATED", violations - float(evidence.violations[index]))
     yield _Criterion("LOW_OVERLAP", float(evidence.share_object[index]) - options.min_inlier_share)
     yield _Criterion("LOW_OVERLAP", float(evidence.share_scene[index]) - of_scene)
-    yield _extra(evidence, index)
     yield _Criterion("SCENE_UNEXPLAINED", float(evidence.share_explained[index]) - options.min_explained_share)
 
 
@@ -103,8 +106,9 @@ def _of_rough_fields(
     yield _Criterion("SCENE_UNEXPLAINED", float(evidence.explained_coarsely[index]) - options.min_explained_share)
 
 
-def _extra(evidence: Evidence, index: int) -> _Criterion:
+def _extra(evidence: Evidence, index: int, extra: float) -> _Criterion:
     """Surface near the object that is no part of it: more may be where it may never have been seen."""
-    per_noise = _EXTRA_PER_NOISE_SEEN if evidence.partial else _EXTRA_PER_NOISE
-    most = _EXTRA + per_noise * float(evidence.residual_rms[index])
-    return _Criterion("SURFACE_UNEXPLAINED", most - float(evidence.extra[index]))
+    noise = float(evidence.residual_rms[index])
+    measured = _EXTRA_MEASURED + _EXTRA_PER_NOISE_MEASURED * noise
+    most = measured if evidence.partial else _EXTRA + _EXTRA_PER_NOISE * noise
+    return _Criterion("SURFACE_UNEXPLAINED", most - extra)
