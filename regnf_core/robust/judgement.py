@@ -22,7 +22,8 @@ _CLEAN_SHARE, _SHARE_PER_NOISE = 0.89, 45.0
 _EXTRA, _EXTRA_PER_NOISE = 0.03, 20.0
 _EXTRA_MEASURED, _EXTRA_PER_NOISE_MEASURED = 0.05, 4.0
 """A fit to images invents surface where nobody looked, the more the noisier it is; what was measured is there."""
-_LEAST_COARSE = 0.68
+_LEAST_COARSE, _LEAST_COARSE_OF_PARTS = 0.68, 0.72
+_LEAST_COARSE_OF_MEASURED, _MOST_HIDDEN, _MOST_OFFSET = 0.78, 0.6, 0.015
 _ROUGH, _ROUGH_SCORE, _SCORE_PER_INCOHERENCE = 0.022, 0.5, 12.0
 """From so incoherent normals on a field counts as rough, and the score may be as bad as they explain."""
 _LONGEST_TAIL = 5.5
@@ -68,7 +69,8 @@ def decide(
     hidden = _Criterion("TOO_LITTLE_SURFACE", options.max_hidden_share - float(evidence.hidden[index]))
     accurate = list(_of_accurate_fields(evidence, index, options))
     joined = _extra(evidence, index, extra)
-    agreement = max(_least(accurate), _least(_of_rough_fields(evidence, index, options, incoherence)))
+    rough = _least(_of_rough_fields(evidence, index, options, incoherence))
+    agreement = max(_least(accurate), rough, _least(_of_measured_surface(evidence, index, options)))
     margin = min(_least([hidden, joined]), agreement)
     if not margin >= 0.0:
         asked = [hidden, accurate[0], joined, *accurate[1:]] if not agreement >= 0.0 else [hidden, joined]
@@ -102,7 +104,22 @@ def _of_rough_fields(
     score = _ROUGH_SCORE + _SCORE_PER_INCOHERENCE * (incoherence - _ROUGH)
     yield _Criterion("LOW_OVERLAP", score - float(evidence.scores[index]))
     yield _Criterion("LOW_OVERLAP", 1.0 - float(evidence.tail[index]) / _LONGEST_TAIL)
-    yield _Criterion("LOW_OVERLAP", float(evidence.coarse[index]) - _LEAST_COARSE)
+    least = _LEAST_COARSE_OF_PARTS if evidence.partial else _LEAST_COARSE
+    yield _Criterion("LOW_OVERLAP", float(evidence.coarse[index]) - least)
+    if evidence.partial:
+        yield _Criterion("TOO_LITTLE_SURFACE", _MOST_HIDDEN - float(evidence.hidden[index]))
+    yield _Criterion("SCENE_UNEXPLAINED", float(evidence.explained_coarsely[index]) - options.min_explained_share)
+
+
+def _of_measured_surface(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Criterion]:
+    """Where what nobody saw has been set aside, both shapes agree at twice the distance, however smooth the field; on
+    enough of the object, and without an offset that makes one thing another."""
+    if not evidence.partial:
+        return
+    yield _Criterion("TOO_LITTLE_SURFACE", _MOST_HIDDEN - float(evidence.hidden[index]))
+    yield _Criterion("LOW_OVERLAP", 1.0 - float(evidence.tail[index]) / _LONGEST_TAIL)
+    yield _Criterion("LOW_OVERLAP", float(evidence.coarse[index]) - _LEAST_COARSE_OF_MEASURED)
+    yield _Criterion("LOW_OVERLAP", _MOST_OFFSET - abs(float(evidence.offsets[index])))
     yield _Criterion("SCENE_UNEXPLAINED", float(evidence.explained_coarsely[index]) - options.min_explained_share)
 
 

@@ -113,6 +113,18 @@ def test_joined_surface_is_not_forgiven_for_roughness() -> None:
     assert (decision.verdict, decision.reason) == ("rejected", "SURFACE_UNEXPLAINED")
 
 
+def test_measured_surface_may_agree_at_twice_the_distance_however_smooth() -> None:
+    found = judged([0.02] * 10, [0.02] * 10)
+    assert decide(found, 0, 0, RobustOptions()).verdict == "rejected"
+    seen = replace(found, partial=True)
+    assert decide(seen, 0, 0, RobustOptions()).verdict == "registered"
+    thick = replace(seen, offsets=torch.tensor([0.016]))
+    assert decide(thick, 0, 0, RobustOptions()).verdict == "rejected"
+    little = replace(judged([0.02] * 10, [0.02] * 3 + [-0.1] * 7), partial=True)
+    assert decide(little, 0, 0, RobustOptions()).verdict == "rejected"
+    assert decide(little, 0, 0, RobustOptions(), incoherence=ROUGH).verdict == "rejected"
+
+
 @given(
     forth=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
     back=st.lists(st.floats(-0.2, 0.2), min_size=4, max_size=12),
