@@ -63,7 +63,7 @@ def nearest_equal(estimate: Sim3, truth: Sim3, points: torch.Tensor, symmetries:
     """Of the truth and its equals by symmetry the one with the least MSSD, and that MSSD, object units."""
     largest = surface_displacement(estimate, truth, points, symmetries).amax(-1)
     best, S = int(largest.argmin()), symmetries.transforms()
-    return float(largest[best]), Sim3(S.scale[best], S.rotation[best], S.translation[best]) @ truth
+    return float(largest[best]), Sim3(S.scale[best], S.rotation[best], S.translation[best]).inverse() @ truth
 
 
 def errors_between(estimate: Sim3, truth: Sim3) -> Errors:
