@@ -57,5 +57,7 @@ class ObservationGrid:
 
     def unpack(self, words: NDArray[np.int32]) -> NDArray[np.uint8]:
         """States (X, Y, Z) from what :meth:`pack` made. The fourth state that two bits have is read as SURFACE."""
-        bits = words.view(np.uint32)[:, None] >> (_BITS * np.arange(_PER_WORD, dtype=np.uint32)) & 3
-        return np.minimum(bits.astype(np.uint8).ravel()[: self.voxels], SURFACE).reshape(self.counts)
+        octets = np.ascontiguousarray(words, "<i4").view(np.uint8)  # four voxels each: no copy wider than the states
+        states: NDArray[np.uint8] = (octets[:, None] >> np.arange(0, 8, _BITS, dtype=np.uint8)) & np.uint8(3)
+        grid: NDArray[np.uint8] = np.minimum(states.ravel()[: self.voxels], np.uint8(SURFACE)).reshape(self.counts)
+        return grid
