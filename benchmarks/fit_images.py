@@ -27,15 +27,15 @@ from scipy.spatial import cKDTree
 
 from benchmarks.fit_pieces import Floats, Piece, distances_to, measure_pieces, moved
 from benchmarks.make_image_fields import OBJECT_OPTIONS, ROOM_OPTIONS
-from regnf_core.datasets.composing import room_scene
-from regnf_core.datasets.layouts import read_layout
-from regnf_core.datasets.mesh_scene import MeshScene, load_thing
-from regnf_core.datasets.posed_images import PosedImages
-from regnf_core.datasets.rendering import camera_rays
-from regnf_core.datasets.sdfstudio import load_dataset
 from regnf_core.fields.safe_format import open_field
-from regnf_core.isosurface import extract_surface
-from regnf_core.reconstruction.fit import FitFiles, reconstruct
+from regnf_core.surface.isosurface import extract_surface
+from regnf_data.composing import room_scene
+from regnf_data.layouts import read_layout
+from regnf_data.mesh_scene import MeshScene, load_thing
+from regnf_data.posed_images import PosedImages
+from regnf_data.rendering import camera_rays
+from regnf_data.sdfstudio import load_dataset
+from regnf_fit.images.fit import FitFiles, reconstruct
 
 _POINTS = 30_000
 _RESOLUTION = 256

@@ -15,13 +15,13 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from regnf_core.box import OrientedBox
-from regnf_core.datasets.mesh_scene import MeshScene
-from regnf_core.datasets.posed_images import PosedImages
 from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.neus_facto import NeusFactoField
-from regnf_core.isosurface import extract_surface
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.surface.isosurface import extract_surface
+from regnf_data.mesh_scene import MeshScene
+from regnf_data.posed_images import PosedImages
 
 Floats = NDArray[np.float64]
 

@@ -30,7 +30,7 @@ import httpx
 
 from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_small_pair
 from regnf_cli.remote import RemoteService
-from service.paging import encode_token
+from regnf_service.http.paging import encode_token
 from tests.contract.live import Live, eventually, live_service
 from tests.worker.bench import children_of
 

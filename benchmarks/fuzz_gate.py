@@ -27,7 +27,7 @@ from types import TracebackType
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
+from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 from tests.core.importing.fuzzing.cases import STAGES
 from tests.core.importing.fuzzing.seeds import make_seeds
 from tests.core.importing.fuzzing.worker import CASE_S, MEMORY_BYTES

@@ -19,14 +19,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from benchmarks.robust.cases import Pair, load_pairs
 from regnf_core import RegistrationResult, Sim3, register
-from regnf_core.diagnostics.preview import OBJECT_COLOUR, SCENE_COLOUR
-from regnf_core.fields.kinds.observation_grid import SURFACE
 from regnf_core.fields.observation import observation_of
-from regnf_core.metrics import errors_against_truth
-from regnf_core.nearest import gaps
-from regnf_core.pictures.splats import Surfels, render, view_from
-from regnf_core.robust.frame import WorkingFrame
+from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.nearest_neighbors import gaps
 from regnf_core.robust.samples import sample_scene_surface
+from regnf_core.robust.working_frame import WorkingFrame
+from regnf_core.schema.kinds.observation_grid import SURFACE
+from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR
+from regnf_core.viewing.splats import Surfels, render, view_from
 
 Floats = NDArray[np.float64]
 

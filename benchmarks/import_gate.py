@@ -22,8 +22,8 @@ from os import cpu_count
 from pathlib import Path
 from statistics import median
 
-from regnf_core.importing.gate import FIELD_NAME, import_field
-from regnf_core.importing.report import ImportReport
+from regnf_core.importing.gate.gate import FIELD_NAME, import_field
+from regnf_core.importing.gate.report import ImportReport
 from tests.contract.live import Live, live_service
 from tests.core.importing.checkpoints import write_full_size_checkpoint
 

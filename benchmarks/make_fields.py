@@ -21,9 +21,9 @@ import numpy as np
 
 from benchmarks.simple_meshes import box, together
 from regnf_core.fields.composite import BoxField, UnionField
-from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fitting.options import FitOptions
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_fit.mesh.options import FitOptions
 from scripts import make_demo_fields as demo
 
 UNITS_PER_METRE = {

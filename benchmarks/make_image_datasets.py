@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.make_fields import UNITS_PER_METRE
-from regnf_core.datasets.composing import RenderOptions, render_object, render_room
-from regnf_core.datasets.layouts import Layout, read_layout
-from regnf_core.datasets.posed_images import PosedImages
-from regnf_core.datasets.sdfstudio import write_dataset
+from regnf_data.composing import RenderOptions, render_object, render_room
+from regnf_data.layouts import Layout, read_layout
+from regnf_data.posed_images import PosedImages
+from regnf_data.sdfstudio import write_dataset
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")
 SINGLE_VIEW_ROOM = "ac-room"

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.make_fields import UNITS_PER_METRE, surface
-from regnf_core.datasets.sdfstudio import load_dataset
-from regnf_core.fields.hash_grid_config import HashGridConfig
-from regnf_core.reconstruction.fit import FitFiles, reconstruct
-from regnf_core.reconstruction.options import ReconstructionOptions
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_data.sdfstudio import load_dataset
+from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.options import ReconstructionOptions
 from scripts import make_demo_fields as demo
 
 ROOMS = ("ac-room", "atbl-room", "mix-room")

@@ -11,7 +11,7 @@ import sys
 from regnf_cli import api_process
 from regnf_cli.listening import open_socket
 from regnf_cli.start_errors import StartError
-from service.settings import Settings
+from regnf_state.settings import Settings
 
 
 def main() -> int:

@@ -43,4 +43,4 @@ WORKDIR /var/lib/regnf
 VOLUME ["/var/lib/regnf"]
 HEALTHCHECK --interval=30s --timeout=10s --start-period=30s --retries=3 \
     CMD ["python", "/opt/regnf/worker_health.py"]
-CMD ["python", "-m", "worker.main"]
+CMD ["python", "-m", "regnf_worker.main"]

@@ -13,8 +13,8 @@ from typing import Any
 from redis import Redis, RedisError
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
-from service.queue import QUEUE_NAME
-from service.settings import Settings
+from regnf_state.queue import QUEUE_NAME
+from regnf_state.settings import Settings
 
 _TIMEOUT_S = 5.0
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from regnf_core import OrientedBox, RegistrationOptions, Sim3, open_field, register
-from regnf_core.diagnostics import result_document, write_artifacts
+from regnf_core.viewing import result_document, write_artifacts
 
 data = Path(__file__).parent / "data"
 output = Path(sys.argv[1])

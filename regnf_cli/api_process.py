@@ -7,10 +7,10 @@ import sys
 
 import uvicorn
 
-from service.logs import configure_logging
-from service.settings import Settings
+from regnf_state.logs import configure_logging
+from regnf_state.settings import Settings
 
-_APPLICATION = "service.app:create_app"
+_APPLICATION = "regnf_service.app:create_app"
 _DRAIN_S = 5
 """How long open requests may go on once the process is told to stop."""
 

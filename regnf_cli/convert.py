@@ -60,7 +60,7 @@ def convert(
 
 
 def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None, images: Path | None) -> None:
-    from regnf_core.importing.gate import FIELD_NAME, ImportLimits, import_field
+    from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as folder:
         with err.status("importing"):
@@ -75,16 +75,16 @@ def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None, imag
 
 
 def _keep_what_was_seen(field: Path, images: Path) -> None:
-    from regnf_core.datasets.sdfstudio import load_dataset
-    from regnf_core.reconstruction.observing import attach_observation
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.observing import attach_observation
 
     attach_observation(field, load_dataset(images))
 
 
 def _evaluated(field: Path, output: Path, resolution: int, given: dict[str, Any] | None) -> None:
     with err.status("opening"):
-        from regnf_core.exporting import write_grid, write_mesh
         from regnf_core.loading import load_field
+        from regnf_core.surface.exporting import write_grid, write_mesh
 
         source = load_field(field, given)
     columns = (

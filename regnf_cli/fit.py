@@ -105,8 +105,8 @@ def _fit_mesh(
     import numpy as np
 
     from regnf_core.fields.mesh import MeshField
-    from regnf_core.fitting.fit import fit_field
-    from regnf_core.fitting.options import FitOptions
+    from regnf_fit.mesh.fit import fit_field
+    from regnf_fit.mesh.options import FitOptions
 
     options = FitOptions(**settings)
     options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))

@@ -21,9 +21,9 @@ def fit_images(
     ``sdfstudio``, a path, or None each; ``pictures``, whether to draw · rest: what
     ``reconstruct`` takes beside.
     """
-    from regnf_core.datasets.sdfstudio import load_dataset
-    from regnf_core.reconstruction.fit import FitFiles, reconstruct
-    from regnf_core.reconstruction.options import ReconstructionOptions
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.fit import FitFiles, reconstruct
+    from regnf_fit.images.options import ReconstructionOptions
 
     table_log2 = settings.pop("table_log2")
     options = ReconstructionOptions(**settings)

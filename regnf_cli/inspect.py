@@ -32,8 +32,8 @@ def inspect(
     require("engine")
     import tempfile
 
-    from regnf_core.importing.gate import ImportLimits, import_field
-    from regnf_core.importing.picture import PICTURE_NAME
+    from regnf_core.importing.gate.gate import ImportLimits, import_field
+    from regnf_core.importing.gate.picture import PICTURE_NAME
 
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
         raise InvalidOptionsError(f"a picture ends in .png and needs a folder that exists: {picture}")

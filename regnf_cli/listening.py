@@ -6,10 +6,10 @@ import ipaddress
 import socket
 
 from regnf_cli.start_errors import StartError
-from service.settings import Settings, is_loopback
-from service.tokens import TokensError, read_callers
-from service.webhooks.signing import read_secrets
-from service.webhooks.targets import AllowList
+from regnf_service.http.tokens import TokensError, read_callers
+from regnf_service.webhooks.signing import read_secrets
+from regnf_service.webhooks.targets import AllowList
+from regnf_state.settings import Settings, is_loopback
 
 _BACKLOG = 2048
 

@@ -18,7 +18,7 @@ def prepare(output: Path | None) -> None:
 
 def write_into(output: Path | None, result: RegistrationResult, **said: Any) -> None:
     """Write every artifact, each whole or not at all; ``said`` goes on to ``write_artifacts``."""
-    from regnf_core.diagnostics import write_artifacts
+    from regnf_core.viewing import write_artifacts
 
     if output is None:
         return

@@ -82,10 +82,10 @@ def register(
 
 
 def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: Path | None) -> dict[str, Any]:
-    from regnf_core.diagnostics import result_document
+    from regnf_core.geometry.sim3 import Sim3
     from regnf_core.loading import load_field
     from regnf_core.registration import register as run
-    from regnf_core.sim3 import Sim3
+    from regnf_core.viewing import result_document
 
     options = RegistrationOptions.from_dict(request["options"])
     box = parse_detection(request["detection"])

@@ -15,8 +15,8 @@ from regnf_cli.extras import require
 from regnf_core.errors import InvalidOptionsError
 
 if TYPE_CHECKING:
-    from regnf_core.datasets.composing import RenderOptions
-    from regnf_core.datasets.posed_images import PosedImages
+    from regnf_data.composing import RenderOptions
+    from regnf_data.posed_images import PosedImages
 
 _LARGEST_EDGE = 4096
 
@@ -58,9 +58,9 @@ def render_dataset(
     Example: **regnf render-dataset chair.glb chair-images**
     """
     require("engine")
-    from regnf_core.datasets.composing import RenderOptions
-    from regnf_core.datasets.sdfstudio import check_target, write_dataset
-    from regnf_core.datasets.sensor import DepthSensor
+    from regnf_data.composing import RenderOptions
+    from regnf_data.sdfstudio import check_target, write_dataset
+    from regnf_data.sensor import DepthSensor
 
     layout = source.suffix.lower() == ".json"
     _check(layout, meshes, trajectory, instance, units_per_metre)
@@ -95,8 +95,8 @@ def _check(
 def _rendered(
     source: Path, meshes: Path | None, instance: str | None, units_per_metre: float | None, options: RenderOptions
 ) -> PosedImages:
-    from regnf_core.datasets.composing import render_object, render_room
-    from regnf_core.datasets.layouts import read_layout
+    from regnf_data.composing import render_object, render_room
+    from regnf_data.layouts import read_layout
 
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=err) as bar:

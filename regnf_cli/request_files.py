@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
+from regnf_core.geometry.similarity import similarity_fault
 from regnf_core.options import Preset, RegistrationOptions
-from regnf_core.similarity import similarity_fault
 
 if TYPE_CHECKING:
-    from regnf_core.box import OrientedBox
+    from regnf_core.geometry.box import OrientedBox
 
 Rows = list[list[float]]
 
@@ -56,7 +56,7 @@ def read_transform(path: Path, what: str) -> Rows:
 
 def parse_detection(values: dict[str, Any]) -> OrientedBox:
     """A detection's JSON as a box. Raises InvalidDetectionError for what is missing, unknown or malformed."""
-    from regnf_core.box import OrientedBox
+    from regnf_core.geometry.box import OrientedBox
 
     known = {"min", "max", "centre", "size", "rotation_quaternion_xyzw", "label", "score"}
     if unknown := sorted(set(values) - known):

@@ -15,7 +15,7 @@ from regnf_cli.output import prepare, write_into
 from regnf_cli.report import exit_code, show_ranking, show_result
 from regnf_cli.request_files import parse_detection, read_object, read_options
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.importing.sniff import HEAD_BYTES, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.options import RegistrationOptions
 
 _FILE: dict[str, Any] = {"exists": True, "dir_okay": False}
@@ -95,9 +95,9 @@ def _looks_like_a_field(path: Path) -> bool:
 
 def _search_here(scene: Path, objects: list[Path], request: dict[str, Any], output: Path | None) -> dict[str, Any]:
     from regnf_cli.object_models import object_model
-    from regnf_core.diagnostics import ranking_document, result_document
     from regnf_core.library import LibraryObject, search_library
     from regnf_core.loading import load_field
+    from regnf_core.viewing import ranking_document, result_document
 
     options = RegistrationOptions.from_dict(request["options"])
     box = parse_detection(request["detection"])

@@ -27,7 +27,7 @@ def serve(
     require("service")
     from regnf_cli.settings import read_settings
     from regnf_cli.supervisor import Supervisor
-    from service.logs import configure_logging
+    from regnf_state.logs import configure_logging
 
     settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
     if settings.workers:

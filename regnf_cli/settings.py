@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from regnf_core.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from service.settings import Settings
+    from regnf_state.settings import Settings
 
 
 def read_settings(**given: Any) -> Settings:
@@ -18,7 +18,7 @@ def read_settings(**given: Any) -> Settings:
     from pydantic import ValidationError
     from pydantic_settings import SettingsError
 
-    from service.settings import Settings
+    from regnf_state.settings import Settings
 
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})

@@ -20,7 +20,7 @@ from regnf_cli.embedded_redis import answers, server_command
 from regnf_cli.listening import address_of, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
-from service.settings import SECRETS, Settings
+from regnf_state.settings import SECRETS, Settings
 
 _LOOK_EVERY_S = 0.2
 _START_DEADLINE_S = 60.0
@@ -95,7 +95,7 @@ class Supervisor:
         descriptor = listener.fileno()
         api = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
         self._api = Child("api", api, environment, lifeline, passed=[descriptor])
-        worker = [sys.executable, "-m", "worker.main"]
+        worker = [sys.executable, "-m", "regnf_worker.main"]
         self._workers = [
             Child(f"worker {number}", worker, _without_secrets(environment), lifeline)
             for number in range(1, self._settings.workers + 1)

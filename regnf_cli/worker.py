@@ -28,9 +28,9 @@ def worker(
 
     from regnf_cli.settings import read_settings
     from regnf_cli.start_errors import StartError
-    from worker.context import NoRedisError
-    from worker.main import run_worker
-    from worker.preload import PreloadError
+    from regnf_worker.context import NoRedisError
+    from regnf_worker.main import run_worker
+    from regnf_worker.preload import PreloadError
 
     if redis_url is not None:
         os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too

@@ -14,25 +14,25 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from regnf_core.version import __version__
+
 if TYPE_CHECKING:
-    from regnf_core.box import OrientedBox
     from regnf_core.errors import RegnfError
     from regnf_core.fields.base import SdfField
     from regnf_core.fields.safe_format import open_field
+    from regnf_core.geometry.box import OrientedBox
+    from regnf_core.geometry.sim3 import Sim3
     from regnf_core.options import RegistrationOptions
     from regnf_core.registration import register
     from regnf_core.result import RegistrationResult
-    from regnf_core.sim3 import Sim3
-
-__version__ = "0.1.0"
 
 _HOMES = {
-    "OrientedBox": "regnf_core.box",
+    "OrientedBox": "regnf_core.geometry.box",
     "RegistrationOptions": "regnf_core.options",
     "RegistrationResult": "regnf_core.result",
     "RegnfError": "regnf_core.errors",
     "SdfField": "regnf_core.fields.base",
-    "Sim3": "regnf_core.sim3",
+    "Sim3": "regnf_core.geometry.sim3",
     "open_field": "regnf_core.fields.safe_format",
     "register": "regnf_core.registration",
 }

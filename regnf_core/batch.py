@@ -10,16 +10,16 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TypeVar
 
-from regnf_core.box import OrientedBox
-from regnf_core.clouds import with_clouds
 from regnf_core.errors import CancelledError, InvalidInputError, RegnfError
 from regnf_core.fields.base import SdfField
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Phase, ProgressCallback, RegistrationResult
-from regnf_core.robust.object_model import ObjectModel, model_object
+from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.register import register_robust
-from regnf_core.robust.scene_view import SceneView, view_scene
+from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import Run
+from regnf_core.surface.clouds import with_clouds
 
 _T = TypeVar("_T")
 

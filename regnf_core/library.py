@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from regnf_core.box import OrientedBox
-from regnf_core.clouds import with_clouds
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import ProgressCallback, RegistrationResult, Verdict
 from regnf_core.robust.library_search import (
@@ -26,13 +26,13 @@ from regnf_core.robust.library_search import (
     refine_contender,
     still_in,
 )
-from regnf_core.robust.model_file import read_object_model, write_object_model
-from regnf_core.robust.object_model import ObjectModel, model_object
+from regnf_core.robust.model.model_file import read_object_model, write_object_model
+from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.register import register_robust
 from regnf_core.robust.report import result_of
-from regnf_core.robust.scene_view import SceneView, view_scene
+from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import STARTS, Run
-from regnf_core.sim3 import Sim3
+from regnf_core.surface.clouds import with_clouds
 
 Stage = Literal["refined", "coarse", "signature"]
 

@@ -55,7 +55,7 @@ def default_cache_dir() -> Path:
 
 
 def _imported(path: Path, description: dict[str, Any] | None, cache_dir: Path) -> Path:
-    from regnf_core.importing.gate import ImportLimits, import_field
+    from regnf_core.importing.gate.gate import ImportLimits, import_field
 
     key = hashlib.sha256(repr((__version__, sorted((description or {}).items()))).encode())
     with path.open("rb") as file:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from regnf_core.box import OrientedBox
-from regnf_core.clouds import with_clouds
 from regnf_core.fields.base import SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.paper import register_paper
+from regnf_core.paper.pipeline import register_paper
 from regnf_core.result import ProgressCallback, RegistrationResult
-from regnf_core.robust.object_model import ObjectModel
+from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.register import register_robust
 from regnf_core.run import Run
-from regnf_core.sim3 import Sim3
+from regnf_core.surface.clouds import with_clouds
 
 
 def register(
@@ -29,7 +29,7 @@ def register(
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
     raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, anything else
-    is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.object_model.model_object` made of
+    is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.model.object_model.model_object` made of
     ``obj`` earlier. Without ``clouds`` the result has the engine's own samples alone, and neither residuals nor
     surroundings: for who draws no pictures.
     Deterministic for a seed, on one machine and with the same number of threads.

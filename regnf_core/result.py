@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from regnf_core.sim3 import Sim3
+from regnf_core.geometry.sim3 import Sim3
 
 Verdict = Literal["registered", "ambiguous", "rejected"]
 Phase = Literal["loading", "sampling", "initialising", "optimising", "verifying", "exporting"]

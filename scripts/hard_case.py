@@ -20,15 +20,15 @@ from PIL import Image, ImageDraw, ImageFont
 from benchmarks.robust.depth_camera import looking
 from benchmarks.robust.one_view_field import DepthImage, OneViewField, directions
 from regnf_core import OrientedBox, RegistrationResult, Sim3, open_field, register
-from regnf_core.cameras import Rays
-from regnf_core.diagnostics.preview import OBJECT_COLOUR, SCENE_COLOUR
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.transformed import TransformedField
-from regnf_core.metrics import errors_against_truth
-from regnf_core.nearest import gaps
-from regnf_core.pictures.splats import Surfels, render, view_from
-from regnf_core.tracing import clip_to_region, first_hits
+from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.nearest_neighbors import gaps
+from regnf_core.surface.cameras import Rays
+from regnf_core.surface.sphere_tracing import clip_to_region, first_hits
+from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR
+from regnf_core.viewing.splats import Surfels, render, view_from
 
 ROOT = Path(__file__).resolve().parents[1]
 ARMCHAIR = ROOT / "examples" / "data" / "armchair.safetensors"

@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
-from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fitting.fit import fit_field
-from regnf_core.fitting.options import FitOptions
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_fit.mesh.fit import fit_field
+from regnf_fit.mesh.options import FitOptions
 
 OBJECT_UNITS_PER_METRE = 0.625
 """1.25 object units a scene unit: the scale that the registration has to find."""

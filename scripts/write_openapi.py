@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from service.app import create_app
-from service.contract import contract_yaml
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.settings import Settings
+from regnf_service.app import create_app
+from regnf_service.http.contract import contract_yaml
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.settings import Settings
 
 TARGET = Path(__file__).resolve().parents[1] / "openapi.yaml"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.peers.interface import MissingPackageError, Peer, PeerCase, PeerResult
 from regnf_core import RegnfError
-from regnf_core.metrics import errors_against_truth
+from regnf_core.geometry.metrics import errors_against_truth
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""

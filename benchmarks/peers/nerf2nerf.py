@@ -37,9 +37,9 @@ from benchmarks.peers.disturbance import keypoints, rigid_fit
 from benchmarks.peers.interface import PeerCase, PeerResult
 from regnf_core import SdfField, Sim3
 from regnf_core.fields.base import CountingField, differentiable_signed_distance
-from regnf_core.kernel import AdaptiveKernel
-from regnf_core.sampling import thin_out
-from regnf_core.sim3_tangent import exp_parts
+from regnf_core.geometry.sim3_tangent import exp_parts
+from regnf_core.paper.kernel import AdaptiveKernel
+from regnf_core.paper.sampling import thin_out
 
 STEPS = 10_000
 _KEYPOINTS, _KEYPOINT_NOISE = 5, 0.01  # noise in diameters

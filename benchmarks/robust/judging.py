@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from regnf_core import RegistrationResult, RegnfError, Sim3
-from regnf_core.metrics import errors_against_truth
-from regnf_core.symmetry import Symmetries
+from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.symmetry import Symmetries
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""

@@ -15,8 +15,8 @@ from pathlib import Path
 import httpx
 from redis import Redis
 
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import RqJobQueue
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import children_of, eventually
 
@@ -111,7 +111,7 @@ class House:
                 process.wait()
 
     def _worker(self, index: int) -> subprocess.Popen[bytes]:
-        return self._launch(f"worker-{index}", ["worker.main"])
+        return self._launch(f"worker-{index}", ["regnf_worker.main"])
 
     def _launch(self, name: str, module: list[str]) -> subprocess.Popen[bytes]:
         plain = {key: value for key, value in os.environ.items() if not key.startswith("REGNF_")}

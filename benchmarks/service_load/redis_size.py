@@ -18,8 +18,8 @@ from redis import Redis
 
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
-from service.redis_client import connect
-from service.redis_records import RedisRecordStore
+from regnf_state.redis.client import connect
+from regnf_state.redis.jobs import RedisRecordStore
 from tests.contract.world import BOX, field_bytes
 
 _PHASES = ("loading", "sampling", "initialising", "optimising", "verifying", "exporting")

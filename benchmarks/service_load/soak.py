@@ -29,7 +29,7 @@ from benchmarks.service_load.clients import Client, Expected
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
-from service.redis_client import connect
+from regnf_state.redis.client import connect
 
 _SAMPLE_S = 5.0
 _MOST_GROWTH = 0.05

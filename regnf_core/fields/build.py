@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from regnf_core.fields.adjusted import AdjustedField
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.kinds.kind import FieldDescription
-from regnf_core.fields.kinds.observation_grid import OBSERVATION
 from regnf_core.fields.observation import ObservedField, stored_observation
+from regnf_core.fields.scaled import AdjustedField
+from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.kinds.observation_grid import OBSERVATION
 
 
 def build_field(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:

@@ -11,9 +11,9 @@ from torch import Tensor
 from regnf_core.fields.box_extension import BoxExtension
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
-from regnf_core.fields.kinds.feature_volumes import FeatureVolumesDescription, count_volumes
-from regnf_core.fields.kinds.mlp import count_layers
 from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
+from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription, count_volumes
+from regnf_core.schema.kinds.mlp import count_layers
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from regnf_core.fields.box_extension import BoxExtension
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.kinds.grid_mlp import GridMlpDescription
-from regnf_core.fields.kinds.mlp import count_layers
+from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
+from regnf_core.schema.kinds.mlp import count_layers
 
 
 @dataclass(frozen=True)

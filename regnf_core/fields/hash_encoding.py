@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 _PRIMES = (1, 2654435761, 805459861)
 _UINT32 = 0xFFFFFFFF

@@ -11,8 +11,8 @@ from torch import Tensor
 from regnf_core.fields.cell_index import CellIndex
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
-from regnf_core.fields.kinds.mlp import count_layers
-from regnf_core.fields.kinds.neural_points import NeuralPointsDescription
+from regnf_core.schema.kinds.mlp import count_layers
+from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
 
 _PRIMES = (73856093, 19349669, 83492791)
 _EPSILON = 1e-15

@@ -15,8 +15,8 @@ from regnf_core.fields.contraction import contract_linf, pull_back_linf
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.kinds.neus_facto import SKIP_LAYER, Contraction, NeusFactoDescription
 from regnf_core.fields.positional_encoding import PositionalEncoding
+from regnf_core.schema.kinds.neus_facto import SKIP_LAYER, Contraction, NeusFactoDescription
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.description import description_to_dict, parse_description
-from regnf_core.fields.kinds.kind import FieldDescription
-from regnf_core.fields.kinds.tensor_check import TensorSpec
+from regnf_core.schema.description import description_to_dict, parse_description
+from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.tensor_check import TensorSpec
 
 if TYPE_CHECKING:
     import torch

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation, observation_of
-from regnf_core.sim3 import Sim3
+from regnf_core.geometry.sim3 import Sim3
 
 
 class TransformedField:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from regnf_core.fields.cell_index import CellIndex
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.kinds.voxel_blocks import VoxelBlocksDescription
 from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
+from regnf_core.schema.kinds.voxel_blocks import VoxelBlocksDescription
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from regnf_core.fields.box_extension import BoxExtension
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.kinds.voxel_grid import VoxelGridDescription
 from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
+from regnf_core.schema.kinds.voxel_grid import VoxelGridDescription
 
 
 @dataclass(frozen=True)

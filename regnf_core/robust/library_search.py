@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 import torch
 
 from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.robust.conclusion import Conclusion, conclude
-from regnf_core.robust.engine import Outcome, Problem, find_candidates, pose_problem, refine_candidates
-from regnf_core.robust.object_model import ObjectModel
-from regnf_core.robust.scene_view import SceneView
-from regnf_core.robust.search import Round
-from regnf_core.robust.signature import signature
-from regnf_core.sim3 import Sim3
+from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.robust.model.signature import signature
+from regnf_core.robust.pipeline import Outcome, Problem, find_candidates, pose_problem, refine_candidates
+from regnf_core.robust.scene.scene_view import SceneView
+from regnf_core.robust.search.search import Round
+from regnf_core.robust.verdict.conclusion import Conclusion, conclude
 
 _SHORTLIST = 12
 """Objects searched coarsely. With 64 objects the right one was never farther down than 7th by its signature."""

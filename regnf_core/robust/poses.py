@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from regnf_core.sim3 import Sim3
-from regnf_core.sim3_tangent import matrix_from_quaternion
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.sim3_tangent import matrix_from_quaternion
 
 
 def select(T: Sim3, index: Tensor) -> Sim3:

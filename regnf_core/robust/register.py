@@ -7,18 +7,18 @@ from itertools import count
 
 import torch
 
-from regnf_core.box import OrientedBox
 from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import RegistrationResult
-from regnf_core.robust.conclusion import Conclusion, conclude
-from regnf_core.robust.engine import ITERATIONS, Outcome, Problem, find_candidates, pose_problem, refine_candidates
-from regnf_core.robust.features import feature_seeds
-from regnf_core.robust.object_model import ObjectModel, model_object
+from regnf_core.robust.model.object_model import ObjectModel, model_object
+from regnf_core.robust.pipeline import ITERATIONS, Outcome, Problem, find_candidates, pose_problem, refine_candidates
 from regnf_core.robust.report import result_of
-from regnf_core.robust.scene_view import SceneView, view_scene
+from regnf_core.robust.scene.scene_view import SceneView, view_scene
+from regnf_core.robust.search.features import feature_seeds
+from regnf_core.robust.verdict.conclusion import Conclusion, conclude
 from regnf_core.run import STARTS, Run
-from regnf_core.sim3 import Sim3
 
 
 def register_robust(

@@ -8,11 +8,11 @@ import torch
 
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import IterationRecord, RegistrationResult, SurfaceSamples
-from regnf_core.robust.conclusion import Conclusion, pose_covariance
-from regnf_core.robust.engine import Outcome, Problem
-from regnf_core.robust.finalists import Trail
+from regnf_core.robust.pipeline import Outcome, Problem
 from regnf_core.robust.poses import select
+from regnf_core.robust.refine.pose_candidates import Trail
 from regnf_core.robust.residuals import Samples
+from regnf_core.robust.verdict.conclusion import Conclusion, pose_covariance
 
 _GEMAN_MCCLURE = -2.0  # as the shape of Barron's general kernel
 

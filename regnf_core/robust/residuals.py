@@ -19,7 +19,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from regnf_core.sim3 import Sim3
+from regnf_core.geometry.sim3 import Sim3
 
 
 class DistanceModel(Protocol):

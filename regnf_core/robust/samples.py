@@ -12,14 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.box import OrientedBox
 from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
-from regnf_core.robust.cells import Cells, surface_cells, tighten
-from regnf_core.robust.frame import WorkingField, WorkingFrame
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.shape import diameter
+from regnf_core.paper.sampling import MIN_POINTS, check_box_meets_scene
 from regnf_core.robust.residuals import Samples
-from regnf_core.sampling import MIN_POINTS, check_box_meets_scene
-from regnf_core.shape import diameter
+from regnf_core.robust.working_frame import WorkingField, WorkingFrame
+from regnf_core.surface.cells import Cells, surface_cells, tighten
 
 REGION_GROWTH = 1.2
 """The scene is sampled in the box grown by this: boxes are often too small or off centre."""

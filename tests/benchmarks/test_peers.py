@@ -16,7 +16,7 @@ from benchmarks.peers.registry import PEERS, Entry
 from benchmarks.robust.cases import Case
 from regnf_core import Sim3
 from regnf_core.errors import InitialisationError
-from regnf_core.metrics import mssd
+from regnf_core.geometry.metrics import mssd
 from tests.core.analytic import chair, chair_box, chair_pose, seen_from
 
 LARGER = 1.6

@@ -9,12 +9,12 @@ import pytest
 import torch
 import trimesh
 
-from regnf_core.datasets.sdfstudio import write_dataset
 from regnf_core.fields.observation import observation_of
 from regnf_core.fields.safe_format import open_field, read_description
-from regnf_core.reconstruction.observing import observe
+from regnf_data.sdfstudio import write_dataset
+from regnf_fit.images.observing import observe
 from tests.cli.conftest import DATA, Run
-from tests.core.reconstruction.scenes import BALL_CENTRE, BALL_RADIUS, BOX_CENTRE, BOX_HALF, images
+from tests.fit.images.scenes import BALL_CENTRE, BALL_RADIUS, BOX_CENTRE, BOX_HALF, images
 
 
 @pytest.fixture

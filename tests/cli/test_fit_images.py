@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.datasets.sdfstudio import write_dataset
 from regnf_core.fields.safe_format import read_description
+from regnf_data.sdfstudio import write_dataset
 from tests.cli.conftest import Run
-from tests.core.reconstruction import scenes
+from tests.fit.images import scenes
 
 SMALL = ("--iterations", 20, "--table-log2", 10, "--hidden-width", 16, "--device", "cpu")
 

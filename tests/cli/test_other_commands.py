@@ -9,7 +9,7 @@ import pytest
 from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_core import __version__
-from service.settings import Settings
+from regnf_state.settings import Settings
 from tests.cli.conftest import DATA, Run
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -78,7 +78,7 @@ def test_a_worker_without_its_redis_is_unavailable(run: Run, monkeypatch: pytest
     def unreachable(settings: Settings) -> None:
         raise RedisConnectionError(f"nobody at {settings.redis_url}")
 
-    monkeypatch.setattr("worker.main.run_worker", unreachable)
+    monkeypatch.setattr("regnf_worker.main.run_worker", unreachable)
     monkeypatch.setenv("REGNF_REDIS_URL", "")  # restored afterwards: the command sets it
     outcome = run("worker", "--redis-url", "redis://127.0.0.1:9/0")
     assert outcome.code == 3

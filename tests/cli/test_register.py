@@ -13,7 +13,7 @@ import torch
 from regnf_cli.report import symmetry_in_words
 from regnf_cli.request_files import parse_detection, read_options
 from regnf_core.errors import InvalidDetectionError, InvalidOptionsError
-from regnf_core.sim3 import Sim3
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.verdicts import VERDICT_REASONS
 from tests.cli.conftest import DATA, Run
 from tests.core.analytic import chair, chair_box, chair_pose, room

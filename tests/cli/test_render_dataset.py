@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from regnf_core.datasets.sdfstudio import METADATA, load_dataset
+from regnf_data.sdfstudio import METADATA, load_dataset
 from tests.cli.conftest import Run
-from tests.core.datasets.rooms import write_room
+from tests.data.rooms import write_room
 
 SMALL = ("--width", 32, "--height", 24)
 

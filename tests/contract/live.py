@@ -80,7 +80,7 @@ def live_service(folder: Path, with_worker: bool = True, **settings: object) -> 
                 eventually(lambda: _status(live, "/healthz") == 200, f"the API; {live.log()}")
                 yield live
                 return
-            with _process(folder, "worker", ["worker.main"], environment) as worker:
+            with _process(folder, "worker", ["regnf_worker.main"], environment) as worker:
                 live = Live(listener.getsockname()[1], folder, api, worker)
                 eventually(lambda: _status(live, "/readyz") == 200, f"readiness; {live.log()}")
                 yield live

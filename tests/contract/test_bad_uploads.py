@@ -12,7 +12,7 @@ from typing import Any
 import anyio
 import pytest
 
-from service.blobs import StorageFullError
+from regnf_state.blobs.base import StorageFullError
 from tests.contract.bad_input import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
@@ -176,7 +176,7 @@ def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any)
 
 
 def test_aborted_uploads_leave_nothing(tmp_path: Any) -> None:
-    from service.local_blobs import LocalBlobStore
+    from regnf_state.blobs.local import LocalBlobStore
 
     world = make_world(tmp_path)
     store = LocalBlobStore(tmp_path / "blobs")

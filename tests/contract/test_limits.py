@@ -9,11 +9,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.app import create_app
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.rate_limits import RedisRateLimiter
-from service.redis_client import connect
-from service.settings import Settings
+from regnf_service.app import create_app
+from regnf_service.http.rate_limits import RedisRateLimiter
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.redis.client import connect
+from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 from tests.redis_server import private_redis

@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.schemas.results import ResultDocument
+from regnf_service.http.schemas.results import ResultDocument
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.test_openapi import validator
 from tests.contract.world import assert_refused, field_bytes, sha256

@@ -15,8 +15,8 @@ from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 
 from regnf_core.options import RobustOptions
 from regnf_core.verdicts import VERDICT_REASONS
-from service.reasons import REASONS
-from service.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, SCENE
+from regnf_service.http.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, SCENE
+from regnf_state.reasons import REASONS
 from tests.contract.world import World
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,7 +99,7 @@ def test_there_are_examples() -> None:
 
 def register_example_fields(world: World) -> None:
     """Fields under the hashes that the examples name."""
-    from service.records import FieldRecord
+    from regnf_state.records import FieldRecord
 
     now = world.records.now()
     for sha in (SCENE, OBJECT, OTHER):

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from service.ownership import reference_of
+from regnf_state.ownership import reference_of
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from service.records import FieldRecord
+from regnf_state.records import FieldRecord
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 
 

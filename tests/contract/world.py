@@ -11,10 +11,10 @@ from typing import Any
 import httpx
 from fastapi import FastAPI
 
-from service.app import create_app
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import JobRecord
-from service.settings import Settings
+from regnf_service.app import create_app
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import JobRecord
+from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from regnf_core.box import OrientedBox
-from regnf_core.sim3 import Sim3
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 
 
 class AnalyticField:

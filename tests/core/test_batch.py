@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from regnf_core.batch import register_batch
-from regnf_core.box import OrientedBox
 from regnf_core.errors import CancelledError, InvalidInputError
 from regnf_core.fields.base import CountingField
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.registration import register
 from regnf_core.result import Phase
 from tests.core.analytic import chair, chair_pose, room, table

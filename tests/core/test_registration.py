@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.box import OrientedBox
 from regnf_core.errors import CancelledError, InitialisationError, InvalidInputError
-from regnf_core.metrics import errors_against_truth
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.options import OptimisationOptions, RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.result import Phase

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.settings import Settings
+from regnf_state.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "deploy/helm/regnf"
@@ -150,7 +150,7 @@ def test_workers_are_scaled_by_what_is_unfinished() -> None:
     metrics = full["Service", "demo-metrics"]["spec"]["ports"][0]
     assert trigger["metadata"]["url"] == f"http://demo-metrics.lab.svc:{metrics['port']}/metrics"
     assert trigger["metadata"]["valueLocation"] == "regnf_unfinished"
-    assert '"unfinished"' in (ROOT / "service/metrics.py").read_text()
+    assert '"unfinished"' in (ROOT / "service/regnf_service/metrics.py").read_text()
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,15 @@ import pytest
 import yaml
 from prometheus_client import generate_latest
 
-from service.dependencies import Services
-from service.memory import InMemoryBlobStore
-from service.metrics import Metrics
-from service.records import FieldRecord, JobRecord
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.redis_records import RedisRecordStore
-from service.settings import Settings
-from service.webhooks.outbox import Delivery, RedisOutbox
+from regnf_service.http.dependencies import Services
+from regnf_service.metrics import Metrics
+from regnf_state.memory import InMemoryBlobStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+from regnf_state.settings import Settings
 from tests.redis_server import private_redis
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.settings import Settings
+from regnf_state.settings import Settings
 from tests.docker.files import COMPOSE, DOCKERFILES, ROOT, compose, services
 
 every_service = pytest.mark.parametrize("name", ["redis", "api", "worker", "worker-gpu", "prometheus", "grafana"])

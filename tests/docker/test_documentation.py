@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from service.settings import Settings
+from regnf_state.settings import Settings
 from tests.docker.files import COMPOSE, ROOT
 
 DEPLOYMENT = (ROOT / "docs" / "deployment.md").read_text()

@@ -13,7 +13,7 @@ import pytest
 from redis import Redis
 from rq import Queue, Worker
 
-from service.queue import QUEUE_NAME
+from regnf_state.queue import QUEUE_NAME
 from tests.docker.files import ROOT
 from tests.redis_server import private_redis
 

@@ -12,11 +12,13 @@ import sys
 
 import uvicorn
 
-from service import app, lifespan, object_blobs, reaper
-from service.logs import configure_logging
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.settings import Settings
+from regnf_service import app, lifespan
+from regnf_service.upkeep import reaper
+from regnf_state.blobs import object_store as object_blobs
+from regnf_state.logs import configure_logging
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 
 FUNCTIONS = ("tests.faults.worker.run_registration", "tests.faults.worker.run_import")

@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.redis_client import connect
+from regnf_state.redis.client import connect
 from tests.faults.house import House, plain_environment
 from tests.faults.pace import pace
 from tests.faults.proxy import Proxy, to_unix

@@ -10,7 +10,7 @@ import time
 import httpx
 import pytest
 
-from service.redis_queue import registration_id
+from regnf_state.redis.queue import registration_id
 from tests.contract.world import field_bytes, sha256
 from tests.faults.house import House
 from tests.faults.promise import check_promise, fault, leftovers

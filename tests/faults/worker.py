@@ -12,21 +12,21 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from service import object_blobs
-from service.blobs import BlobStore
-from service.logs import configure_logging
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.settings import Settings
+from regnf_state.blobs import object_store as object_blobs
+from regnf_state.blobs.base import BlobStore
+from regnf_state.logs import configure_logging
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+from regnf_worker import artifacts, registration
+from regnf_worker.context import Context
+from regnf_worker.imports import run_import_attempt
+from regnf_worker.jobs import delivery
+from regnf_worker.process import RegnfWorker
+from regnf_worker.registration import run_attempt
+from regnf_worker.scratch import Scratch
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
-from worker import artifacts, registration
-from worker.context import Context
-from worker.imports import run_import_attempt
-from worker.jobs import delivery
-from worker.process import RegnfWorker
-from worker.registration import run_attempt
-from worker.scratch import Scratch
 
 FUNCTIONS = ("tests.faults.worker.run_registration", "tests.faults.worker.run_import")
 

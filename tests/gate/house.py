@@ -9,11 +9,11 @@ from typing import Any
 
 import httpx
 
-from regnf_core.importing.convert import convert_file
-from regnf_core.importing.report import MIB, ImportLimits
+from regnf_core.importing.gate.convert import convert_file
+from regnf_core.importing.gate.report import MIB, ImportLimits
+from regnf_worker.context import Context
+from regnf_worker.imports import run_import_attempt
 from tests.contract.world import World, assert_refused, make_world, sha256
-from worker.context import Context
-from worker.imports import run_import_attempt
 
 LIMITS = ImportLimits(tensor_bytes=64 * MIB)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from service.reasons import REASONS
+from regnf_state.reasons import REASONS
 from tests.gate.bad_containers import CONTAINERS
 from tests.gate.bad_pickles import PICKLES
 from tests.gate.bad_tensors import TENSORS

@@ -11,7 +11,7 @@ from regnf_cli import embedded_redis
 from regnf_cli.listening import address_of, is_loopback, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
-from service.settings import Settings
+from regnf_state.settings import Settings
 from tests.worker.bench import alive, children_of, eventually
 
 

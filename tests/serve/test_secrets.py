@@ -51,7 +51,7 @@ def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
         assert client.get("/jobs", headers={"Authorization": f"Bearer {FILED}"}).status_code == 200
         running = descendants()
         texts += [" ".join(command) for command in running.values()]
-        workers = {pid for pid, command in running.items() if "worker.main" in command}
+        workers = {pid for pid, command in running.items() if "regnf_worker.main" in command}
         assert workers
         environments = [(Path("/proc") / str(pid) / "environ").read_bytes().decode() for pid in workers]
     texts += [path.read_text(errors="replace") for path in state.rglob("*.log")]

@@ -28,7 +28,7 @@ def service(tmp_path: Path) -> Iterator[Service]:
 def test_it_comes_up_with_nothing_configured(service: Service) -> None:
     service.await_ready()
     assert httpx.get(f"{service.address}/healthz").json() == {"status": "ok"}
-    parts = ("unixsocket:", "worker.main", "regnf_cli.api_process")
+    parts = ("unixsocket:", "regnf_worker.main", "regnf_cli.api_process")
     assert {service.part(part) for part in parts} == service.look(), [command_line(pid) for pid in service.look()]
     assert service.address.startswith("http://127.0.0.1:")
     assert oct(service.socket_dir().stat().st_mode & 0o777) == "0o700"
@@ -98,7 +98,7 @@ def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> N
     started.end()
 
 
-@pytest.mark.parametrize("part", ["worker.main", "regnf_cli.api_process", "unixsocket:"])
+@pytest.mark.parametrize("part", ["regnf_worker.main", "regnf_cli.api_process", "unixsocket:"])
 def test_a_part_that_dies_is_started_anew(service: Service, part: str) -> None:
     service.await_ready()
     before = service.part(part)

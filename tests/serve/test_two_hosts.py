@@ -52,7 +52,10 @@ def client(tmp_path: Path, objects: ObjectServer) -> Iterator[httpx.Client]:
             "REGNF_DEVICE": "cpu",
             "REGNF_THREADS": "1",
         }
-        for name, module in (("api", ["regnf_cli.api_process", str(listener.fileno())]), ("worker", ["worker.main"])):
+        for name, module in (
+            ("api", ["regnf_cli.api_process", str(listener.fileno())]),
+            ("worker", ["regnf_worker.main"]),
+        ):
             environment = plain | shared | objects.environment | {"REGNF_STATE_DIR": str(tmp_path / name)}
             stack.enter_context(process(module, environment, tmp_path / f"{name}.log", listener.fileno()))
         address = f"http://127.0.0.1:{listener.getsockname()[1]}"

@@ -14,19 +14,19 @@ import pytest
 from redis import Redis
 from redis.exceptions import RedisError
 
-from service import lifespan
-from service.app import ConfigurationError, create_app
-from service.concurrency import Waiters
-from service.dependencies import Services
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.settings import Settings
-from service.shutdown import stopping_on_signals
-from service.waiting import pause, wait_for
+from regnf_service import lifespan
+from regnf_service.app import ConfigurationError, create_app
+from regnf_service.http.concurrency import Waiters
+from regnf_service.http.dependencies import Services
+from regnf_service.http.waiting import pause, wait_for
+from regnf_service.shutdown import stopping_on_signals
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.settings import Settings
 from tests.contract.world import make_world
 
 
 def test_the_application_loads_neither_torch_nor_open3d() -> None:
-    code = "import sys, service.app; sys.exit(' '.join({'torch', 'open3d', 'worker', 'numpy'} & set(sys.modules)) or 0)"
+    code = "import sys, regnf_service.app; sys.exit(' '.join({'torch', 'open3d', 'worker', 'numpy'} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -8,7 +8,7 @@ import random
 
 import pytest
 
-from service.boxes import boxes_overlap, normal_quaternion, rotation_columns
+from regnf_service.jobs.boxes import boxes_overlap, normal_quaternion, rotation_columns
 
 HALF = math.sqrt(0.5)
 

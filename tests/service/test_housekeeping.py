@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from service.housekeeping import Housekeeper, Removed
-from service.journaled_records import JournaledRecordStore
-from service.lease import Lease, LeaseLostError
-from service.memory import InMemoryBlobStore, InMemoryJobQueue
-from service.rebuild import Rebuilder
-from service.records import FieldRecord, JobRecord
-from service.redis_client import connect
-from service.settings import Settings
+from regnf_service.upkeep.housekeeping import Housekeeper, Removed
+from regnf_service.upkeep.lease import Lease, LeaseLostError
+from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.settings import Settings
 from tests.redis_server import private_redis
 
 DAY_S = 24 * 3600.0

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import pytest
 from redis import Redis
 
-from service.lease import Lease, LeaseLostError
-from service.redis_client import connect
+from regnf_service.upkeep.lease import Lease, LeaseLostError
+from regnf_state.redis.client import connect
 from tests.redis_server import private_redis
 
 

@@ -11,15 +11,15 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
-from service.dependencies import Services
-from service.figures import BOUNDS_S, Figures
-from service.memory import InMemoryBlobStore
-from service.metrics import Metrics, served
-from service.records import FieldRecord, JobRecord
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.redis_records import RedisRecordStore
-from service.settings import Settings
+from regnf_service.http.dependencies import Services
+from regnf_service.metrics import Metrics, served
+from regnf_state.memory import InMemoryBlobStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.redis.counters import BOUNDS_S, Figures
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
 from tests.contract.world import assert_refused, make_world
 from tests.redis_server import private_redis
 
@@ -83,7 +83,7 @@ def test_a_jobs_way_is_counted_once(redis: Redis, tmp_path: Path) -> None:
 
 
 def test_seconds_go_into_the_buckets_of_their_bounds(redis: Redis) -> None:
-    from service.figures import timed
+    from regnf_state.redis.counters import timed
 
     for seconds in (0.05, 0.1, 0.2, 2.0, 5000.0, -3.0):
         for command in timed("job_wait_seconds", seconds):

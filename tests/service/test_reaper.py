@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import pytest
 from redis import Redis
 
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.reaper import Reaped, Reaper
-from service.records import FieldRecord, JobRecord
-from service.redis_client import connect
-from service.settings import Settings
+from regnf_service.upkeep.reaper import Reaped, Reaper
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.settings import Settings
 from tests.redis_server import private_redis
 
 SHA = "a" * 64

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.canonical import digest, job_id_of
-from service.digests import announced_digest, is_sha256
-from service.paging import decode_token, encode_token
-from service.problems import Problem, json_pointer
-from service.ranges import ByteRange, parse_range
-from service.reasons import REASONS
-from service.routes.registrations import preferred_wait
-from service.strict_json import parse_json
+from regnf_service.http.digests import announced_digest, is_sha256
+from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.problems import Problem, json_pointer
+from regnf_service.http.ranges import ByteRange, parse_range
+from regnf_service.http.routes.registrations import preferred_wait
+from regnf_service.http.strict_json import parse_json
+from regnf_service.jobs.canonical import digest, job_id_of
+from regnf_state.reasons import REASONS
 
 
 @pytest.mark.parametrize(

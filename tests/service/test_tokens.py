@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.app import create_app
-from service.ownership import owner_of, reference_of, sha256_of
-from service.settings import Settings
-from service.tokens import TokensError, caller_of, read_callers
+from regnf_service.app import create_app
+from regnf_service.http.tokens import TokensError, caller_of, read_callers
+from regnf_state.ownership import owner_of, reference_of, sha256_of
+from regnf_state.settings import Settings
 
 SECRET = "s3cret-of-somebody"
 SHA = "a" * 64

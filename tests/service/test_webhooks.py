@@ -14,16 +14,16 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from service.ownership import reference_of
-from service.records import JobRecord
-from service.redis_client import connect
-from service.redis_records import RedisRecordStore
-from service.tokens import TokensError
-from service.webhooks.deliverer import Deliverer
-from service.webhooks.outbox import RedisOutbox
-from service.webhooks.sender import HttpSender
-from service.webhooks.signing import read_secrets, signed_headers
-from service.webhooks.targets import AllowList, is_public
+from regnf_service.http.tokens import TokensError
+from regnf_service.webhooks.deliverer import Deliverer
+from regnf_service.webhooks.sender import HttpSender
+from regnf_service.webhooks.signing import read_secrets, signed_headers
+from regnf_service.webhooks.targets import AllowList, is_public
+from regnf_state.ownership import reference_of
+from regnf_state.records import JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.webhook_outbox import RedisOutbox
 
 KEY = bytes(range(24))
 SECRET = f"whsec_{base64.b64encode(KEY).decode()}"

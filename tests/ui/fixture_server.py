@@ -24,7 +24,7 @@ from PIL import Image
 from tests.ui.synthetic import JOB_ID, Synthetic, synthetic
 from tests.ui.verdicts import ambiguous_result, searched_result
 
-WEB = Path(__file__).resolve().parents[2] / "service" / "web"
+WEB = Path(__file__).resolve().parents[2] / "service" / "regnf_service" / "web"
 CONTENT_SECURITY_POLICY = "default-src 'self'"
 TOKEN = "open-sesame"
 STORIES = (

@@ -15,11 +15,11 @@ import pytest
 import uvicorn
 from playwright.sync_api import expect
 
-from service.app import create_app
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.ownership import ANONYMOUS, reference_of
-from service.records import FieldRecord, JobRecord
-from service.settings import Settings
+from regnf_service.app import create_app
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.ownership import ANONYMOUS, reference_of
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.settings import Settings
 from tests.ui.conftest import Visit
 from tests.ui.fixture_server import field_picture
 from tests.ui.pixels import canvas_pixels, coloured

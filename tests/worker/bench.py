@@ -15,15 +15,15 @@ from typing import TypeVar
 
 from redis import Redis
 
-from service.local_blobs import LocalBlobStore
-from service.records import FINISHED, FieldRecord, JobRecord
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.redis_records import RedisRecordStore
-from service.settings import Settings
+from regnf_state.blobs.local import LocalBlobStore
+from regnf_state.records import FINISHED, FieldRecord, JobRecord
+from regnf_state.redis.client import connect
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+from regnf_worker.context import Context
 from tests.redis_server import private_redis
 from tests.worker.tiny_worker import FUNCTIONS
-from worker.context import Context
 
 SCENE, OBJECT = "a" * 64, "b" * 64
 DEADLINE_S = 60.0

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.settings import Settings
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.settings import Settings
+from regnf_worker.context import Context
 from tests.redis_server import private_redis
 from tests.worker.refusals import RefusingRedis
-from worker.context import Context
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from service.records import FieldRecord, JobRecord
-from worker.context import Context
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_worker.context import Context
 
 SHA = "a" * 64
 

@@ -3,8 +3,8 @@
 import hashlib
 from pathlib import Path
 
-from service.memory import InMemoryBlobStore
-from worker.artifacts import discard_others, publish, read_manifest, store_artifacts
+from regnf_state.memory import InMemoryBlobStore
+from regnf_worker.artifacts import discard_others, publish, read_manifest, store_artifacts
 
 
 def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:

@@ -5,15 +5,15 @@ from pathlib import Path
 import pytest
 
 from regnf_core.errors import CancelledError
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import FieldRecord
-from service.settings import Settings
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import FieldRecord
+from regnf_state.settings import Settings
+from regnf_worker.artifacts import publish, read_manifest
+from regnf_worker.context import Context
+from regnf_worker.pulse import Pulse
+from regnf_worker.registration import run_attempt
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine
-from worker.artifacts import publish, read_manifest
-from worker.context import Context
-from worker.pulse import Pulse
-from worker.registration import run_attempt
 
 
 def test_an_attempt_that_is_not_to_be_had_does_nothing(context: Context) -> None:
@@ -58,7 +58,7 @@ def test_fields_that_are_still_imported_send_the_job_back(context: Context, monk
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    monkeypatch.setattr("worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
+    monkeypatch.setattr("regnf_worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
     assert isinstance(context.queue, InMemoryJobQueue)

@@ -13,9 +13,9 @@ from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
 from rq.worker.base import BaseWorker
 
-from service.redis_queue import RqJobQueue
+from regnf_state.redis.queue import RqJobQueue
+from regnf_worker.bookkeeping import PatientWorker
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis
-from worker.bookkeeping import PatientWorker
 
 # RQ's calls, one by one
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from regnf_core.options import RegistrationOptions
-from worker.engine import CoreEngine
+from regnf_worker.engine import CoreEngine
 
 START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
 REQUEST: dict[str, Any] = {
@@ -24,7 +24,7 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
-    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, **said: ["result.json"])
+    monkeypatch.setattr("regnf_core.viewing.write_artifacts", lambda result, folder, **said: ["result.json"])
     request = REQUEST | {"initial_transform": start, "ground_truth": None}
     files = Path("scene"), Path("object")
     names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path)
@@ -38,5 +38,5 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
 def test_requests_recorded_before_there_were_starts_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: None)
-    monkeypatch.setattr("regnf_core.diagnostics.write_artifacts", lambda result, folder, **said: [])
+    monkeypatch.setattr("regnf_core.viewing.write_artifacts", lambda result, folder, **said: [])
     assert CoreEngine("cpu").register(Path("s"), Path("o"), None, REQUEST, lambda phase, share: None, tmp_path) == []

@@ -10,10 +10,10 @@ import pytest
 from redis import Redis
 from redis.exceptions import RedisError
 
-from service.reaper import Reaper
+from regnf_service.upkeep.reaper import Reaper
+from regnf_worker.artifacts import read_manifest
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import Bench, bench, children_of, eventually
-from worker.artifacts import read_manifest
 
 Full = Callable[[], AbstractContextManager[None]]
 

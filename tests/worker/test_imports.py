@@ -3,11 +3,11 @@
 import json
 from pathlib import Path
 
+from regnf_worker.context import Context
+from regnf_worker.imports import run_import_attempt
+from regnf_worker.settle import HorseEnd, settle_import
 from tests.worker.doubles import SHA, begin_import, field
 from tests.worker.tiny_engine import tiny_importer
-from worker.context import Context
-from worker.imports import run_import_attempt
-from worker.settle import HorseEnd, settle_import
 
 
 def test_of_two_deliveries_of_an_import_one_does_the_work(context: Context) -> None:

@@ -12,13 +12,13 @@ import pytest
 
 from regnf_core.errors import FieldFormatError, NoSurfaceError
 from regnf_core.options import RegistrationOptions
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import FieldRecord, JobRecord
-from service.settings import Settings
-from worker.context import Context
-from worker.engine import Candidate
-from worker.models import model_key
-from worker.registration import run_attempt
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.settings import Settings
+from regnf_worker.context import Context
+from regnf_worker.engine import Candidate
+from regnf_worker.models import model_key
+from regnf_worker.registration import run_attempt
 
 SCENE, CHAIR, TABLE, AIR = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
 SYMMETRY = {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": False}
@@ -195,7 +195,7 @@ def test_a_search_whose_candidate_is_gone_fails(context: Context) -> None:
 
 
 def test_a_search_stops_between_models_when_it_is_cancelled(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("worker.pulse._REPORT_EVERY_S", 0.0)  # every report asks the record
+    monkeypatch.setattr("regnf_worker.pulse._REPORT_EVERY_S", 0.0)  # every report asks the record
     engine = ModelEngine(while_making=lambda: context.records.request_cancel("j1"))
     assert run(context, engine, "j1", candidates=[CHAIR, TABLE, AIR]).status == "dismissed"
     assert engine.made == [b"chair"]

@@ -8,17 +8,17 @@ import pytest
 from redis.exceptions import RedisError
 from rq.exceptions import StopRequested
 
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import FieldRecord, JobRecord
-from service.settings import Settings
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.settings import Settings
+from regnf_worker.context import Context
+from regnf_worker.imports import run_import_attempt
+from regnf_worker.patience import LONGEST_WAIT_S, passes, patiently
+from regnf_worker.process import RegnfWorker
+from regnf_worker.registration import run_attempt
+from regnf_worker.scratch import Scratch
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
-from worker.context import Context
-from worker.imports import run_import_attempt
-from worker.patience import LONGEST_WAIT_S, passes, patiently
-from worker.process import RegnfWorker
-from worker.registration import run_attempt
-from worker.scratch import Scratch
 
 SHA = "a" * 64
 
@@ -77,7 +77,7 @@ def test_a_refusal_and_its_end_are_logged_once(waits: list[float], caplog: pytes
 
 @pytest.fixture
 def worker(tmp_path: Path, redis: RefusingRedis, monkeypatch: pytest.MonkeyPatch) -> RegnfWorker:
-    monkeypatch.setattr("worker.process.connect", lambda *_, **__: redis)
+    monkeypatch.setattr("regnf_worker.process.connect", lambda *_, **__: redis)
     settings = Settings(state_dir=tmp_path, redis_url="unix:///nowhere")
     context = Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
     return RegnfWorker(context, Scratch(tmp_path / "scratch"))

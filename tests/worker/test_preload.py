@@ -12,7 +12,7 @@ CODE = """
 import os
 os.environ["OMP_NUM_THREADS"] = "2"
 os.environ["OPENBLAS_NUM_THREADS"] = "2"
-from worker.preload import preload
+from regnf_worker.preload import preload
 preload()
 import torch
 assert len(os.listdir("/proc/self/task")) == 1, "a fork would leave threads behind"
@@ -33,7 +33,7 @@ def test_nothing_that_is_loaded_starts_threads_and_a_child_computes() -> None:
 def test_what_starts_threads_is_refused() -> None:
     code = """
 import threading
-from worker import preload
+from regnf_worker import preload
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 preload._MODULES = ()
 preload.preload()
@@ -45,5 +45,5 @@ preload.preload()
 
 def test_a_worker_told_to_holds_torch_before_its_first_job(tmp_path: Path) -> None:
     with bench(tmp_path) as table:
-        worker = table.start_worker("worker.main", preload=True)
+        worker = table.start_worker("regnf_worker.main", preload=True)
         assert "libtorch" in Path(f"/proc/{worker.pid}/maps").read_text()

@@ -2,10 +2,10 @@
 
 import pytest
 
+from regnf_worker.artifacts import publish
+from regnf_worker.context import Context
+from regnf_worker.settle import HorseEnd, settle_import, settle_registration
 from tests.worker.doubles import SHA, accept, begin_import, field, job
-from worker.artifacts import publish
-from worker.context import Context
-from worker.settle import HorseEnd, settle_import, settle_registration
 
 
 @pytest.mark.parametrize(

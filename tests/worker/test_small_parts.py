@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from rq.timeouts import JobTimeoutException
 
-from service.blobs import StorageFullError
-from service.settings import Settings
-from worker import kernel
-from worker.context import Context, NoRedisError
-from worker.problems import fault, problem
-from worker.scratch import Scratch
+from regnf_state.blobs.base import StorageFullError
+from regnf_state.settings import Settings
+from regnf_worker import kernel
+from regnf_worker.context import Context, NoRedisError
+from regnf_worker.problems import fault, problem
+from regnf_worker.scratch import Scratch
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_a_worker_without_redis_says_so() -> None:
     with pytest.raises(NoRedisError):
         Context.from_settings(Settings(redis_url=None))
     environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
-    for module, code in (("worker.main", 2), ("regnf_cli.main", 3)):
+    for module, code in (("regnf_worker.main", 2), ("regnf_cli.main", 3)):
         arguments = [sys.executable, "-m", module, *(["worker"] if code == 3 else [])]
         done = subprocess.run(arguments, env=environment, capture_output=True, text=True, timeout=60)
         assert done.returncode == code, done.stderr

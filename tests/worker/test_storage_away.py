@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from service.blobs import StorageUnavailableError
-from service.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
-from service.records import FieldRecord, JobRecord
-from service.settings import Settings
+from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.settings import Settings
+from regnf_worker import kernel
+from regnf_worker.context import Context
+from regnf_worker.imports import run_import_attempt
+from regnf_worker.registration import run_attempt
+from regnf_worker.scratch import Scratch
+from regnf_worker.settle import HorseEnd, settle_import, settle_registration
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
-from worker import kernel
-from worker.context import Context
-from worker.imports import run_import_attempt
-from worker.registration import run_attempt
-from worker.scratch import Scratch
-from worker.settle import HorseEnd, settle_import, settle_registration
 
 SHA = "a" * 64
 

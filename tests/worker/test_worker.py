@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from service.records import FieldRecord
+from regnf_state.records import FieldRecord
+from regnf_worker.artifacts import read_manifest
 from tests.worker.bench import OBJECT, SCENE, Bench, alive, bench, children_of, eventually
-from worker.artifacts import read_manifest
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_a_job_succeeds(table: Bench) -> None:
 
 
 def test_the_parent_never_loads_torch(table: Bench) -> None:
-    worker = table.start_worker("worker.main")
+    worker = table.start_worker("regnf_worker.main")
     maps = Path(f"/proc/{worker.pid}/maps").read_text()
     assert "/python" in maps
     assert "libtorch" not in maps
@@ -243,13 +243,13 @@ def test_a_registration_of_a_rejected_field_fails(tmp_path: Path) -> None:
 
 def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
     with bench(tmp_path) as table:
-        from service.redis_queue import RqJobQueue
+        from regnf_state.redis.queue import RqJobQueue
 
         now = table.context.records.now()
         table.context.blobs.put(f"fields/{SCENE}/original", b"no field at all")
         table.context.records.create_field(FieldRecord(SCENE, "validating", 15, now, now))
         RqJobQueue(table.redis).enqueue_import(SCENE)
-        table.start_worker("worker.main")
+        table.start_worker("regnf_worker.main")
         rejected = field_state(table, SCENE)
         assert rejected.error is not None
         assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNISED")

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import NoSurfaceError
-from service.settings import Settings
-from worker.jobs import delivery
-from worker.registration import run_attempt
+from regnf_state.settings import Settings
+from regnf_worker.jobs import delivery
+from regnf_worker.registration import run_attempt
 
 Report = Callable[[str, float], None]
 
@@ -90,7 +90,7 @@ class TinyEngine:
 
 
 def run_registration(job_id: str) -> None:
-    """What tests have the queue name instead of worker.jobs.run_registration."""
+    """What tests have the queue name instead of regnf_worker.jobs.run_registration."""
     from tests.worker.tiny_worker import tiny_context
 
     run_attempt(tiny_context(), job_id, *delivery(), TinyEngine)
@@ -98,8 +98,8 @@ def run_registration(job_id: str) -> None:
 
 def run_import(sha256: str) -> None:
     """An import whose upload says how it ends."""
+    from regnf_worker.imports import run_import_attempt
     from tests.worker.tiny_worker import tiny_context
-    from worker.imports import run_import_attempt
 
     run_import_attempt(tiny_context(), sha256, *delivery(), tiny_importer)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from service.logs import configure_logging
-from service.redis_client import connect
-from service.redis_queue import RqJobQueue
-from service.settings import Settings
-from worker import process
-from worker.context import Context
-from worker.scratch import Scratch
+from regnf_state.logs import configure_logging
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+from regnf_worker import process
+from regnf_worker.context import Context
+from regnf_worker.scratch import Scratch
 
 FUNCTIONS = ("tests.worker.tiny_engine.run_registration", "tests.worker.tiny_engine.run_import")
 

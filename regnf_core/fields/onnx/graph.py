@@ -17,7 +17,7 @@ from regnf_core.fields.onnx.linear import LINEAR
 from regnf_core.fields.onnx.shaping import SHAPING
 
 if TYPE_CHECKING:
-    from regnf_core.fields.kinds.onnx import OnnxDescription
+    from regnf_core.schema.kinds.onnx import OnnxDescription
 
 OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
 _MAX_ELEMENTS = 1 << 24

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families import dense_grid, voxel_block_grid
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.npz import ArraySource
 from regnf_core.importing.upload_description import UploadDescription
 
 ArrayFamily = Callable[[ArraySource, UploadDescription], ConvertedField | None]

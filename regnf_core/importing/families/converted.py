@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.importing.tensors import StoredArray
+from regnf_core.importing.pickle.tensors import StoredArray
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ConvertedField:
     warnings: tuple[str, ...] = ()
     readings: tuple[Reading, ...] = ()
     """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
-    one that behaves most like a distance; see :mod:`regnf_core.importing.choice`. Empty: there is no doubt."""
+    one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
     sign_is_open: bool = False
     """Whether trainers of this family save fields of either sign, and nobody said which this is."""
 

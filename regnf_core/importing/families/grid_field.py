@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.families.grid_search import grid_name
-from regnf_core.importing.tensors import Float32Array
+from regnf_core.importing.pickle.tensors import Float32Array
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 
 def grid_readings(

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.hash_grid_config import MAX_GROWTH, HashGridConfig, Interpolation
 from regnf_core.importing.upload_description import GridDescription
+from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig, Interpolation
 
 MAX_GRIDS = 24
 """Most configurations that are worth trying out."""

@@ -16,7 +16,7 @@ from regnf_core.importing.families.grid_field import grid_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
 from regnf_core.importing.families.layers import Layers, below, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape
+from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "instant_nsr_pl"

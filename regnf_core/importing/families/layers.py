@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.kinds.neus_facto import MAX_LAYERS
-from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.schema.kinds.neus_facto import MAX_LAYERS
 
 _NORMALISED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
 """How torch names direction and length of a normalised weight: the older way, the newer way."""

@@ -10,7 +10,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import below, numbered, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nglod"

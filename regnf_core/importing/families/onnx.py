@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.kinds.onnx import MAX_BATCH, MAX_NUMBERS
-from regnf_core.fields.kinds.onnx_operators import OPERATORS
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.onnx.model import Attribute, Model, Node, Port, read_model, unsupported
 from regnf_core.importing.onnx.tensor import Array
-from regnf_core.importing.tensors import StoredArray
+from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
+from regnf_core.schema.kinds.onnx_operators import OPERATORS
 
 _BATCH = 1024
 _LEAST_FIXED_BATCH = 64

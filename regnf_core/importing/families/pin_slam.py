@@ -14,8 +14,8 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle_values import Placeholder
-from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.pickle.pickle_values import Placeholder
+from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "pin_slam"

@@ -9,10 +9,10 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.safe_format import read_description
+from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family
-from regnf_core.importing.safetensors_header import StoredTensor, read_header
-from regnf_core.importing.tensors import StoredArray
+from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 
 _OVERRULED = frozenset({"contraction", "level_mask"})

@@ -12,16 +12,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.hash_grid_config import HashGridConfig
-from regnf_core.fields.kinds.neus_facto import SKIP_LAYER
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_field import grid_readings
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
 from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
-from regnf_core.importing.pickle_values import GlobalRef, Placeholder
-from regnf_core.importing.tensors import TensorSource, as_tensor, lookup, require_shape
+from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
+from regnf_core.importing.pickle.tensors import TensorSource, as_tensor, lookup, require_shape
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.kinds.neus_facto import SKIP_LAYER
 
 _PREFIXES = ("_model.field.", "_model.module.field.")
 _DEGREE = 6

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids, grid_name
 from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.importing.upload_description import GridDescription, UploadDescription
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 FAMILY = "torch_ngp"
 _OWN, _TCNN = ("encoder.embeddings", "encoder.offsets", "backbone.0.weight"), ("encoder.params", "backbone.params")

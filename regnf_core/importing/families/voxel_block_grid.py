@@ -9,12 +9,8 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.npz import ArraySource
-from regnf_core.importing.tensors import Float32Array, StoredArray, tensor_error
-from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.importing.voxel_maps import (
+from regnf_core.importing.containers.npz import ArraySource
+from regnf_core.importing.containers.voxel_maps import (
     BoolArray,
     IntArray,
     fill_unseen,
@@ -22,6 +18,10 @@ from regnf_core.importing.voxel_maps import (
     seen_extent,
     tell_truncation,
 )
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.pickle.tensors import Float32Array, StoredArray, tensor_error
+from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "open3d_voxel_block_grid"
 _NEEDED = ("key", "block_resolution", "voxel_size", "attr_name_tsdf")

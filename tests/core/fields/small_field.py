@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 GRID = HashGridConfig.from_top_resolution(64, levels=4, log2_table_size=10, base_resolution=8)
 

@@ -12,7 +12,7 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.hash_grid_config import HashGridConfig, Interpolation
+from regnf_core.schema.hash_grid_config import HashGridConfig, Interpolation
 from tests.core.fields.reference import central_differences, encode_slowly
 from tests.devdata import dev_data
 

@@ -16,8 +16,8 @@ from safetensors.numpy import load_file, save_file
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
-from regnf_core.fields.description import parse_description
 from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
+from regnf_core.schema.description import parse_description
 from tests.core.fields.small_field import GRID, description, tensors
 
 Tensors = dict[str, np.ndarray[Any, Any]]

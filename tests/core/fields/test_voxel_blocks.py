@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
-from regnf_core.fields.description import parse_description
 from regnf_core.fields.safe_format import open_field, write_safe_field
+from regnf_core.schema.description import parse_description
 from tests.core.fields.grids import numeric_gradient, slow_trilinear
 
 EDGE, SIZE = 4, 0.1

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 LEVELS, FEATURES = 16, 2
 Change = Callable[[dict[str, Any]], None]

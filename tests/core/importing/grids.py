@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import HashGridConfig
 
 Array = NDArray[np.float32]
 

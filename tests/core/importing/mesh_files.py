@@ -6,10 +6,10 @@ from typing import Any
 
 import trimesh
 
+from regnf_core.importing.containers.sniff import sniff_format
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import MESH_READERS
-from regnf_core.importing.sniff import sniff_format
 from regnf_core.importing.upload_description import UploadDescription
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import HashGridConfig
 from tests.core.fields.reference import encode_slowly
 
 Array = NDArray[np.float64]

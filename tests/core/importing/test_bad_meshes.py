@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from regnf_core.importing.containers.sniff import sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.gate import import_field
+from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import geometry
-from regnf_core.importing.sniff import sniff_format
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.mesh_files import PLY_TRIANGLE, converted, exported

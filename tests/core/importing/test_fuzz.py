@@ -19,12 +19,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.container import TorchArchive, read_archive
+from regnf_core.importing.containers.container import TorchArchive, read_archive
+from regnf_core.importing.containers.safetensors_header import read_header
+from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.importing.families import convert_checkpoint
-from regnf_core.importing.pickle_reader import PickleLimits, read_pickle
-from regnf_core.importing.safetensors_header import read_header
-from regnf_core.importing.sniff import explain_refusal, sniff_format
-from regnf_core.importing.tensors import TensorSource
+from regnf_core.importing.pickle.pickle_reader import PickleLimits, read_pickle
+from regnf_core.importing.pickle.tensors import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import torch_zip
 from tests.core.importing.checkpoints import checkpoint

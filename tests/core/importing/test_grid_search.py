@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
-from regnf_core.fields.hash_grid_config import HashGridConfig
 from regnf_core.importing.families.grid_search import MAX_GRIDS, GridHabits, find_grids, grid_name
 from regnf_core.importing.upload_description import GridDescription
+from regnf_core.schema.hash_grid_config import HashGridConfig
 from tests.core.importing.archives import assert_refused
 
 HABITS = GridHabits((2, 4, 8), ((16, 2048), (16, 512), (64, 4096)), "smoothstep")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from regnf_core.fields.positional_encoding import _ICOSAHEDRON
 from regnf_core.fields.safe_format import open_field
-from regnf_core.importing.convert import FIELD_NAME, convert_file
-from regnf_core.importing.report import ImportLimits
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.report import ImportLimits
 from tests.core.fields.grids import numeric_gradient
 from tests.core.importing.archives import assert_refused
 

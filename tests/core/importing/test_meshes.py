@@ -13,7 +13,7 @@ import trimesh
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.safe_format import open_field
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.gate import import_field
+from regnf_core.importing.gate.gate import import_field
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.mesh_files import BALL, converted, exported
 from tests.devdata import dev_data

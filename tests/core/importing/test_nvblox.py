@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.safe_format import open_field
-from regnf_core.importing import sqlite_source
-from regnf_core.importing.convert import FIELD_NAME, convert_file
+from regnf_core.importing.containers import sqlite_source
+from regnf_core.importing.containers.sqlite_source import TableSource
 from regnf_core.importing.families import nvblox
-from regnf_core.importing.gate import import_field
-from regnf_core.importing.report import ImportLimits
-from regnf_core.importing.sqlite_source import TableSource
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.report import ImportLimits
 from tests.core.fields.grids import slow_trilinear
 from tests.core.importing.archives import assert_refused, patched
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from regnf_core.fields.safe_format import open_field, read_description
-from regnf_core.importing.convert import FIELD_NAME, convert_file
-from regnf_core.importing.report import ImportLimits
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.archives import assert_refused
 from tests.devdata import dev_data
 

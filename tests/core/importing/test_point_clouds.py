@@ -13,7 +13,7 @@ from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.safe_format import open_field
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.gate import import_field
+from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
 

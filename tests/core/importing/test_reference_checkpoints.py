@@ -12,9 +12,9 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.safe_format import open_field
-from regnf_core.importing.convert import FIELD_NAME, convert_file
-from regnf_core.importing.gate import import_field
-from regnf_core.importing.report import ImportLimits
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.report import ImportLimits
 from tests.devdata import dev_data
 
 CHECKPOINTS = {".ckpt", ".pth", ".pt"}

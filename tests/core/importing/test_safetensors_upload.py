@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from regnf_core.fields.safe_format import read_description
-from regnf_core.importing.convert import FIELD_NAME, convert_file
-from regnf_core.importing.report import ImportLimits
-from regnf_core.importing.safetensors_header import read_header
+from regnf_core.importing.containers.safetensors_header import read_header
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.checkpoints import write_small_checkpoint
 

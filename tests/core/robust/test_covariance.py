@@ -9,12 +9,12 @@ import torch
 from scipy.stats import chi2
 from torch import Tensor
 
-from regnf_core.robust.covariance import covariance, in_object_units
-from regnf_core.robust.frame import WorkingFrame
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import perturb
 from regnf_core.robust.residuals import Residuals, residuals
 from regnf_core.robust.samples import sample_object_surface
-from regnf_core.sim3 import Sim3
+from regnf_core.robust.verdict.covariance import covariance, in_object_units
+from regnf_core.robust.working_frame import WorkingFrame
 from tests.core.analytic import chair
 from tests.core.robust.shapes import random_pose
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.robust.extra_surface import extra_share
 from regnf_core.robust.residuals import Samples
-from regnf_core.sim3 import Sim3
+from regnf_core.robust.verdict.unexplained_surface import extra_share
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 NONE = torch.zeros((), dtype=torch.float64)

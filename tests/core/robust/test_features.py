@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 
 from regnf_core.fields.transformed import TransformedField
-from regnf_core.robust.features import feature_seeds
-from regnf_core.robust.object_model import model_object
+from regnf_core.robust.model.object_model import model_object
 from regnf_core.robust.poses import displacement
 from regnf_core.robust.residuals import Samples
+from regnf_core.robust.search.features import feature_seeds
 from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose
 

@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.robust.evidence import Evidence, gather_evidence
-from regnf_core.robust.judgement import decide
 from regnf_core.robust.residuals import Samples
-from regnf_core.sim3 import Sim3
+from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
+from regnf_core.robust.verdict.judgment import decide
 
 D = torch.float64
 ROUGH = 0.06

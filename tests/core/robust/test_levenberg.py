@@ -7,11 +7,11 @@ from itertools import pairwise
 import pytest
 import torch
 
-from regnf_core.robust.levenberg import geman_mcclure_weights, minimise, robust_cost
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import displacement, perturb
+from regnf_core.robust.refine.levenberg_marquardt import geman_mcclure_weights, minimise, robust_cost
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.samples import sample_object_surface, some
-from regnf_core.sim3 import Sim3
 from tests.core.analytic import chair, seen_from
 from tests.core.robust.shapes import random_pose
 

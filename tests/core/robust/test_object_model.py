@@ -11,9 +11,9 @@ from safetensors.torch import load_file, save_file
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.registration import register
-from regnf_core.robust.model_file import read_object_model, write_object_model
-from regnf_core.robust.object_model import model_object
-from regnf_core.robust.signature import SIGNATURE_LENGTH, signature
+from regnf_core.robust.model.model_file import read_object_model, write_object_model
+from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust.model.signature import SIGNATURE_LENGTH, signature
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, table
 from tests.core.robust.shapes import ROBUST, can, detection, random_pose, slab_table
 

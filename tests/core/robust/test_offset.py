@@ -6,11 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.robust.levenberg import MOST_OFFSET, OFFSET_PRIOR, minimise, normal_equations, robust_cost, with_offset
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import perturb
+from regnf_core.robust.refine.levenberg_marquardt import (
+    MOST_OFFSET,
+    OFFSET_PRIOR,
+    minimise,
+    normal_equations,
+    robust_cost,
+    with_offset,
+)
 from regnf_core.robust.residuals import Residuals, residuals
 from regnf_core.robust.samples import sample_object_surface
-from regnf_core.sim3 import Sim3
 from tests.core.analytic import AnalyticField, chair, chair_pose, room
 from tests.core.robust.shapes import detection, run
 

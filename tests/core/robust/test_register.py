@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
-from regnf_core.box import OrientedBox
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.robust.poses import perturb
-from regnf_core.sim3 import Sim3
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import (
     ROBUST,

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import perturb
 from regnf_core.robust.residuals import Samples, residuals
-from regnf_core.sim3 import Sim3
 from tests.core.robust.shapes import random_pose
 
 SCALES = [0.05, 1.0, 20.0]

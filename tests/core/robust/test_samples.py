@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.box import OrientedBox
 from regnf_core.errors import InvalidDetectionError, NoSurfaceError
 from regnf_core.fields.base import CountingField
 from regnf_core.fields.transformed import TransformedField
-from regnf_core.robust.proxy import ProxyField
-from regnf_core.robust.rotations import super_fibonacci, turns_about
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.robust.samples import sample_object_surface, sample_scene_surface
-from regnf_core.robust.support import support
+from regnf_core.robust.scene.support_planes import support
+from regnf_core.robust.search.distance_grid import ProxyField
+from regnf_core.robust.search.rotations import super_fibonacci, turns_about
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.shapes import detection, random_pose
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.robust.levenberg import normal_equations, robust_cost
+from regnf_core.robust.refine.levenberg_marquardt import normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, Samples
-from regnf_core.robust.shadow import shadow_walls
+from regnf_core.robust.scene.occlusion_boundary import shadow_walls
 
 
 def unit(vectors: Tensor) -> Tensor:

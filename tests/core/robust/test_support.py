@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.residuals import Samples
-from regnf_core.robust.smoothing import smoothed
-from regnf_core.robust.support import support
+from regnf_core.robust.scene.smoothing import smoothed
+from regnf_core.robust.scene.support_planes import support
 
 
 def generator(seed: int = 0) -> torch.Generator:

@@ -1,0 +1,1 @@
+"""Similarity transforms, boxes, points, metrics."""

@@ -1,0 +1,166 @@
+"""Similarity transforms: one scale, one rotation, one translation, x -> s R x + t."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.geometry.sim3_tangent import exp_parts, log_parts, matrix_from_quaternion, quaternion_from_matrix
+
+_SIMILARITY_TOLERANCE = 1e-4  # float32 matrices from other tools come with about 1e-6
+
+
+def _invalid(message: str) -> InvalidInputError:
+    return InvalidInputError(message, reason="INVALID_TRANSFORM")
+
+
+def _numbers(values: Any) -> Tensor:
+    """Values as float64, where they are numbers in a regular array."""
+    try:
+        return torch.as_tensor(values, dtype=torch.float64)
+    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
+        raise _invalid("a transform is made of numbers, in rows of equal length") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Sim3:
+    """A similarity transform, or a batch of them: x -> scale * rotation @ x + translation.
+
+    scale: (...) > 0 · rotation: (..., 3, 3) proper · translation: (..., 3). float64 unless made otherwise.
+    Products read like the paper's: ``(T_c_b @ T_b_a)`` maps frame a to frame c. Autograd flows through everything.
+    """
+
+    scale: Tensor
+    rotation: Tensor
+    translation: Tensor
+
+    @classmethod
+    def identity(cls, dtype: torch.dtype = torch.float64) -> Sim3:
+        """The transform that changes nothing."""
+        return cls(torch.ones((), dtype=dtype), torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype))
+
+    @classmethod
+    def from_translation(cls, translation: Tensor) -> Sim3:
+        """A pure shift by ``translation`` (..., 3)."""
+        eye = torch.eye(3, dtype=translation.dtype, device=translation.device)
+        return cls(torch.ones_like(translation[..., 0]), eye.expand(*translation.shape[:-1], 3, 3).clone(), translation)
+
+    @classmethod
+    def from_matrix(cls, matrix: Tensor | Sequence[Sequence[float]]) -> Sim3:
+        """From (..., 4, 4) homogeneous matrices.
+
+        Raises InvalidInputError (INVALID_TRANSFORM) unless each is a similarity: finite, last row (0, 0, 0, 1),
+        equal singular values, no reflection.
+        """
+        M = _numbers(matrix)
+        if M.shape[-2:] != (4, 4):
+            raise _invalid(f"a transform is a 4x4 matrix, not {tuple(M.shape)}")
+        if not torch.isfinite(M).all():
+            raise _invalid("the transform holds a number that is not finite")
+        last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=M.dtype, device=M.device)
+        if not torch.allclose(M[..., 3, :], last_row.expand_as(M[..., 3, :]), atol=1e-9):
+            raise _invalid("the transform's last row is not (0, 0, 0, 1)")
+        U, singular, Vh = torch.linalg.svd(M[..., :3, :3])
+        scale = singular.mean(-1)
+        spread = (singular[..., 0] - singular[..., 2]) / scale.clamp_min(1e-300)
+        if not ((scale > 1e-12) & (spread <= _SIMILARITY_TOLERANCE)).all():
+            raise _invalid("the transform is no similarity: its axes are stretched differently or vanish")
+        rotation = U @ Vh  # nearest rotation
+        if not (torch.linalg.det(rotation) > 0).all():
+            raise _invalid("the transform mirrors space")
+        return cls(scale, rotation, M[..., :3, 3].clone())
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        scale: Tensor | float,
+        rotation_quaternion_xyzw: Tensor | Sequence[float],
+        translation: Tensor | Sequence[float],
+    ) -> Sim3:
+        """From scale (...), quaternion (..., 4) as (x, y, z, w), normalised here, and translation (..., 3)."""
+        s, q, t = _numbers(scale), _numbers(rotation_quaternion_xyzw), _numbers(translation)
+        if q.shape[-1:] != (4,) or t.shape[-1:] != (3,):
+            raise _invalid("a quaternion has four numbers and a translation three")
+        if not all(torch.isfinite(part).all() for part in (s, q, t)):
+            raise _invalid("the transform holds a number that is not finite")
+        norm = q.norm(dim=-1, keepdim=True)
+        if not ((s > 0).all() and (norm > 1e-9).all()):
+            raise _invalid("the scale must be positive and the quaternion must not vanish")
+        return cls(s, matrix_from_quaternion(q / norm), t)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Sim3:
+        """From what :meth:`to_dict` gives: ``matrix`` alone, or scale, quaternion and translation."""
+        if "matrix" in values:
+            return cls.from_matrix(values["matrix"])
+        try:
+            return cls.from_quaternion(values["scale"], values["rotation_quaternion_xyzw"], values["translation"])
+        except KeyError as error:
+            raise _invalid(f"the transform lacks {error.args[0]!r}") from error
+
+    @classmethod
+    def exp(cls, tangent: Tensor) -> Sim3:
+        """The exponential of (..., 7): translation part rho (3), rotation omega (3, radians), log scale (1)."""
+        return cls(*exp_parts(tangent))
+
+    def log(self) -> Tensor:
+        """The tangent (..., 7) whose :meth:`exp` is this transform; its rotation angle is at most pi."""
+        return log_parts(self.scale, self.rotation, self.translation)
+
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """The transform that applies ``other`` first."""
+        return Sim3(
+            self.scale * other.scale,
+            self.rotation @ other.rotation,
+            self._linear(other.translation) + self.translation,
+        )
+
+    def inverse(self) -> Sim3:
+        """The transform back."""
+        scale = 1.0 / self.scale
+        rotation = self.rotation.mT
+        shift = (rotation @ self.translation.unsqueeze(-1)).squeeze(-1)
+        return Sim3(scale, rotation, -scale.unsqueeze(-1) * shift)
+
+    def apply(self, points: Tensor) -> Tensor:
+        """Points (..., N, 3) in the target frame; dtype and device of the points."""
+        T = self.to(points)
+        return T.scale[..., None, None] * (points @ T.rotation.mT) + T.translation[..., None, :]
+
+    def matrix(self) -> Tensor:
+        """(..., 4, 4) homogeneous matrices."""
+        M = torch.zeros(*self.scale.shape, 4, 4, dtype=self.scale.dtype, device=self.scale.device)
+        M[..., :3, :3] = self.scale[..., None, None] * self.rotation
+        M[..., :3, 3] = self.translation
+        M[..., 3, 3] = 1.0
+        return M
+
+    def quaternion_xyzw(self) -> Tensor:
+        """(..., 4) unit quaternions (x, y, z, w) with w >= 0."""
+        return quaternion_from_matrix(self.rotation)
+
+    def to(self, like: Tensor) -> Sim3:
+        """The same transform in the dtype and on the device of another tensor."""
+        return Sim3(self.scale.to(like), self.rotation.to(like), self.translation.to(like))
+
+    def detach(self) -> Sim3:
+        """The same transform, cut from any autograd graph."""
+        return Sim3(self.scale.detach(), self.rotation.detach(), self.translation.detach())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values: ``matrix`` (row-major 4x4), ``scale``, ``rotation_quaternion_xyzw``, ``translation``."""
+        return {
+            "matrix": self.matrix().tolist(),
+            "scale": self.scale.tolist(),
+            "rotation_quaternion_xyzw": self.quaternion_xyzw().tolist(),
+            "translation": self.translation.tolist(),
+        }
+
+    def _linear(self, vectors: Tensor) -> Tensor:
+        """scale * rotation @ v for vectors (..., 3), without the translation."""
+        return self.scale.unsqueeze(-1) * (self.rotation @ vectors.unsqueeze(-1)).squeeze(-1)

@@ -1,0 +1,50 @@
+"""Whether plain numbers are a similarity transform. Torch-free: asked before the work begins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+TOLERANCE = 1e-4
+"""Largest Frobenius norm of M^T M / s^2 - I. Whatever passes here passes :meth:`regnf_core.geometry.sim3.Sim3.from_matrix`."""
+_LEAST_SCALE = 1e-6
+_LARGEST = 1e9
+
+
+def similarity_fault(rows: Any) -> str | None:
+    """What keeps a row-major 4x4 from being x -> s R x + t with s > 0 and R a rotation; None when nothing does."""
+    if not _is_four_by_four(rows):
+        return "not four rows of four numbers"
+    if not all(abs(number) <= _LARGEST for row in rows for number in row):
+        return "a number is not finite, or beyond all reason"
+    if list(rows[3]) != [0, 0, 0, 1]:
+        return "the last row is not 0 0 0 1"
+    x, y, z = ([float(row[column]) for row in rows[:3]] for column in range(3))
+    squared = (_dot(x, x) + _dot(y, y) + _dot(z, z)) / 3
+    if squared < _LEAST_SCALE**2:
+        return "the scale vanishes"
+    lengths = sum((_dot(axis, axis) / squared - 1) ** 2 for axis in (x, y, z))
+    angles = sum((_dot(a, b) / squared) ** 2 for a, b in ((x, y), (y, z), (z, x)))
+    if not math.sqrt(lengths + 2 * angles) <= TOLERANCE:
+        return "the axes are sheared or stretched differently"
+    if _dot(_cross(x, y), z) < 0:
+        return "it mirrors space"
+    return None
+
+
+def _is_four_by_four(rows: Any) -> bool:
+    return (
+        isinstance(rows, Sequence)
+        and len(rows) == 4
+        and all(isinstance(row, Sequence) and len(row) == 4 for row in rows)
+        and all(isinstance(number, int | float) and not isinstance(number, bool) for row in rows for number in row)
+    )
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return sum(p * q for p, q in zip(a, b, strict=True))
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

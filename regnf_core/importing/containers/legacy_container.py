@@ -1,0 +1,113 @@
+"""The container that torch.save wrote before version 1.6, and still writes on request: pickles, then raw storages.
+
+In order: a magic number, the protocol's version, facts about the machine, the values, the storages' keys (five
+pickles), then each storage: its count of elements in eight bytes, and the elements. Read by the same reader that never
+imports. There are no checksums; but every byte must be accounted for, so the file has one reading only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.container import MAX_PICKLE_BYTES, Entry
+from regnf_core.importing.containers.zip_members import MAX_ENTRIES
+from regnf_core.importing.pickle.pickle_reader import LeadingPickle, PickleLimits, read_leading_pickle
+from regnf_core.importing.pickle.pickle_values import StorageRef
+
+_MAGIC = 0x1950A86A20F9469CFC6C
+_PROTOCOL = 1001
+_SMALL = PickleLimits(opcodes=1000, stack=100, marks=10, memo=100)
+_KEYS = PickleLimits(opcodes=4 * MAX_ENTRIES, stack=2 * MAX_ENTRIES, marks=10, memo=2 * MAX_ENTRIES)
+_COUNT_BYTES = 8
+_ELEMENT_BYTES = {
+    "float32": 4,
+    "float64": 8,
+    "float16": 2,
+    "bfloat16": 2,
+    "int64": 8,
+    "int32": 4,
+    "int16": 2,
+    "int8": 1,
+    "uint8": 1,
+    "bool": 1,
+}
+
+
+@dataclass(frozen=True)
+class LegacyArchive:
+    """The storages by the names that the zip container gives them: "data/<key>"."""
+
+    data: memoryview
+    entries: Mapping[str, Entry]
+
+    def read(self, name: str) -> memoryview:
+        """The entry's bytes, copied: they may begin at any byte, and numbers want an aligned place."""
+        entry = self.entries[name]
+        return memoryview(bytes(self.data[entry.offset : entry.offset + entry.size]))
+
+
+def read_legacy(data: memoryview) -> tuple[Any, LegacyArchive]:
+    """The values that were saved, and the storages of their tensors. ``data`` is the whole file.
+
+    Raises FieldFormatError: FILE_TRUNCATED, LEGACY_MALFORMED, ARCHIVE_BYTE_ORDER, ARCHIVE_TOO_MANY_ENTRIES,
+    ARCHIVE_TRAILING_DATA, TENSOR_DTYPE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH and the PICKLE_* reasons.
+    """
+    magic, at = _leading(data, 0, _SMALL)
+    protocol, at = _leading(data, at, _SMALL)
+    machine, at = _leading(data, at, _SMALL)
+    if magic.value != _MAGIC or protocol.value != _PROTOCOL or not isinstance(machine.value, dict):
+        raise _malformed("the file's head is not torch.save's")
+    if machine.value.get("little_endian") is not True:
+        raise FieldFormatError("the tensors are not little-endian", reason="ARCHIVE_BYTE_ORDER")
+    values, at = _leading(data, at, PickleLimits())
+    keys, at = _leading(data, at, _KEYS)
+    return values.value, LegacyArchive(data, _entries(data, at, _checked_keys(keys.value), values.storages))
+
+
+def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[LeadingPickle, int]:
+    """The pickle at ``at``, and where it ends."""
+    if at >= len(data):
+        raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
+    pickle = read_leading_pickle(data[at : at + MAX_PICKLE_BYTES], limits)
+    return pickle, at + pickle.length
+
+
+def _checked_keys(keys: object) -> list[str]:
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys) or len(set(keys)) != len(keys):
+        raise _malformed("the storages' keys are no list of names")
+    if len(keys) > MAX_ENTRIES:
+        message = f"{len(keys)} storages; at most {MAX_ENTRIES} are read"
+        raise FieldFormatError(message, reason="ARCHIVE_TOO_MANY_ENTRIES")
+    return keys
+
+
+def _entries(data: memoryview, at: int, keys: list[str], storages: Mapping[str, StorageRef]) -> dict[str, Entry]:
+    """Where each storage lies, one behind the other from ``at`` to the end of the file."""
+    entries = {}
+    for key in keys:
+        storage = storages.get(key)
+        if storage is None:
+            raise FieldFormatError("a storage that no tensor names", reason="TENSOR_STORAGE_MISSING")
+        element = _ELEMENT_BYTES.get(storage.dtype or "")
+        if element is None:
+            raise FieldFormatError(f"a storage of {storage.type_name}, of unknown size", reason="TENSOR_DTYPE")
+        size = storage.count * element
+        if at + _COUNT_BYTES + size > len(data):
+            raise FieldFormatError("the file was cut short", reason="FILE_TRUNCATED")
+        count = int.from_bytes(data[at : at + _COUNT_BYTES], "little")
+        if count != storage.count:
+            message = f"a storage of {storage.count} elements has {count} in the file"
+            raise FieldFormatError(message, reason="TENSOR_STORAGE_MISMATCH")
+        at += _COUNT_BYTES
+        entries[f"data/{key}"] = Entry(f"data/{key}", at, size, crc32=0)
+        at += size
+    if at != len(data):
+        raise FieldFormatError("something lies behind the last storage", reason="ARCHIVE_TRAILING_DATA")
+    return entries
+
+
+def _malformed(message: str) -> FieldFormatError:
+    return FieldFormatError(message, reason="LEGACY_MALFORMED")

@@ -1,0 +1,79 @@
+"""What a file seems to be, from its first bytes. Imports nothing: the HTTP front end asks while an upload arrives."""
+
+from __future__ import annotations
+
+from regnf_core.importing.containers.sniff_mesh import sniff_mesh
+
+HEAD_BYTES = 512
+"""How many first bytes are enough to name every format."""
+
+_SQLITE_MAGIC = b"SQLite format 3\x00"
+_VDB_MAGICS = (b" BDV", b"NanoVDB")
+_ZIP_LOCAL_HEADER = b"PK\x03\x04"
+_ZIP_NAME_AT = 30
+_TORCH_MEMBERS = frozenset(
+    b"data.pkl data .data version byteorder .format_version .storage_alignment constants.pkl code".split()
+)
+_ONNX_VERSIONS, _ONNX_NEXT = (
+    tuple(bytes([n]) for n in range(3, 32)),
+    (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
+)
+_LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
+
+
+def sniff_format(head: bytes) -> str | None:
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, or
+    None for what is not taken.
+
+    ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
+    about the rest of the file.
+    """
+    if head.startswith(_ZIP_LOCAL_HEADER) and _may_be_torch_archive(head):
+        return "torch-zip"
+    if head.startswith(_LEGACY_MAGIC):
+        return "torch-legacy"
+    if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head).endswith(b".npy"):
+        return "npz"
+    if head.startswith(_SQLITE_MAGIC):
+        return "sqlite"
+    if head[8:9] == b"{":
+        return "safetensors"
+    return "onnx" if _may_be_onnx(head) else sniff_mesh(head)
+
+
+def explain_refusal(head: bytes) -> tuple[str, str]:
+    """The reason and a sentence for a file that ``sniff_format`` does not name."""
+    if not head:
+        return "FILE_EMPTY", "the file holds no bytes"
+    if head[257:262] == b"ustar":
+        return "LEGACY_TORCH_FILE", "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
+    if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
+        return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
+    if head.lstrip()[:1] == b"{" and b'"asset"' in head:
+        return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
+    if head.startswith(_VDB_MAGICS):
+        return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
+    if head.startswith(_ZIP_LOCAL_HEADER):
+        return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
+    return (
+        "FORMAT_NOT_RECOGNISED",
+        "none of the formats that are taken: torch.save archives, safetensors, npz, SQLite, ONNX, meshes",
+    )
+
+
+def _may_be_onnx(head: bytes) -> bool:
+    """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
+    return head[:1] == b"\x08" and head[1:2] in _ONNX_VERSIONS and head[2:3] in _ONNX_NEXT
+
+
+def _first_name(head: bytes) -> bytes:
+    return head[_ZIP_NAME_AT : _ZIP_NAME_AT + int.from_bytes(head[26:28], "little")]
+
+
+def _may_be_torch_archive(head: bytes) -> bool:
+    """Whether the first entry's name fits torch.save: <archive>/<member>. A head cut short gets the benefit."""
+    name_end = _ZIP_NAME_AT + int.from_bytes(head[26:28], "little")
+    if len(head) < min(name_end, HEAD_BYTES):
+        return True
+    parts = head[_ZIP_NAME_AT:name_end].split(b"/")
+    return len(parts) >= 2 and parts[1] in _TORCH_MEMBERS

@@ -1,0 +1,184 @@
+"""The gate's outer side: runs one conversion in a process of its own and believes nothing but what it checks itself."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import math
+import mmap
+import os
+import re
+import shutil
+import signal
+import stat
+import sys
+import tempfile
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.safetensors_header import read_header
+from regnf_core.importing.gate.child import ChildOutcome, run_child
+from regnf_core.importing.gate.picture import PICTURE_NAME, is_sound_picture
+from regnf_core.importing.gate.report import ImportLimits, ImportReport
+
+__all__ = ["FIELD_NAME", "ImportLimits", "ImportReport", "import_field"]
+
+FIELD_NAME = "field.safetensors"
+"""The name of the safe field file in the output folder."""
+
+_ROOT = Path(__file__).resolve().parents[3]
+_ENTRY = """
+import sys
+if sys.argv[1] not in sys.path:
+    sys.path.insert(0, sys.argv[1])
+from regnf_core.importing.gate.convert import main
+sys.exit(main(sys.argv[2:]))
+"""
+_REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
+_MAX_DETAIL = 500
+_OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
+_MAX_DESCRIPTION = 16_384
+_log = logging.getLogger(__name__)
+
+
+def import_field(
+    upload: Path,
+    out_dir: Path,
+    description: dict[str, Any] | None = None,
+    limits: ImportLimits | None = None,
+    picture: bool = False,
+) -> ImportReport:
+    """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
+
+    description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
+    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
+    of the field in ``out_dir``/preview.png too, if it can be made in good time.
+
+    Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
+    OSError when the disk is full.
+    """
+    limits = limits or ImportLimits()
+    request = _request(description, limits, picture)
+    upload = upload.resolve(strict=True)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
+    try:
+        started = time.monotonic()
+        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
+        outcome = run_child(command, request, work, _environment(limits), limits.wall_s)
+        values = _judge(outcome)
+        report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
+        os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
+        if picture and is_sound_picture(work / PICTURE_NAME):
+            os.replace(work / PICTURE_NAME, out_dir / PICTURE_NAME)
+        return report
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: bool) -> bytes:
+    try:
+        request = {"description": description, "limits": asdict(limits), "parent_pid": os.getpid(), "picture": picture}
+        text = json.dumps(request, allow_nan=False).encode()
+    except (TypeError, ValueError, RecursionError) as error:
+        raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
+    if len(text) > _MAX_DESCRIPTION:
+        raise FieldFormatError("the description is too long", reason="INVALID_DESCRIPTION")
+    return text
+
+
+def _environment(limits: ImportLimits) -> dict[str, str]:
+    """All the child gets to see of the environment: no secret lives in these names."""
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, str(limits.threads))}
+
+
+def _judge(outcome: ChildOutcome) -> dict[str, Any]:
+    """The report's values, or the error that the child's end stands for."""
+    if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
+        raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
+    if outcome.stopped is None and outcome.signal == signal.SIGKILL:  # not ours: the kernel's, for want of memory
+        raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY")
+    values = _parse(outcome.stdout) if outcome.exit_status == 0 else None
+    if values is None:
+        if any(sign in outcome.stderr for sign in _OUT_OF_MEMORY_SIGNS):
+            raise FieldFormatError("the import needs more memory than it may have", reason="IMPORT_OUT_OF_MEMORY")
+        ending = f"status {outcome.exit_status}, signal {outcome.signal}, stopped {outcome.stopped}"
+        _log.error("import process failed (%s): %s", ending, outcome.stderr[-4000:].decode("utf-8", "replace"))
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
+    reason = values.get("reason")
+    if reason is None:
+        return values
+    if not isinstance(reason, str) or not _REASON.fullmatch(reason):
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
+    detail = "".join(c for c in str(values.get("detail"))[:_MAX_DETAIL] if c.isprintable())
+    if reason == "STORAGE_FULL":
+        raise OSError(errno.ENOSPC, detail)
+    raise FieldFormatError(detail, reason=reason)
+
+
+def _parse(stdout: bytes) -> dict[str, Any] | None:
+    try:
+        values = json.loads(stdout)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None
+
+
+def _report(
+    values: dict[str, Any], outcome: ChildOutcome, limits: ImportLimits, field: Path, seconds: float
+) -> ImportReport:
+    """The report from the child's own words and this side's measurements, after a look at the file it left."""
+    try:
+        size = _checked_size(field, limits.file_bytes)
+        isolation = {str(key): bool(value) for key, value in values["isolation"].items()}
+        lower, upper = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["bounds"])
+        return ImportReport(
+            family=str(values["family"]),
+            why=tuple(map(str, values["why"])),
+            bounds=(lower, upper),
+            parameters=int(values["parameters"]),
+            plausibility={str(key): _finite(value) for key, value in values["plausibility"].items()},
+            warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),
+            label=None if values["label"] is None else str(values["label"]),
+            field_bytes=size,
+            seconds=round(seconds, 3),
+            cpu_seconds=round(outcome.cpu_seconds, 3),
+            peak_memory_bytes=int(values["peak_memory_bytes"]),
+            isolation=isolation,
+        )
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, OSError, FieldFormatError) as error:
+        _log.error("import process left no usable result: %r", error)
+        raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED") from error
+
+
+def _finite(value: Any) -> float:
+    """The number, if JSON can hold it: Python's reader takes NaN and 1e999 too."""
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError("a number that is not finite")
+    return number
+
+
+def _isolation_warnings(isolation: dict[str, bool]) -> list[str]:
+    if isolation.get("network_namespace") or isolation.get("system_call_filter"):
+        return []
+    return ["NOT_ISOLATED: the kernel granted the import neither a network namespace nor a system call filter"]
+
+
+def _checked_size(field: Path, most: int) -> int:
+    """The file's size, if it is a plain file of its own (no link) with a sound safetensors header."""
+    found = field.lstat()
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= most:
+        raise ValueError("the import left something else than a plain file")
+    with open(field, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        data = memoryview(mapped)
+        try:
+            read_header(data)
+        finally:
+            data.release()
+    return found.st_size

@@ -1,0 +1,93 @@
+"""The first lines of the throw-away process: before it sees the upload it gives up all it does not need."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+import struct
+import sys
+from pathlib import Path
+
+from regnf_core.importing.gate.landlock import restrict_files
+from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.gate.system_calls import refuse_system_calls
+
+_PR_SET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_NO_NEW_PRIVS = 1, 4, 38
+_CLONE_NEWUSER, _CLONE_NEWNET, _CLONE_NEWIPC = 0x10000000, 0x40000000, 0x08000000
+_CAPABILITY_VERSION = 0x20080522
+_OPEN_FILES = 256
+_SYSTEM = """
+/usr/lib /usr/lib64 /usr/local/lib /usr/local/cuda /usr/share /lib /lib64 /nix/store
+/etc/ld.so.cache /etc/localtime /etc/ssl/openssl.cnf /dev/null /dev/urandom
+/proc/cpuinfo /proc/meminfo /proc/stat /sys/devices/system/cpu /sys/devices/system/node
+"""
+"""Where libraries lie, and what they ask of the machine as they load. No service keeps a secret there."""
+
+
+def confine(limits: ImportLimits, parent_pid: int, upload: int, folder: Path) -> dict[str, bool]:
+    """Confine this process for the rest of its life; returns which confinements the kernel granted.
+
+    ``upload`` is the opened upload, ``folder`` where the process may write. Resource limits always hold. A network
+    namespace without interfaces and the system call filter each keep the process off the network; containers often
+    forbid the first and allow the second.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    die_with_parent = libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0) == 0
+    if os.getppid() != parent_pid:  # the parent died before the line above
+        os._exit(1)
+    _limit_resources(limits)
+    libc.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)
+    no_network = _leave_network(libc)
+    no_capabilities = _drop_capabilities(libc)
+    no_new_privileges = libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
+    return {
+        "dies_with_parent": die_with_parent,
+        "network_namespace": no_network,
+        "no_capabilities": no_capabilities,
+        "no_new_privileges": no_new_privileges,
+        "files_restricted": no_new_privileges and restrict_files([upload, *_readable()], folder),
+        "system_call_filter": no_new_privileges and refuse_system_calls(),
+    }
+
+
+def _readable() -> list[int | Path]:
+    """What this process reads besides the upload: its own code, libraries, itself.
+
+    The folder that the package lies in is left out: where the code runs from a checkout it may hold anything.
+    """
+    package = Path(__file__).resolve().parents[2]
+    prefixes = (Path(prefix) / name for prefix in (sys.base_prefix, sys.prefix) for name in ("lib", "lib64"))
+    on_path = (Path(entry) for entry in sys.path if entry and Path(entry).resolve() != package.parent)
+    itself = os.open("/proc/self", os.O_PATH | os.O_DIRECTORY)  # kept open: a rule holds for this one node only
+    return [itself, package, *prefixes, *on_path, *map(Path, _SYSTEM.split())]
+
+
+def _leave_network(libc: ctypes.CDLL) -> bool:
+    """Move to a network namespace of our own, which has no interface that is up."""
+    kinds = _CLONE_NEWNET | _CLONE_NEWIPC
+    if libc.unshare(kinds) == 0:
+        return True
+    return bool(libc.unshare(kinds | _CLONE_NEWUSER) == 0)
+
+
+def _drop_capabilities(libc: ctypes.CDLL) -> bool:
+    """Give up what root, or a user namespace of its own, would let this process do."""
+    return bool(libc.capset(struct.pack("=Ii", _CAPABILITY_VERSION, 0), bytes(24)) == 0)
+
+
+def _limit_resources(limits: ImportLimits) -> None:
+    wanted = (
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_CPU, limits.cpu_s),
+        (resource.RLIMIT_AS, limits.memory_bytes),
+        (resource.RLIMIT_FSIZE, limits.file_bytes),
+        (resource.RLIMIT_NOFILE, _OPEN_FILES),
+    )
+    for kind, value in wanted:
+        _, hard = resource.getrlimit(kind)
+        highest = value + 1 if kind == resource.RLIMIT_CPU else value  # at the hard limit SIGKILL would hide the cause
+        if hard != resource.RLIM_INFINITY:
+            value, highest = min(value, hard), min(highest, hard)
+        resource.setrlimit(kind, (value, highest))

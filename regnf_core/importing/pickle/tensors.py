@@ -1,0 +1,180 @@
+"""Tensors that a family needs, as float32 arrays: read from the map only after every claim about them was checked."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.container import Entry
+from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder, StorageRef, TensorRef
+
+Float32Array = npt.NDArray[np.float32]
+StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.int32]
+"""What a safe field holds."""
+
+_STORED: dict[str, np.dtype[Any]] = {
+    "float32": np.dtype("<f4"),
+    "float64": np.dtype("<f8"),
+    "float16": np.dtype("<f2"),
+    "bfloat16": np.dtype("<u2"),
+}
+_STORED_WHOLE: dict[str, np.dtype[Any]] = {"int64": np.dtype("<i8"), "int32": np.dtype("<i4")}
+_DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
+_FINITE_CHUNK = 1 << 20
+_ALIGNMENT = 16
+_MAX_ELEMENTS = 1 << 60
+"""What numpy can address at eight bytes each. It counts empty axes as ones: even an array of nothing has a limit."""
+
+
+def tensor_error(message: str, reason: str) -> FieldFormatError:
+    """The error for a tensor that is not what it must be."""
+    return FieldFormatError(message, reason=reason)
+
+
+class Archive(Protocol):
+    """A container of torch.save: its storages' bytes under ``data/<key>``."""
+
+    @property
+    def entries(self) -> Mapping[str, Entry]:
+        """Where the entries lie, by name."""
+        ...
+
+    def read(self, name: str) -> memoryview:
+        """An entry's bytes. Raises FieldFormatError where they are damaged."""
+        ...
+
+
+class TensorSource:
+    """Materialises tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
+    them; nothing else of the file is touched.
+
+    ``budget`` caps the bytes of all tensors together, as float32.
+    """
+
+    def __init__(self, archive: Archive, budget: int) -> None:
+        self._archive = archive
+        self._budget = budget
+
+    def array(self, name: str, value: object) -> Float32Array:
+        """The tensor called ``name`` as a contiguous float32 array of its own shape.
+
+        Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, TENSOR_EXPECTED, TENSOR_NOT_DENSE, TENSOR_SHAPE,
+        TENSOR_DTYPE, TENSOR_DEVICE, TENSOR_STORAGE_MISSING, TENSOR_STORAGE_MISMATCH, TENSOR_TOO_LARGE,
+        TENSOR_NOT_FINITE or ARCHIVE_CRC_MISMATCH.
+        """
+        ref = as_tensor(name, value)
+        values = self._values(name, ref, _stored_type(name, ref, _STORED, "real"))
+        if ref.storage.dtype == "bfloat16":
+            values = (np.ascontiguousarray(values).astype(np.uint32) << np.uint32(16)).view(np.float32)
+        return finite_float32(name, values)
+
+    def integers(self, name: str, value: object) -> npt.NDArray[np.int64]:
+        """The tensor called ``name``, of whole numbers, as a contiguous array. Raises what :meth:`array` raises."""
+        ref = as_tensor(name, value)
+        return np.ascontiguousarray(self._values(name, ref, _stored_type(name, ref, _STORED_WHOLE, "whole")), np.int64)
+
+    def _values(self, name: str, ref: TensorRef, stored: np.dtype[Any]) -> npt.NDArray[Any]:
+        count = math.prod(ref.shape)
+        self._spend(name, 4 * count)
+        raw = self._storage(name, ref.storage, stored, count)
+        _check_dense(name, ref, count)
+        return _in_shape(_aligned(np.frombuffer(raw, dtype=stored)), ref)
+
+    def _spend(self, name: str, size: int) -> None:
+        self._budget -= size
+        if self._budget < 0:
+            raise tensor_error(f"with {name} the tensors exceed the limit", "TENSOR_TOO_LARGE")
+
+    def _storage(self, name: str, storage: StorageRef, stored: np.dtype[Any], count: int) -> memoryview:
+        entry = self._archive.entries.get(f"data/{storage.key}")
+        if entry is None:
+            raise tensor_error(f"the storage of {name} is not in the archive", "TENSOR_STORAGE_MISSING")
+        if storage.count != count or entry.size != count * stored.itemsize:
+            message = f"{name} has {count} elements, its storage {storage.count} in {entry.size} bytes"
+            raise tensor_error(message, "TENSOR_STORAGE_MISMATCH")
+        return self._archive.read(f"data/{storage.key}")
+
+
+def as_tensor(name: str, value: object) -> TensorRef:
+    """``value`` if it is a tensor; otherwise a refusal that says what stands in its place."""
+    if isinstance(value, TensorRef):
+        return value
+    if isinstance(value, (Placeholder, GlobalRef)):
+        message = f"{name} can only be made by running {value.full_name}, which is not allowed"
+        raise tensor_error(message, "UNSAFE_GLOBAL_IN_WEIGHTS")
+    raise tensor_error(f"{name} is a {type(value).__name__}, not a tensor", "TENSOR_EXPECTED")
+
+
+def require_shape(name: str, array: Float32Array, shape: tuple[int | None, ...]) -> None:
+    """Raise FieldFormatError (TENSOR_SHAPE) unless the shapes agree; None stands for any extent above zero."""
+    fits = array.ndim == len(shape) and all(
+        have == want or (want is None and have > 0) for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = tuple("any" if extent is None else extent for extent in shape)
+        raise tensor_error(f"{name} has shape {array.shape}, expected {wanted}", "TENSOR_SHAPE")
+
+
+def finite_float32(name: str, values: npt.NDArray[Any]) -> Float32Array:
+    """The array ``name`` as contiguous float32 in its own shape. Raises FieldFormatError (TENSOR_NOT_FINITE)."""
+    with np.errstate(over="ignore"):  # a number too large for float32 becomes inf, which the check refuses
+        array = np.ascontiguousarray(values, dtype=np.float32).reshape(values.shape)
+    flat = array.reshape(-1)
+    for start in range(0, flat.size, _FINITE_CHUNK):
+        if not np.isfinite(flat[start : start + _FINITE_CHUNK]).all():
+            raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")
+    return array
+
+
+def require_possible(name: str, shape: tuple[int, ...]) -> None:
+    """Raise FieldFormatError (TENSOR_SHAPE) for a shape that no array has, even one of nothing."""
+    if math.prod(max(extent, 1) for extent in shape) > _MAX_ELEMENTS:
+        raise tensor_error(f"{name} has a shape that no array has: {shape}", "TENSOR_SHAPE")
+
+
+def lookup(values: Mapping[Any, Any], name: str) -> object:
+    """The value under ``name``. Raises FieldFormatError (TENSOR_MISSING)."""
+    if name not in values:
+        raise tensor_error(f"{name} is missing", "TENSOR_MISSING")
+    return values[name]
+
+
+def _stored_type(name: str, ref: TensorRef, types: Mapping[str, np.dtype[Any]], sort: str) -> np.dtype[Any]:
+    storage = ref.storage
+    stored = types.get(storage.dtype or "")
+    if stored is None:
+        raise tensor_error(f"{name} is stored as {storage.type_name}; {sort} numbers are needed", "TENSOR_DTYPE")
+    if not _DEVICE.fullmatch(storage.device):
+        raise tensor_error(f"{name} has no data of its own (device {storage.device!r})", "TENSOR_DEVICE")
+    if not ref.plain:
+        raise tensor_error(f"{name} is more than a view of its storage", "TENSOR_NOT_DENSE")
+    return stored
+
+
+def _check_dense(name: str, ref: TensorRef, count: int) -> None:
+    """Every element of the storage occurs exactly once: strides are those of some order of the axes, offset is 0."""
+    require_possible(name, ref.shape)
+    expected = 1
+    for stride, extent in sorted((s, n) for s, n in zip(ref.strides, ref.shape, strict=True) if n != 1):
+        if stride != expected and count:
+            raise tensor_error(f"{name} is not dense: strides {ref.strides} of shape {ref.shape}", "TENSOR_NOT_DENSE")
+        expected *= extent
+    if ref.offset:
+        raise tensor_error(f"{name} begins at element {ref.offset} of its storage", "TENSOR_STORAGE_MISMATCH")
+
+
+def _aligned(flat: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The array where wide loads may read it: torch crashes over the odd addresses that other writers' entries have."""
+    return flat.copy() if flat.ctypes.data % _ALIGNMENT else flat
+
+
+def _in_shape(flat: npt.NDArray[Any], ref: TensorRef) -> npt.NDArray[Any]:
+    order = sorted(range(len(ref.shape)), key=lambda axis: (-ref.strides[axis], ref.shape[axis] == 1))
+    stored = flat.reshape([ref.shape[axis] for axis in order])
+    return stored.transpose(np.argsort(order)) if order else stored

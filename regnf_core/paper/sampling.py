@@ -1,0 +1,110 @@
+"""Multi-view surface sampling (paper, section III-C.1): points on the scene's and the object's surface.
+
+Cameras look at the detected thing from several sides; every ray returns the first point where the field is zero.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidDetectionError, NoSurfaceError
+from regnf_core.fields.base import SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.options import SamplingOptions
+from regnf_core.result import SurfaceSamples
+from regnf_core.surface.cameras import axis_vector, camera_positions, cast_rays
+from regnf_core.surface.extent import surface_extent
+from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, shortest_step
+
+MIN_POINTS = 50
+_BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
+_TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
+_CLEARANCE = 0.75  # a camera keeps this many box diagonals from the centre at least: outside the box, with room to see
+
+
+def sample_scene(
+    scene: SdfField, detection: OrientedBox, options: SamplingOptions, turn: float = 0.0
+) -> SurfaceSamples:
+    """Points of the scene's surface within the detection box, ground removed. Scene frame, scene units.
+
+    ``turn`` (radians) rotates the cameras about the vertical, for an independent set of views.
+    Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION) when fewer than
+    50 points are found, InvalidInputError (FIELD_NOT_FINITE).
+    """
+    check_box_meets_scene(scene, detection)
+    points = _trace_views(scene, detection, options.scene_camera_distance, options, turn)
+    points = points[_above_ground(points, detection, options)]
+    if points.shape[0] < MIN_POINTS:
+        raise NoSurfaceError(
+            f"only {points.shape[0]} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION"
+        )
+    return _with_normals(scene, points)
+
+
+def sample_object(
+    obj: SdfField, options: SamplingOptions, turn: float = 0.0, extent: OrientedBox | None = None
+) -> SurfaceSamples:
+    """Points of the object's surface. Object frame, object units.
+
+    The cameras stand round the object's own surface, not round the field's bounds, which may be much larger;
+    ``extent`` is that surface's box where it is known already.
+    Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
+    """
+    extent = extent or surface_extent(obj)
+    points = _trace_views(obj, extent, options.object_camera_distance, options, turn)
+    if points.shape[0] < MIN_POINTS:
+        raise NoSurfaceError(f"only {points.shape[0]} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
+    return _with_normals(obj, points)
+
+
+def thin_out(samples: SurfaceSamples, limit: int, generator: torch.Generator) -> SurfaceSamples:
+    """At most ``limit`` of the samples, chosen at random by the (CPU) generator."""
+    count = samples.points.shape[0]
+    if count <= limit:
+        return samples
+    chosen = torch.randperm(count, generator=generator)[:limit].sort().values.to(samples.points.device)
+    return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
+
+
+def check_box_meets_scene(scene: SdfField, detection: OrientedBox) -> None:
+    """Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE) when the box lies wholly outside the scene's bounds."""
+    corners = detection.corners()
+    low, high = scene.bounds
+    if bool(((corners.amax(0) <= low) | (corners.amin(0) >= high)).any()):
+        raise InvalidDetectionError("the detection box lies outside the scene", reason="DETECTION_OUTSIDE_SCENE")
+
+
+def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: SamplingOptions, turn: float) -> Tensor:
+    """(M, 3) first surface points, seen from all cameras, within the slightly grown box."""
+    positions = camera_positions(
+        box.centre, max(distance, _CLEARANCE * box.diagonal), options.views, options.up_axis, turn
+    )
+    grown = OrientedBox(box.centre, box.size * (1.0 + _BOX_MARGIN), box.rotation)
+    rays = cast_rays(positions, box.centre, grown.corners(), options.image_size, options.pixel_stride)
+    rays = type(rays)(rays.origins.to(field.device), rays.directions.to(field.device))
+    entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
+    local = type(rays)(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))
+    box_entry, box_exit = clip_to_region(local, -grown.size / 2, grown.size / 2)
+    # A ray is followed from the camera, since what stands before the box hides it, but no farther than through the box.
+    last = torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
+    hits = first_hits(field, rays, entry, last, shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal)
+    return hits.points[grown.contains(hits.points)]
+
+
+def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+    """(N,) bool: which points (N, 3) of the scene lie in the slightly grown box and above the ground."""
+    return detection.contains(points, _BOX_MARGIN) & _above_ground(points, detection, options)
+
+
+def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+    """(N,) bool: which points are above the lowest ``ground_fraction`` of the box's height."""
+    up = axis_vector(options.up_axis)
+    heights = detection.corners() @ up
+    ground = heights.min() + options.ground_fraction * (heights.max() - heights.min())
+    return points @ up.to(points) >= ground.to(points)
+
+
+def _with_normals(field: SdfField, points: Tensor) -> SurfaceSamples:
+    _, gradient = field.signed_distance_and_gradient(points)
+    return SurfaceSamples(points, torch.nn.functional.normalize(gradient.to(points), dim=-1))

@@ -1,0 +1,1 @@
+"""Refinement of pose candidates on the fields: Levenberg-Marquardt on Sim(3)."""

@@ -1,0 +1,1 @@
+"""Pose candidates from samples alone; no field is evaluated."""

@@ -1,0 +1,75 @@
+"""Seeds for the search: rotations from a fixed, even set; scale and shift for each from the two shapes.
+
+Three ways to scale and shift a rotated object onto what the box holds, since each fails where another holds: the
+centroids and root-mean-square radii (bad with clutter), the extents of the points (bad with one stray point), the
+detection box itself (bad when it is loose).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.poses import join, perturb
+
+
+def seeds(
+    scene_points: Tensor, object_points: Tensor, box_axes: Tensor, box_size: Tensor, rotations: Tensor, scales: Tensor
+) -> Sim3:
+    """Poses T_object_scene (H,), working frames, float64: every rotation (K, 3, 3) with every way to scale and shift.
+
+    scene_points (N, 3): what may be the object, the box's centre at 0 · box_axes (3, 3): columns, scene frame ·
+    box_size (3,): full edges · scales: factors (L,) tried about the ratio of the radii.
+    """
+    scene_points, object_points = scene_points.double(), object_points.double()
+    by_moments = _from_moments(scene_points, object_points, rotations, scales)
+    local = scene_points @ box_axes
+    lowest, highest = _extremes(local[None])
+    low, high = _object_extents(object_points, rotations, box_axes)
+    by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
+    by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
+    return join([by_moments, by_points, by_box])
+
+
+def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
+    """A pose and ``count`` perturbed copies: by about 10 degrees, 5 % of the object's size, 10 % of the scale."""
+    spread = torch.tensor([0.17] * 3 + [0.05] * 3 + [0.10], dtype=torch.float64)
+    steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
+    steps[0] = 0.0
+    same = [v.expand(count + 1, *v.shape) for v in (T_start.scale, T_start.rotation, T_start.translation)]
+    return perturb(Sim3(*same), steps)
+
+
+def _from_moments(scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor) -> Sim3:
+    scene_centre, object_centre = scene_points.mean(0), object_points.mean(0)
+    ratio = _radius(object_points, object_centre) / _radius(scene_points, scene_centre)
+    s = (ratio * scales.double())[:, None].expand(-1, rotations.shape[0]).reshape(-1)
+    R = rotations.repeat(scales.shape[0], 1, 1)
+    return Sim3(s, R, object_centre - s[:, None] * (R @ scene_centre))
+
+
+def _from_extents(
+    rotations: Tensor, box_axes: Tensor, of_object: tuple[Tensor, Tensor], of_scene: tuple[Tensor, Tensor]
+) -> Sim3:
+    """The scale that fits the extents along the box's axes best (geometric mean), the middles laid on each other."""
+    ratio = (of_object[1] - of_object[0]) / (of_scene[1] - of_scene[0]).clamp_min(1e-9)  # (K, 3)
+    s = ratio.clamp_min(1e-9).log().mean(-1).exp()
+    turned_axes = rotations @ box_axes  # box axes to object axes
+    object_middle = (turned_axes @ ((of_object[0] + of_object[1]) / 2)[..., None]).squeeze(-1)
+    scene_middle = (turned_axes @ ((of_scene[0] + of_scene[1]) / 2)[..., None]).squeeze(-1)
+    return Sim3(s, rotations, object_middle - s[:, None] * scene_middle)
+
+
+def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest coordinates (K, 3) of the object along the box's axes, for every rotation."""
+    return _extremes(object_points @ (rotations @ box_axes))
+
+
+def _extremes(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest coordinates (K, 3) of point sets (K, N, 3)."""
+    return points.amin(1), points.amax(1)
+
+
+def _radius(points: Tensor, centre: Tensor) -> Tensor:
+    return (points - centre).square().sum(-1).mean().sqrt()

@@ -1,0 +1,1 @@
+"""The decision on a refined pose: evidence, verdict, covariance."""

@@ -1,0 +1,78 @@
+"""Working frames: both fields are seen centred and of size one, so that no number below depends on anybody's units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.schema.kinds.observation_grid import SURFACE, UNSEEN
+
+
+@dataclass(frozen=True, eq=False)
+class WorkingFrame:
+    """x_work = (x - centre) / length. centre: (3,) float64, field frame · length: field units."""
+
+    centre: Tensor
+    length: float
+
+    def into(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the field's frame in the working frame, float32."""
+        return ((points.double().cpu() - self.centre) / self.length).float()
+
+    def out_of(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the working frame in the field's frame, float64."""
+        return points.double().cpu() * self.length + self.centre
+
+    def to_field(self) -> Sim3:
+        """The working frame's points in the field's frame."""
+        return Sim3(
+            torch.tensor(self.length, dtype=torch.float64), torch.eye(3, dtype=torch.float64), self.centre.clone()
+        )
+
+
+class WorkingField:
+    """A field in its working frame: value and gradient at (M, 3) float32 points on the CPU, results on the CPU."""
+
+    def __init__(self, field: SdfField, frame: WorkingFrame) -> None:
+        self.field = field
+        self.frame = frame
+
+    def value(self, points: Tensor) -> Tensor:
+        """Signed distance (M,), working units. Raises InvalidInputError (FIELD_NOT_FINITE)."""
+        distance = self.field.signed_distance(self._own(points)).cpu() / self.frame.length
+        return _finite(distance.float())
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (M,), working units, and its gradient (M, 3). Raises InvalidInputError (FIELD_NOT_FINITE)."""
+        distance, gradient = self.field.signed_distance_and_gradient(self._own(points))
+        return _finite(distance.cpu().float() / self.frame.length), _finite(gradient.cpu().float())
+
+    def _own(self, points: Tensor) -> Tensor:
+        return self.frame.out_of(points).float().to(self.field.device)
+
+
+class WorkingObservation:
+    """What was seen of a field, in its working frame: at (M, 3) float32 points on the CPU."""
+
+    def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
+        self._observation = observation.seen_in(frame.to_field())
+
+    def on_surface(self, points: Tensor) -> Tensor:
+        """(M,) bool: a surface was measured there."""
+        return self._observation.at(points) == SURFACE
+
+    def nobody_looked(self, points: Tensor, _values: Tensor) -> Tensor:
+        """(M,) bool: neither a surface was measured there, nor anything seen through it."""
+        return self._observation.at(points) == UNSEEN
+
+
+def _finite(values: Tensor) -> Tensor:
+    if not torch.isfinite(values).all():
+        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
+    return values

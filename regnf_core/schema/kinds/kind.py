@@ -1,0 +1,72 @@
+"""What every kind of field shares: the entries of its description, a check of its tensors, and a way to build it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from annotated_types import Ge, Le, MaxLen
+
+from regnf_core.schema.kinds.observation_grid import OBSERVATION, ObservationGrid
+from regnf_core.schema.tensor_check import TensorSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from regnf_core.fields.base import SdfField
+
+FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
+Corner = tuple[float, float, float]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FieldDescription(ABC):
+    """Which function a file's tensors parametrise. A kind adds entries of its own and the two methods.
+
+    A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale).
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
+
+    family: str
+    bounds: tuple[Corner, Corner]
+    """Lowest and highest corner of the region where the field has meaning, the field's own frame and unit."""
+    world_scale: Annotated[float, Ge(1e-6), Le(1e6)] = 1.0
+    """Length, in the field's unit, of one unit of the function's coordinates."""
+    sign: Literal[1, -1] = 1
+    """-1: the function is negative in free space."""
+    up_axis: Axis | None = None
+    """Which axis points up, where somebody said so. Changes nothing about the function."""
+    label: Annotated[str, MaxLen(200)] | None = None
+    source: dict[str, Any] = field(default_factory=dict)
+    """Free notes on the field's origin."""
+    observation: ObservationGrid | None = None
+    """What was seen of the volume, if it is known; its states are one more tensor."""
+
+    @property
+    def function_bounds(self) -> tuple[Corner, Corner]:
+        """The bounds in the function's coordinates."""
+        (ax, ay, az), (bx, by, bz) = self.bounds
+        s = self.world_scale
+        return (ax / s, ay / s, az / s), (bx / s, by / s, bz / s)
+
+    def check(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of all tensors that is not as described."""
+        if self.observation is not None:
+            self.observation.check_tensors(tensors)
+            tensors = {name: spec for name, spec in tensors.items() if name != OBSERVATION}
+        self.check_tensors(tensors)
+
+    @abstractmethod
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of the function's tensors that is amiss."""
+
+    @abstractmethod
+    def build(self, tensors: Mapping[str, Tensor]) -> SdfField:
+        """The function as a field, with ``function_bounds``, from tensors that ``check_tensors`` has passed.
+
+        Loads torch. Tensors keep their device; the field evaluates in float32.
+        """

@@ -1,0 +1,61 @@
+"""The kind ``neural_points``: a map of points with features, decoded by a small network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from annotated_types import Ge, Le
+
+from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.kinds.mlp import check_plain_layers, count_layers
+from regnf_core.schema.kinds.voxel_grid import Length
+from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from regnf_core.fields.function_field import FunctionField
+    from regnf_core.fields.neural_points import NeuralPointsFunction
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeuralPointsDescription(FieldDescription):
+    """A field of the neural_points kind; see :class:`regnf_core.fields.neural_points.NeuralPointsFunction`."""
+
+    family: Literal["neural_points"]
+    cell_size: Length
+    """Edge of the cells that hold one point each."""
+    buffer_size: Annotated[int, Ge(1), Le(1 << 40)]
+    """Cells are told apart by a number below this."""
+    reach: Annotated[float, Ge(1), Le(8)]
+    """Points are looked for in cells less than this many cells away."""
+    max_distance: Length
+    """Points farther away than this do not count."""
+    neighbours: Annotated[int, Ge(1), Le(64)]
+    """How many of the nearest points count."""
+    blend_first: bool
+    """True: features are blended, then decoded; false: the other way round."""
+    oriented: bool = False
+    """Whether the points' frames are turned: quaternions tell how."""
+
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
+        layers = count_layers(tensors)
+        names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
+        require_names(tensors, names | {"points", "features"} | ({"orientations"} if self.oriented else set()))
+        points = count_rows(tensors, "points")
+        require_shape(tensors, "points", (points, 3))
+        shape = tensors["features"].shape
+        require(len(shape) == 2, f"features has shape {shape}, expected one row a point")
+        require_shape(tensors, "features", (points, shape[1]))
+        if self.oriented:
+            require_shape(tensors, "orientations", (points, 4))
+        check_plain_layers(tensors, shape[1] + 3)
+
+    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[NeuralPointsFunction]:
+        """The points as a field."""
+        from regnf_core.fields.neural_points import build_neural_points
+
+        return build_neural_points(self, tensors)

@@ -1,0 +1,43 @@
+"""The kind ``voxel_blocks``: distances in blocks of voxels, as maps made from depth images have them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.kinds.voxel_grid import Length, Place
+from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from regnf_core.fields.function_field import FunctionField
+    from regnf_core.fields.voxel_blocks import VoxelBlocksFunction
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelBlocksDescription(FieldDescription):
+    """A field of the voxel_blocks kind; see :class:`regnf_core.fields.voxel_blocks.VoxelBlocksFunction`."""
+
+    family: Literal["voxel_blocks"]
+    origin: Place = (0.0, 0.0, 0.0)
+    """Where the first node of block (0, 0, 0) is, in the function's coordinates."""
+    voxel_size: Length
+    """From node to node."""
+
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
+        require_names(tensors, {"values", "blocks"}, integers={"blocks"})
+        blocks = count_rows(tensors, "blocks")
+        require_shape(tensors, "blocks", (blocks, 3))
+        shape = tensors["values"].shape
+        require(len(shape) == 4 and shape[1] >= 1, f"values has shape {shape}, expected blocks of voxels")
+        require_shape(tensors, "values", (blocks, shape[1], shape[1], shape[1]))
+
+    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[VoxelBlocksFunction]:
+        """The blocks as a field."""
+        from regnf_core.fields.voxel_blocks import build_voxel_blocks
+
+        return build_voxel_blocks(self, tensors)

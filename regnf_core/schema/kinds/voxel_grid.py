@@ -1,0 +1,46 @@
+"""The kind ``voxel_grid``: distances at the nodes of a regular grid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from annotated_types import Ge, Le
+
+from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.tensor_check import TensorSpec, require, require_names
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from regnf_core.fields.box_extension import BoxExtension
+    from regnf_core.fields.function_field import FunctionField
+    from regnf_core.fields.voxel_grid import VoxelGridFunction
+
+Coordinate = Annotated[float, Ge(-1e9), Le(1e9)]
+Place = tuple[Coordinate, Coordinate, Coordinate]
+Length = Annotated[float, Ge(1e-9), Le(1e9)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelGridDescription(FieldDescription):
+    """A field of the voxel_grid kind; see :class:`regnf_core.fields.voxel_grid.VoxelGridFunction`."""
+
+    family: Literal["voxel_grid"]
+    origin: Place
+    """Where node (0, 0, 0) is, in the function's coordinates."""
+    spacing: tuple[Length, Length, Length]
+    """From node to node along x, y and z."""
+
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
+        require_names(tensors, {"values"})
+        shape = tensors["values"].shape
+        require(len(shape) == 3 and min(shape) >= 2, f"values has shape {shape}, expected two nodes an axis at least")
+
+    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[BoxExtension[VoxelGridFunction]]:
+        """The grid as a field."""
+        from regnf_core.fields.voxel_grid import build_voxel_grid
+
+        return build_voxel_grid(self, tensors)

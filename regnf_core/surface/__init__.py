@@ -1,0 +1,1 @@
+"""The zero level of a field: rays, cells, isosurface, point clouds."""

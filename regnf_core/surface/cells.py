@@ -1,0 +1,94 @@
+"""Where a field's surface runs within a region: cells subdivided only where the field says the surface may be.
+
+Costs a few thousand evaluations where a dense grid of the same fineness costs tens of thousands, finds thin parts as
+surely as broad ones, and spreads what it finds evenly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.surface.exterior import FreeSpace
+
+_REACH = 1.15 * 0.5 * 3**0.5
+"""Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""
+_TIGHTENINGS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cubic cells: centres (N, 3) float64, the field's values there (N,), the edge; all in one frame and unit."""
+
+    centres: Tensor
+    values: Tensor
+    edge: float
+
+    def near(self) -> Cells:
+        """The cells that may hold surface."""
+        return self[self.values.abs() <= _REACH * self.edge]
+
+    def __getitem__(self, index: Tensor) -> Cells:
+        return Cells(self.centres[index], self.values[index], self.edge)
+
+    def extent(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest corner (3,) of all cells."""
+        return self.centres.amin(0) - self.edge / 2, self.centres.amax(0) + self.edge / 2
+
+
+def surface_cells(
+    value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int, levels: int
+) -> tuple[Cells, FreeSpace]:
+    """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times.
+
+    ``value`` tells the signed distance (N,) at points (N, 3). The cells may be none. With them comes what the values
+    tell of the free space, on a grid of the finest cells.
+    """
+    cells = _grid(value, low, high, base)
+    start = cells.extent()[0]
+    finest = cells.edge / 2**levels
+    size = ((cells.extent()[1] - start) / finest).round().long().tolist()
+    space = FreeSpace(start, finest, torch.zeros(size, dtype=torch.bool))
+    for level in range(levels + 1):
+        if level > 0:
+            cells = _split(value, cells.near())
+        space.mark(cells.centres[cells.values > _REACH * cells.edge], 2 ** (levels - level))
+    space.mark(cells.centres[cells.values > 0], 1)
+    return cells.near(), space
+
+
+def tighten(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> tuple[Tensor, Tensor]:
+    """The part (3,), (3,) of the region low..high that may hold surface, found by ever smaller grids.
+
+    Where nothing is near the surface the region comes back as it was.
+    """
+    for _ in range(_TIGHTENINGS):
+        near = _grid(value, low, high, base).near()
+        if near.centres.shape[0] == 0:
+            break
+        lowest, highest = near.extent()
+        lowest, highest = torch.maximum(lowest, low), torch.minimum(highest, high)
+        shrunk = float((highest - lowest).max() / (high - low).max())
+        low, high = lowest, highest
+        if shrunk > 0.75:
+            break
+    return low, high
+
+
+def _grid(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> Cells:
+    edge = float((high - low).max()) / base
+    counts = ((high - low) / edge - 1e-9).ceil().clamp_min(1).long()
+    start = (low + high) / 2 - counts * edge / 2
+    axes = [start[k] + (torch.arange(int(counts[k]), dtype=torch.float64) + 0.5) * edge for k in range(3)]
+    centres = torch.cartesian_prod(*axes).reshape(-1, 3)
+    return Cells(centres, value(centres), edge)
+
+
+def _split(value: Callable[[Tensor], Tensor], cells: Cells) -> Cells:
+    edge = cells.edge / 2
+    offsets = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3) * edge  # (8, 3)
+    centres = (cells.centres[:, None] + offsets).reshape(-1, 3)
+    return Cells(centres, value(centres), edge)

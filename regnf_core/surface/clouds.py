@@ -1,0 +1,53 @@
+"""The point clouds of a result, for pictures and viewers: dense where the object is, coarse round it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.options import SamplingOptions
+from regnf_core.paper.sampling import in_detection
+from regnf_core.result import RegistrationResult, SurfaceSamples
+from regnf_core.surface.agreement import object_residuals, scene_residuals
+from regnf_core.surface.densify import densify
+from regnf_core.surface.surroundings import surroundings
+
+_DENSE = 4_200
+_COARSE = 5_500
+_MARGIN = 0.02  # of the object's extent: how far beyond the samples new ones may lie
+
+
+def with_clouds(
+    result: RegistrationResult,
+    scene_field: SdfField,
+    object_field: SdfField,
+    detection: OrientedBox,
+    options: SamplingOptions,
+) -> RegistrationResult:
+    """The result with both clouds densified, their residuals, and the scene round the detection.
+
+    The evaluations it took stand apart from the registration's own, as ``field_evaluations_clouds``.
+    """
+    scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
+    generator = torch.Generator().manual_seed(result.seed)
+    extent = _extent(result.object_samples)
+    A = densify(scene, result.scene_samples, _DENSE, generator, lambda points: in_detection(points, detection, options))
+    B = densify(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
+    residuals = {
+        "scene_points": A.points,
+        "scene_residuals": scene_residuals(scene, obj, A.points, T),
+        "object_points": B.points,
+        "object_residuals": object_residuals(scene, obj, B.points, T),
+    }
+    around = surroundings(scene, detection, _COARSE, generator)
+    metrics = {**result.metrics, "field_evaluations_clouds": float(scene.evaluations + obj.evaluations)}
+    return replace(result, scene_samples=A, object_samples=B, residuals=residuals, surroundings=around, metrics=metrics)
+
+
+def _extent(samples: SurfaceSamples) -> OrientedBox:
+    """The samples' axis-aligned box."""
+    low, high = samples.points.amin(0).tolist(), samples.points.amax(0).tolist()
+    return OrientedBox.from_corners(low, [max(b, a + 1e-9) for a, b in zip(low, high, strict=True)])

@@ -1,0 +1,87 @@
+"""The files of one registration, written into a folder."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.result import RegistrationResult, SurfaceSamples
+from regnf_core.viewing.document import result_document, trace_document
+from regnf_core.viewing.ply import write_ply
+from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR, preview
+
+CONTEXT_COLOUR = (0.80, 0.82, 0.85)
+_ALWAYS = (
+    "scene_points.ply",
+    "object_points.ply",
+    "aligned.ply",
+    "residuals.npz",
+    "trace.json",
+    "transform.npy",
+    "preview.png",
+    "result.json",
+)
+
+
+def write_artifacts(
+    result: RegistrationResult,
+    directory: Path,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    object_name: str | None = None,
+    candidates: list[dict[str, Any]] | None = None,
+) -> list[str]:
+    """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
+
+    ``truth``, ``symmetries``, ``object_name`` and ``candidates`` are for the result document.
+
+    scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, coloured by
+    source), context_points.ply (the scene round the detection, where the result has it), residuals.npz,
+    trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
+    """
+    scene, obj = result.scene_samples, result.object_samples
+    back = result.T_object_scene.inverse()
+    placed = SurfaceSamples(back.apply(obj.points.double().cpu()), obj.normals.double().cpu() @ back.rotation.mT)
+    _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOUR))
+    _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOUR))
+    _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOUR), (placed, OBJECT_COLOUR))
+    names = list(_ALWAYS)
+    if result.surroundings is not None and len(result.surroundings.points):
+        _write_cloud(directory / "context_points.ply", (result.surroundings, CONTEXT_COLOUR))
+        names.append("context_points.ply")
+    arrays: dict[str, Any] = {name: _float32(value) for name, value in result.residuals.items()}
+    np.savez(directory / "residuals.npz", **arrays)
+    _write_json(directory / "trace.json", trace_document(result.trace))
+    np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
+    preview(result).save(directory / "preview.png")
+    device = scene.points.device
+    document = result_document(result, truth, symmetries, device, object_name=object_name, candidates=candidates)
+    _write_json(directory / "result.json", document)
+    return names
+
+
+def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:
+    points = np.concatenate([_float32(samples.points) for samples, _ in parts])
+    normals = np.concatenate([_float32(samples.normals) for samples, _ in parts])
+    colours = np.concatenate(
+        [
+            np.tile((255 * np.array(colour)).round().astype(np.uint8), (len(samples.points), 1))
+            for samples, colour in parts
+        ]
+    )
+    write_ply(path, points, normals, colours)
+
+
+def _write_json(path: Path, values: Any) -> None:
+    path.write_text(json.dumps(values, allow_nan=False, separators=(",", ":")), encoding="utf-8")
+
+
+def _float32(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
+    array: np.ndarray[Any, np.dtype[np.float32]] = values.detach().float().cpu().numpy()
+    return array

@@ -1,0 +1,119 @@
+"""The result document: everything about a registration that fits into JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+import regnf_core
+from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.result import Alternative, IterationRecord, RegistrationResult
+from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.viewing.uncertainty import COVARIANCE_ORDERING, uncertainty
+
+if TYPE_CHECKING:
+    from regnf_core.library import Candidate
+
+
+def result_document(
+    result: RegistrationResult,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    device: torch.device | str = "cpu",
+    *,
+    object_name: str | None = None,
+    candidates: list[dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
+
+    ``symmetries`` are the object's: rotation error and MSSD are the least over them. ``device`` is where it ran.
+    ``object_name`` says whose pose it is, and ``candidates``, of :func:`ranking_document`, among which it was found.
+    """
+    metrics = dict(result.metrics)
+    if truth is not None:
+        metrics |= errors_against_truth(result.T_object_scene, truth, result.object_samples.points, symmetries)
+    return {
+        "verdict": result.verdict,
+        "verdict_reason": result.verdict_reason,
+        "verdict_detail": VERDICT_REASONS.get(result.verdict_reason, ""),
+        "T_object_scene": result.T_object_scene.to_dict(),
+        "T_scene_object": result.T_object_scene.inverse().to_dict(),
+        "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
+        "alternatives": [_alternative(other) for other in result.alternatives],
+        **_covariance(result.covariance),
+        "symmetry": None if result.symmetry is None else asdict(result.symmetry),
+        "metrics": {name: _json_number(value) for name, value in metrics.items()},
+        "object": object_name,
+        "candidates": candidates,
+        "seed": result.seed,
+        "options": result.options,
+        "engine": {
+            "name": "regnf",
+            "version": regnf_core.__version__,
+            "device": str(device),
+            "torch": torch.__version__,
+        },
+    }
+
+
+def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) -> list[dict[str, Any]]:
+    """A search's candidates as plain values, the likeliest first, then those ``unusable``: their names and reasons."""
+    ranked: list[dict[str, Any]] = [
+        {
+            "object": one.name,
+            "stage": one.stage,
+            "score": _json_number(one.score),
+            "verdict": one.verdict,
+            "verdict_reason": one.verdict_reason,
+            "T_object_scene": None if one.T_object_scene is None else one.T_object_scene.to_dict(),
+        }
+        for one in ranking
+    ]
+    nothing = {"stage": "unusable", "score": None, "verdict": None, "T_object_scene": None}
+    return ranked + [{"object": name, **nothing, "verdict_reason": reason} for name, reason in unusable.items()]
+
+
+def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
+    """One plain entry an iteration: the loss, its parts, the kernel, and T_object_scene as a row-major 4x4 matrix."""
+    return [
+        {
+            "iteration": record.iteration,
+            "loss": _json_number(record.loss),
+            "residual_scene": _json_number(record.residual_scene),
+            "residual_object": _json_number(record.residual_object),
+            "regulariser": _json_number(record.regulariser),
+            "kernel_shape": record.kernel_shape,
+            "kernel_scale": record.kernel_scale,
+            "scene_samples": record.scene_samples,
+            "object_samples": record.object_samples,
+            "T_object_scene": {"matrix": record.T_object_scene.matrix().tolist()},
+        }
+        for record in trace
+    ]
+
+
+def _covariance(covariance: Tensor | None) -> dict[str, Any]:
+    if covariance is None:
+        return {"covariance": None, "covariance_ordering": None, "uncertainty": None}
+    rows = [[_json_number(value) for value in row] for row in covariance.tolist()]
+    return {
+        "covariance": rows,
+        "covariance_ordering": list(COVARIANCE_ORDERING),
+        "uncertainty": uncertainty(covariance),
+    }
+
+
+def _alternative(other: Alternative) -> dict[str, Any]:
+    return {"T_object_scene": other.T_object_scene.to_dict(), "score": other.score, "relation": other.relation}
+
+
+def _json_number(value: float) -> float | None:
+    """JSON knows neither NaN nor infinity."""
+    return value if math.isfinite(value) else None

@@ -1,0 +1,136 @@
+"""preview.png: the object over the scene before and after, and how far the surfaces are apart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from regnf_core.geometry.nearest_neighbors import gaps
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.paper.verification import INLIER_DISTANCE
+from regnf_core.result import RegistrationResult, SurfaceSamples
+from regnf_core.surface.cameras import axis_vector
+from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
+
+SCENE_COLOUR = (0.38, 0.58, 0.80)
+OBJECT_COLOUR = (0.95, 0.56, 0.20)
+_BACKGROUND = np.array([0.975, 0.975, 0.97])
+_INK = (52, 56, 62)
+_PANEL = 480
+_OVERSAMPLING = 2
+_CAPTION = 52
+_ELEVATION = np.radians(28.0)
+_DISC_SHARE = 1.5  # disc radius over the typical gap of the cloud: closes the gaps
+_RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable without telling red from green
+    [[0.18, 0.20, 0.46], [0.19, 0.42, 0.56], [0.16, 0.62, 0.54], [0.53, 0.79, 0.34], [0.98, 0.88, 0.18]]
+)
+
+
+def preview(result: RegistrationResult) -> Image.Image:
+    """Three panels side by side in the scene frame: at the start, at the end, and the residuals of both surfaces."""
+    scene = _surfels(result.scene_samples, SCENE_COLOUR)
+    start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOUR)
+    end = _placed(result.object_samples, result.T_object_scene, OBJECT_COLOUR)
+    up = axis_vector(_up_axis(result.options)).numpy()
+    direction = _best_direction(scene, up)
+    edge = _PANEL * _OVERSAMPLING
+    view = view_from(direction, up, np.concatenate([scene.points, start.points, end.points]), edge)
+    radius = _DISC_SHARE * max(float(gaps(torch.from_numpy(cloud.points)).median()) for cloud in (scene, end))
+    residual = _residual_surfels(result, scene, end)
+    before, after = Surfels.join(scene, start), Surfels.join(scene, end)
+    in_front = nearest_surfels(after, view, edge, radius)
+    panels = [
+        _panel(before, nearest_surfels(before, view, edge, radius), view),
+        _panel(after, in_front, view),
+        _panel(residual, in_front, view),  # the same discs in other colours
+    ]
+    sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
+    for number, panel in enumerate(panels):
+        sheet.paste(panel, (number * _PANEL, _CAPTION))
+    _captions(sheet, result)
+    return sheet
+
+
+def _up_axis(options: dict[str, Any]) -> str:
+    """The scene's vertical axis as far as the options say it."""
+    robust = options["robust"]["up_axis"] if options["preset"] == "robust" else None
+    return str(robust or options["sampling"]["up_axis"])
+
+
+def residual_colours(shares: Floats) -> Floats:
+    """(N, 3) colours of |residuals| (N,) given as a share of the ramp's top, clipped to it."""
+    position = np.clip(shares, 0.0, 1.0) * (len(_RAMP) - 1)
+    low = np.minimum(position.astype(np.int64), len(_RAMP) - 2)
+    weight = (position - low)[:, None]
+    colours: Floats = (1.0 - weight) * _RAMP[low] + weight * _RAMP[low + 1]
+    return colours
+
+
+def _surfels(samples: SurfaceSamples, colour: tuple[float, float, float]) -> Surfels:
+    points = samples.points.double().cpu().numpy()
+    return Surfels(points, samples.normals.double().cpu().numpy(), np.broadcast_to(np.array(colour), points.shape))
+
+
+def _placed(samples: SurfaceSamples, T_object_scene: Sim3, colour: tuple[float, float, float]) -> Surfels:
+    """The object's samples in the scene frame."""
+    back = T_object_scene.inverse()
+    moved = SurfaceSamples(back.apply(samples.points.double().cpu()), samples.normals.double().cpu() @ back.rotation.mT)
+    return _surfels(moved, colour)
+
+
+def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfels) -> Surfels:
+    top = INLIER_DISTANCE * result.metrics["object_diameter"]
+    parts = []
+    for cloud, name in ((scene, "scene_residuals"), (placed, "object_residuals")):
+        sizes = result.residuals[name].double().abs().cpu().numpy()
+        parts.append(Surfels(cloud.points, cloud.normals, residual_colours(sizes / top)))
+    return Surfels.join(*parts)
+
+
+def _best_direction(scene: Surfels, up: Floats) -> Floats:
+    """From above and from the side that shows most of the scanned surface."""
+    first = np.roll(up, 1)
+    second = np.cross(up, first)
+    turns = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)[:, None]
+    around = np.cos(turns) * first + np.sin(turns) * second
+    candidates = np.cos(_ELEVATION) * around + np.sin(_ELEVATION) * up
+    shown = np.clip(scene.normals @ candidates.T, 0.0, None).sum(0)
+    best: Floats = candidates[int(shown.argmax())]
+    return best
+
+
+def _panel(cloud: Surfels, nearest: NDArray[np.int64], view: View) -> Image.Image:
+    large = Image.fromarray(paint(cloud, nearest, view, _BACKGROUND))
+    return large.resize((_PANEL, _PANEL), Image.Resampling.LANCZOS)
+
+
+def _captions(sheet: Image.Image, result: RegistrationResult) -> None:
+    draw = ImageDraw.Draw(sheet)
+    title, small = ImageFont.load_default(size=20), ImageFont.load_default(size=14)
+    scale = float(result.T_object_scene.scale)
+    texts = [
+        ("Start", "object (orange) over the scene (blue)"),
+        (result.verdict.capitalize(), f"scale {scale:.4f}, after {int(result.metrics['iterations'])} iterations"),
+        ("Residual", "|S_object(T x) - s S_scene(x)|"),
+    ]
+    for number, (heading, note) in enumerate(texts):
+        left = number * _PANEL + 24
+        draw.text((left, 16), heading, fill=_INK, font=title)
+        draw.text((left, 42), note, fill=(120, 124, 130), font=small)
+    _colour_bar(sheet, draw, small)
+
+
+def _colour_bar(
+    sheet: Image.Image, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont
+) -> None:
+    width, height = 150, 10
+    left, top = 3 * _PANEL - width - 24, 22
+    ramp = residual_colours(np.linspace(0.0, 1.0, width))
+    bar = np.broadcast_to((255 * ramp).astype(np.uint8), (height, width, 3))
+    sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
+    draw.text((left, top + 20), "0", fill=_INK, font=font)
+    draw.text((left + width, top + 20), f"{100 * INLIER_DISTANCE:g} % of diameter", fill=_INK, font=font, anchor="ra")

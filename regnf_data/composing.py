@@ -1,0 +1,204 @@
+"""Datasets rendered from meshes: a furnished room, or one object alone in thin air."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_core.errors import DatasetError
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.bad_view import bad_view, half_view
+from regnf_data.layouts import Furnishing, Layout
+from regnf_data.mesh_scene import MeshScene, Thing, box_thing, load_thing
+from regnf_data.paint import TilePaint
+from regnf_data.posed_images import Instance, PosedImages
+from regnf_data.rendering import Size, View, intrinsics_of, render
+from regnf_data.sensor import DepthSensor
+from regnf_data.trajectories import check_free, long_walk, orbit, pass_by, short_walk
+from regnf_data.walking import WalkingGround
+
+Array = NDArray[np.float64]
+Trajectory = Literal["long", "short", "single"]
+Progress = Callable[[int, int], None]
+"""Told how many images are done, and of how many."""
+
+_FLOOR = TilePaint((0.42, 0.33, 0.22), (0.5, 0.41, 0.29), 0.3)
+_WALL = TilePaint((0.62, 0.62, 0.58), (0.7, 0.71, 0.68), 0.4)
+_FRAMES = {"room": {"long": 240, "short": 60, "single": 1}, "object": {"long": 60, "short": 20, "single": 1}}
+_OBJECT_MARGIN = 0.1
+_SINGLE_MARGIN_M = 0.4
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How images are taken. frames: None for the usual number · size: height, width · sensor: None for exact depths."""
+
+    trajectory: Trajectory = "long"
+    frames: int | None = None
+    size: Size = (120, 160)
+    field_of_view_deg: float = 60.0
+    sensor: DepthSensor | None = field(default_factory=DepthSensor)
+    seed: int = 0
+
+    @property
+    def intrinsics(self) -> Array:
+        """(3, 3)."""
+        return intrinsics_of(self.size, self.field_of_view_deg)
+
+    def count(self, kind: str) -> int:
+        """How many images of a room or an object. Raises DatasetError (DATASET_FRAMES_INVALID)."""
+        usual = _FRAMES[kind][self.trajectory]
+        if self.frames is not None and (self.frames < 1 or (usual == 1 and self.frames != 1)):
+            raise DatasetError(f"{self.frames} frames: a single view is one", reason="DATASET_FRAMES_INVALID")
+        return self.frames or usual
+
+
+def render_room(
+    layout: Layout,
+    options: RenderOptions,
+    *,
+    units_per_metre: float | None = None,
+    object_units_per_metre: Mapping[str, float] | None = None,
+    instance: str | None = None,
+    progress: Progress | None = None,
+) -> PosedImages:
+    """Images of a furnished room, with every piece's box and true transform.
+
+    units_per_metre: of the world, instead of the layout's · object_units_per_metre: of the library objects that the
+    truths lead to, by name, else 1; an object's origin is the middle of its mesh's bounding box · instance: the one
+    that a single view shows; then the bounds are its own, with 40 cm round it, and no other instance is listed.
+    Raises DatasetError (DATASET_NO_FREE_PATH, DATASET_NO_VIEW, DATASET_NO_INSTANCE, DATASET_FRAMES_INVALID),
+    FieldFormatError (MESH_INVALID) and OSError.
+    """
+    count = options.count("room")
+    units = layout.units_per_metre if units_per_metre is None else units_per_metre
+    T_world_metric = scale_and_shift(units, layout.origin_m)
+    scene = room_scene(layout)
+    pieces = list(zip(layout.furnishings, scene.things[-len(layout.furnishings) :], strict=True))
+    if options.trajectory == "single":
+        pieces = [pair for pair in pieces if pair[0].name == instance][:1]
+        if not pieces:
+            raise DatasetError(f"{layout.name} has no instance {instance!r}", reason="DATASET_NO_INSTANCE")
+        poses, bounds = _single_view(layout, scene, pieces[0][1], options)
+    else:
+        walk = long_walk if options.trajectory == "long" else short_walk
+        boxes = [thing.solid.bounds.numpy() for _, thing in pieces]
+        poses, bounds = walk(WalkingGround(scene, layout.floor), boxes, count), scene.bounds
+    images = _taken(scene, poses, bounds, T_world_metric, options, progress)
+    of_object = object_units_per_metre or {}
+    instances = [_instance(thing, piece, T_world_metric, of_object.get(piece.name, 1.0)) for piece, thing in pieces]
+    return replace(images, instances=tuple(instances), masks=None)
+
+
+def render_object(
+    mesh: str | os.PathLike[str],
+    options: RenderOptions,
+    *,
+    units_per_metre: float = 1.0,
+    progress: Progress | None = None,
+) -> PosedImages:
+    """Images of one mesh alone, with masks; the world is the library object's frame, its origin the mesh's middle.
+
+    Raises DatasetError (DATASET_FRAMES_INVALID, DATASET_NO_VIEW), FieldFormatError (MESH_INVALID) and OSError.
+    """
+    count = options.count("object")
+    name = Path(mesh).stem
+    thing = load_thing(mesh, name=name)
+    scene = MeshScene([thing])
+    bounds = thing.solid.bounds.numpy()
+    floor = float(bounds[0, 2])
+    if not (bounds[1] > bounds[0]).any():
+        raise DatasetError("the mesh is a single point", reason="DATASET_NO_VIEW")
+    if options.trajectory == "single":
+        poses = bad_view(scene, thing, options.size, options.intrinsics, floor)[None]
+    else:
+        circle = orbit if options.trajectory == "long" else pass_by
+        poses = circle(bounds, count, half_view(options.size, options.intrinsics), floor)
+    margin = _OBJECT_MARGIN * float((bounds[1] - bounds[0]).max())
+    T_world_metric = scale_and_shift(units_per_metre, bounds.mean(axis=0))
+    images = _taken(scene, poses, bounds + np.array([[-margin], [margin]]), T_world_metric, options, progress)
+    whole = Furnishing(name, Path(mesh), np.eye(4), None)
+    return replace(images, instances=(_instance(thing, whole, T_world_metric, units_per_metre),))
+
+
+def room_scene(layout: Layout) -> MeshScene:
+    """Floor, walls and furniture. Walls reach down through the floor, so that no gap or face lies between them."""
+    bottom = layout.floor[0, 2]
+    walls = [box_thing([*wall[0, :2], min(bottom, wall[0, 2])], wall[1], _WALL) for wall in layout.walls]
+    pieces = [load_thing(piece.mesh, piece.T_room_mesh, piece.name) for piece in layout.furnishings]
+    return MeshScene([box_thing(layout.floor[0], layout.floor[1], _FLOOR), *walls, *pieces])
+
+
+def scale_and_shift(units_per_metre: float, origin_m: tuple[float, float, float] | Array) -> Array:
+    """(4, 4): metres less ``origin_m``, times ``units_per_metre``."""
+    if not 0.0 < units_per_metre < math.inf:
+        raise DatasetError("units per metre must be positive", reason="DATASET_SCALE_INVALID")
+    matrix = np.diag([units_per_metre] * 3 + [1.0])
+    matrix[:3, 3] = -units_per_metre * np.asarray(origin_m)
+    return matrix
+
+
+def _single_view(layout: Layout, scene: MeshScene, thing: Thing, options: RenderOptions) -> tuple[Array, Array]:
+    """The pose (1, 4, 4), metric, and the bounds (2, 3): the thing's with a margin, within the scene's."""
+    floor = float(layout.floor[1, 2])
+    pose = bad_view(scene, thing, options.size, options.intrinsics, floor)
+    lower, upper = thing.solid.bounds.numpy()
+    low, high = scene.bounds
+    return pose[None], np.stack((np.maximum(lower - _SINGLE_MARGIN_M, low), np.minimum(upper + _SINGLE_MARGIN_M, high)))
+
+
+def _taken(
+    scene: MeshScene,
+    poses: Array,
+    bounds: Array,
+    T_world_metric: Array,
+    options: RenderOptions,
+    progress: Progress | None,
+) -> PosedImages:
+    """Images from metric poses, put into the world frame."""
+    check_free(scene, poses)
+    rng = np.random.default_rng(options.seed)
+    units = float(T_world_metric[0, 0])
+    views: list[View] = []
+    depths = []
+    for pose in poses:
+        view = render(scene, options.size, options.intrinsics, pose)
+        sensor = options.sensor
+        depth = view.depth if sensor is None else sensor.measure(view.depth, view.cosine, rng)
+        views.append(view)
+        depths.append((depth * units).astype(np.float32))
+        if progress is not None:
+            progress(len(views), len(poses))
+    T_world_camera = poses.copy()
+    T_world_camera[:, :3, 3] = poses[:, :3, 3] @ T_world_metric[:3, :3].T + T_world_metric[:3, 3]
+    return PosedImages(
+        colours=np.stack([view.colours for view in views]),
+        intrinsics=np.tile(options.intrinsics, (len(poses), 1, 1)),
+        T_world_camera=T_world_camera,
+        bounds=bounds @ T_world_metric[:3, :3].T + T_world_metric[:3, 3],
+        depths=np.stack(depths),
+        masks=np.stack([view.thing >= 0 for view in views]),
+        T_metric_world=np.asarray(np.linalg.inv(T_world_metric), dtype=np.float64),
+    )
+
+
+def _instance(thing: Thing, piece: Furnishing, T_world_metric: Array, object_units: float) -> Instance:
+    """The stated bounds if there are any: detections elsewhere are made of them."""
+    metric = thing.solid.bounds.numpy() if piece.bounds is None else piece.bounds
+    lower, upper = metric @ T_world_metric[:3, :3].T + T_world_metric[:3, 3]
+    mesh_bounds = load_thing(piece.mesh).solid.bounds.numpy()
+    T_world_mesh = T_world_metric @ piece.T_room_mesh
+    return Instance(
+        piece.name,
+        OrientedBox.from_corners(lower.tolist(), upper.tolist(), piece.name),
+        T_object_world=scale_and_shift(object_units, mesh_bounds.mean(axis=0)) @ np.linalg.inv(T_world_mesh),
+        world_pose=T_world_mesh,
+        gt_pose=piece.T_room_mesh,
+    )

@@ -1,0 +1,59 @@
+"""Images of one scene with their cameras, whatever they were read from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_core.geometry.box import OrientedBox
+
+
+@dataclass(frozen=True)
+class Instance:
+    """A thing in the scene, as a detector would name it.
+
+    box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library
+    object, the truth if the dataset tells it · world_pose, gt_pose: (4, 4), the thing's own frame to the world and to
+    the metric frame, as the dataset tells them; nothing is computed from these.
+    """
+
+    label: str
+    box: OrientedBox
+    T_object_world: NDArray[np.float64] | None = None
+    world_pose: NDArray[np.float64] | None = None
+    gt_pose: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """N images of H x W pixels of one scene that stands still.
+
+    The world frame is the one the field is fitted in; its unit is the field's. Cameras look along +z, x to the right, y
+    down (OpenCV). A pixel's centre lies at (column + .5, row + .5).
+    """
+
+    colours: NDArray[np.uint8]
+    """(N, H, W, 3), sRGB."""
+    intrinsics: NDArray[np.float64]
+    """(N, 3, 3), pixels."""
+    T_world_camera: NDArray[np.float64]
+    """(N, 4, 4), camera to world."""
+    bounds: NDArray[np.float64]
+    """(2, 3): lowest and highest corner of the region worth a field, world frame."""
+    depths: NDArray[np.float32] | None = None
+    """(N, H, W): distance along the camera's z axis, world units; 0 where the sensor saw nothing."""
+    masks: NDArray[np.bool_] | None = None
+    """(N, H, W): true on the thing, false on background that the field shall keep free."""
+    instances: tuple[Instance, ...] = ()
+    T_metric_world: NDArray[np.float64] | None = None
+    """(4, 4): world to the metric frame (sdfstudio's ``worldtogt``), if known."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return self.colours.shape[1], self.colours.shape[2]
+
+    def __len__(self) -> int:
+        return len(self.colours)

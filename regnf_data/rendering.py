@@ -1,0 +1,109 @@
+"""RGB-D images of a mesh scene, as an ideal camera would take them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_data.mesh_scene import Hits, MeshScene
+from regnf_data.paint import to_srgb
+
+Size = tuple[int, int]
+"""Height and width, pixels."""
+
+_BACKGROUND = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Shading:
+    """Lambert's cosine law under one far lamp, and light from all around, a little more from above.
+
+    to_lamp: (3,), any length · lamp, ambient: shares of full light; together 1 at most, so that nothing is overexposed.
+    """
+
+    to_lamp: tuple[float, float, float] = (0.5, 0.35, 0.8)
+    lamp: float = 0.55
+    ambient: float = 0.45
+
+    def light(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(P,): light that falls on surfaces with unit normals (P, 3)."""
+        direction = np.array(self.to_lamp) / np.linalg.norm(self.to_lamp)
+        shone: NDArray[np.float64] = self.lamp * np.maximum(normals @ direction, 0.0)
+        return shone + self.ambient * (0.8 + 0.2 * normals[:, 2])
+
+
+@dataclass(frozen=True)
+class View:
+    """One image. colours: (H, W, 3) uint8 sRGB · depth: (H, W) along the camera's z axis, 0 where nothing is ·
+
+    cosine: (H, W) between the ray and the surface's normal · thing: (H, W) index of the thing seen, -1 for none.
+    """
+
+    colours: NDArray[np.uint8]
+    depth: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+    thing: NDArray[np.int64]
+
+
+def intrinsics_of(size: Size, field_of_view_deg: float) -> NDArray[np.float64]:
+    """(3, 3): square pixels, the axis through the image's middle, ``field_of_view_deg`` across its width."""
+    height, width = size
+    focal = width / 2.0 / math.tan(math.radians(field_of_view_deg) / 2.0)
+    return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+
+
+def camera_rays(
+    size: Size, intrinsics: NDArray[np.float64], T_scene_camera: NDArray[np.float64], fine: int = 1
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origins and directions (R, 3) through the middles of ``fine`` x ``fine`` parts of every pixel, row by row.
+
+    A direction's part along the camera's axis is 1: distances along the rays are depths.
+    """
+    rows, columns = ((np.arange(count * fine) + 0.5) / fine for count in size)
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    directions = (T_scene_camera[:3, :3] @ np.linalg.inv(intrinsics) @ pixels).T
+    return np.broadcast_to(T_scene_camera[:3, 3], directions.shape), directions
+
+
+def render(
+    scene: MeshScene,
+    size: Size,
+    intrinsics: NDArray[np.float64],
+    T_scene_camera: NDArray[np.float64],
+    shading: Shading | None = None,
+    fine: int = 3,
+) -> View:
+    """The scene from one camera, depth at the pixels' middles, colours the mean over ``fine`` x ``fine`` rays a pixel.
+
+    size: height and width · intrinsics: (3, 3) · T_scene_camera: (4, 4), a rotation and a translation, OpenCV's axes.
+    ``fine`` must be odd: the ray in the middle gives the depth.
+    """
+    if fine % 2 == 0:
+        raise ValueError("fine must be odd")
+    origins, directions = camera_rays(size, intrinsics, T_scene_camera, fine)
+    hits = scene.cast(origins, directions)
+    height, width = size
+    blocks = _shaded(hits, shading or Shading()).reshape(height, fine, width, fine, 3)
+    middle = slice(fine // 2, None, fine)
+
+    def middles(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values.reshape(height * fine, width * fine)[middle, middle]
+
+    cosine = -np.einsum("rc,rc->r", hits.normal, directions) / np.linalg.norm(directions, axis=1)
+    depth = middles(hits.distance)
+    return View(
+        colours=to_srgb(blocks.mean(axis=(1, 3))),
+        depth=np.where(np.isfinite(depth), depth, 0.0),
+        cosine=middles(cosine),
+        thing=hits.thing.reshape(height * fine, width * fine)[middle, middle],
+    )
+
+
+def _shaded(hits: Hits, shading: Shading) -> NDArray[np.float64]:
+    shaded: NDArray[np.float64] = hits.colour * shading.light(hits.normal)[:, None]
+    shaded[hits.thing < 0] = _BACKGROUND
+    return shaded

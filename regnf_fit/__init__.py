@@ -1,0 +1,1 @@
+"""Fitting of neural signed distance fields: to meshes, and to posed images."""

@@ -1,0 +1,138 @@
+"""What a fit draws from where there are depths: rays that end on a surface, and points known to be free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from regnf_core.geometry.box import OrientedBox
+from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.preparation import PreparedImages
+from regnf_fit.images.rays import PixelRays
+
+_FREE_POOL = 400_000
+_CANDIDATES = 3
+"""So many times the pool are drawn where those near instances are to be chosen from them."""
+_BOX_MARGIN = 0.1
+_VOXEL = 2.0 / 3.0
+"""Bands: measured points closer together than this are averaged before distances to them are taken."""
+_PRECISE = 0.25
+"""Bands: the noise up to which a point tells where the surface is."""
+_ALONE = 3.0
+"""Bands: noisier points count where no precise one is as near as this."""
+_MOST_TRUST = 4.0
+"""At the most a depth counts so many times what the median one does, or so many times less."""
+
+
+@dataclass(frozen=True)
+class DepthSupervision:
+    """What is drawn from in every iteration; lengths in field units.
+
+    rays: (R,) those with depth · before, behind: (R,) how far along them the band reaches before and behind the surface
+    · trust: (R,) what they count, 1 in the mean · detailed: (D,) indices of those that end in an instance's box ·
+    free_points: (P, 3), free by what was seen · clearances: (P,) their distance to the nearest measured surface ·
+    size: the bounds' diagonal.
+    """
+
+    rays: PixelRays
+    before: Tensor
+    behind: Tensor
+    trust: Tensor
+    detailed: Tensor
+    free_points: Tensor
+    clearances: Tensor
+    size: float
+
+    def to(self, device: torch.device) -> DepthSupervision:
+        """The same on another device."""
+        return DepthSupervision(
+            rays=self.rays.to(device),
+            before=self.before.to(device),
+            behind=self.behind.to(device),
+            trust=self.trust.to(device),
+            detailed=self.detailed.to(device),
+            free_points=self.free_points.to(device),
+            clearances=self.clearances.to(device),
+            size=self.size,
+        )
+
+
+def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator) -> DepthSupervision:
+    """The pool of rays with depth whose surface lies in the bounds, and of points known to be free."""
+    rays, size = prepared.training, prepared.size
+    # depths are told from the surface by their noise, or by the width of a pixel there
+    bands = torch.maximum(options.band_deviations * rays.deviations, prepared.pixel * rays.depths)
+    before, behind = bands.clamp_max(options.band * size), (0.5 * bands).clamp_max(options.band_behind * size)
+    seen = (rays.depths > 0.0) & ~rays.background
+    inside = seen & (rays.depths >= rays.near) & (rays.depths <= rays.far)
+    surface = rays.take(inside)
+    ends = surface.at(surface.depths[:, None])[:, 0]
+    usual = float(before[inside].median()) if len(surface) else options.band * size
+    cloud = _cloud(ends.numpy(), surface.deviations.numpy(), usual)
+    free_to = torch.where(seen, rays.depths - before / rays.directions.norm(dim=1), rays.far).minimum(rays.far)
+    is_open = (seen | rays.background) & (free_to > rays.near)
+    points = _free_points(rays.take(is_open), free_to[is_open], prepared.boxes, options.detail_share, rng)
+    return DepthSupervision(
+        rays=surface,
+        before=before[inside],
+        behind=behind[inside],
+        trust=_trust(surface.deviations),
+        detailed=_within(prepared.boxes, ends).nonzero()[:, 0],
+        free_points=points,
+        clearances=torch.from_numpy(cKDTree(cloud).query(points.numpy())[0].astype(np.float32)),
+        size=size,
+    )
+
+
+def _free_points(
+    rays: PixelRays, free_to: Tensor, boxes: Sequence[OrientedBox], detail_share: float, rng: np.random.Generator
+) -> Tensor:
+    """(P, 3) anywhere on the rays up to depths (R,), ``detail_share`` of them within the boxes if there are enough."""
+    if len(rays) == 0:
+        return torch.zeros(0, 3)
+    chosen = torch.from_numpy(rng.integers(len(rays), size=_FREE_POOL * (_CANDIDATES if boxes else 1)))
+    share = torch.from_numpy(rng.random(len(chosen), np.float32))
+    picked = rays.take(chosen)
+    points = picked.at((picked.near + share * (free_to[chosen] - picked.near))[:, None])[:, 0]
+    within = _within(boxes, points).nonzero()[:, 0][: int(detail_share * _FREE_POOL)]
+    return torch.cat((points[within], points[: _FREE_POOL - len(within)]))
+
+
+def _within(boxes: Sequence[OrientedBox], points: Tensor) -> Tensor:
+    """(N,): whether points (N, 3) lie in any of the boxes, each a little grown."""
+    inside = torch.zeros(len(points), dtype=torch.bool)
+    for box in boxes:
+        inside |= box.contains(points, _BOX_MARGIN)
+    return inside
+
+
+def _trust(deviations: Tensor) -> Tensor:
+    """What depths of these deviations (R,) count: the maximum likelihood of L1, within limits, 1 in the mean."""
+    if len(deviations) == 0 or not bool((deviations > 0.0).all()):
+        return torch.ones_like(deviations)
+    weight = (deviations.median() / deviations).clamp(1.0 / _MOST_TRUST, _MOST_TRUST)
+    return weight / weight.mean()
+
+
+def _cloud(points: NDArray[np.float32], deviations: NDArray[np.float32], band: float) -> NDArray[np.float64]:
+    """Averaged points (V, 3). Those too noisy for the band count only where no others are."""
+    precise = deviations <= _PRECISE * band
+    cloud, rough = (_averaged(points[chosen], _VOXEL * band) for chosen in (precise, ~precise))
+    if len(cloud) == 0 or len(rough) == 0:
+        return cloud if len(cloud) else rough
+    alone = np.isinf(cKDTree(cloud).query(rough, distance_upper_bound=_ALONE * band)[0])
+    return np.concatenate((cloud, rough[alone]))
+
+
+def _averaged(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
+    """One point (V, 3) for each occupied voxel: the mean of those within."""
+    cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
+    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index.ravel(), points[:, axis]) for axis in range(3)], axis=1)
+    return np.asarray(sums / counts[:, None])

@@ -1,0 +1,63 @@
+"""What measured depths say about the signed distance.
+
+Near the measured surface the distance along the ray and free space before it, as Azinovic et al. (2022, "Neural RGB-D
+Surface Reconstruction") have it, with two changes for a field that shall be a distance, not one along a ray: the
+distance along the ray is shortened by the cosine between ray and surface, and free points are given their distance to
+the nearest measured surface (as Ortiz et al. 2022, "iSDF") in place of the truncation.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_fit.images.depth_supervision import DepthSupervision
+from regnf_fit.images.options import ReconstructionOptions
+
+_MORE_MATTER = 0.3
+"""What an error counts behind a surface, when a point is less deep than the ray says: the part may be thin."""
+_PLACES_BEHIND = 0.25
+"""The share of the points beside a surface that lie behind it."""
+
+
+def depth_terms(
+    function: NeusFactoFunction, data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The surface's term and that of free space, in diagonals, and the points (N, 3) on and near the surface."""
+    chosen = _draw_rays(data, options, generator)
+    rays = data.rays.take(chosen)
+    offsets = _offsets(data.before[chosen], data.behind[chosen], options.band_samples, generator)
+    cosines = torch.where(rays.cosines > 0.0, rays.cosines, 1.0)
+    depths = rays.depths[:, None] - offsets / rays.directions.norm(dim=1, keepdim=True)
+    near = rays.at(depths)  # (R, 1 + B, 3)
+    free = _draw(len(data.free_points), options.free_points, generator, data.free_points.device)
+    values = function.value(torch.cat((near.flatten(0, 1), data.free_points[free])))
+    beside, beyond = values[: offsets.numel()].view_as(offsets), values[offsets.numel() :]
+    error = beside - offsets * cosines[:, None]
+    weight = torch.where((offsets < 0.0) & (error > 0.0), _MORE_MATTER, 1.0) * data.trust[chosen, None]
+    # where no plane could be laid, only the surface itself is believed
+    weight = torch.where((rays.cosines[:, None] <= 0.0) & (offsets != 0.0), 0.0, weight)
+    surface = (weight * error.abs()).mean() / data.size
+    free_space = (beyond - data.clearances[free]).abs().sum() / max(len(free), 1) / data.size
+    return surface, free_space, near.flatten(0, 1)
+
+
+def _draw_rays(data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator) -> Tensor:
+    """Indices of the rays of one iteration: a share of those that end in instances' boxes, and any."""
+    device = data.free_points.device
+    count = int(options.detail_share * options.surface_rays) if len(data.detailed) else 0
+    detailed = data.detailed[_draw(len(data.detailed), count, generator, device)]
+    return torch.cat((detailed, _draw(len(data.rays), options.surface_rays - count, generator, device)))
+
+
+def _offsets(before: Tensor, behind: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(R, 1 + count): 0 for the surface itself, then distances along the ray before it (positive) and behind."""
+    share = torch.rand(len(before), count, generator=generator).to(before.device)
+    is_behind = (torch.rand(len(before), count, generator=generator) < _PLACES_BEHIND).to(before.device)
+    beside = torch.where(is_behind, -behind[:, None] * share, before[:, None] * share)
+    return torch.cat((torch.zeros_like(before)[:, None], beside), dim=1)
+
+
+def _draw(pool: int, count: int, generator: torch.Generator, device: torch.device) -> Tensor:
+    return torch.randint(max(pool, 1), (count if pool else 0,), generator=generator).to(device)

@@ -1,0 +1,182 @@
+"""Fitting a neus-facto field to posed images."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
+from regnf_core.fields.neus_facto import NeusFactoField
+from regnf_core.fields.observation import Observation
+from regnf_core.fields.safe_format import write_safe_field
+from regnf_core.schema.kinds.observation_grid import OBSERVATION
+from regnf_core.viewing.field_picture import field_picture
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
+from regnf_fit.images.held_out import judge
+from regnf_fit.images.network import DEGREE, RadianceField
+from regnf_fit.images.observing import observe
+from regnf_fit.images.options import ReconstructionOptions, ReconstructionProgress, ReconstructionReport
+from regnf_fit.images.preparation import prepare
+from regnf_fit.images.sdfstudio_export import write_sdfstudio
+from regnf_fit.images.trainer import Trainer
+
+_REPORT_EVERY = 25
+_CHECKPOINTS = 10
+_PICTURES = (0.03, 0.1, 0.3)
+
+
+@dataclass(frozen=True)
+class FitFiles:
+    """Where a fit writes. snapshots: shares of the iterations, in (0, 1), after which the field is written as
+    NAME-after-3-percent beside ``output`` · checkpoint: kept until the fit is done, and gone on from if it is there."""
+
+    output: Path
+    checkpoint: Path | None = None
+    snapshots: tuple[float, ...] = ()
+    pictures: bool = False
+    """Draw the field after 3, 10 and 30 % of the iterations and at the end, beside ``output``, as .png."""
+    sdfstudio: Path | None = None
+    """The field with its colours in the layout of sdfstudio's checkpoints, if wanted."""
+
+
+def reconstruct(
+    images: PosedImages,
+    files: FitFiles,
+    options: ReconstructionOptions | None = None,
+    seed: int = 0,
+    device: str = "auto",
+    progress: ReconstructionProgress | None = None,
+    label: str | None = None,
+    source: dict[str, Any] | None = None,
+) -> ReconstructionReport:
+    """Fit a field to ``images``, write it in the safe format, and say how well it agrees with pixels held out.
+
+    The field's frame is the images' world frame, its bounds are theirs. Deterministic for ``seed`` on one machine's
+    CPU, interrupted or not. Raises DatasetError, FitDivergedError and InvalidInputError (CHECKPOINT_...).
+    """
+    options = options or ReconstructionOptions()
+    started = time.monotonic()
+    torch_device = pick_device(device)
+    rng = np.random.default_rng(seed)
+    prepared = prepare(images, options.start, rng)
+    trainer = Trainer(prepared, options, seed, torch_device, rng)
+    write = _Writer(options, prepared.bounds, label, source or {}, observe(images, options.observation_voxels))
+    key = _key(images, options, seed)
+    if files.checkpoint is not None and files.checkpoint.exists():
+        trainer.resume(read_checkpoint(files.checkpoint, key))
+    loss = _train(trainer, files, key, write, progress)
+    write(trainer.averaged, files.output)
+    if files.pictures:
+        _draw(trainer.averaged, prepared.bounds, files.output.with_suffix(".png"))
+    if files.sdfstudio is not None:
+        write_sdfstudio(trainer.averaged, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
+    if files.checkpoint is not None:
+        files.checkpoint.unlink(missing_ok=True)
+    figures = judge(trainer.averaged, prepared.held_out.to(torch_device), prepared.size)
+    return ReconstructionReport(
+        loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(figures)
+    )
+
+
+def pick_device(name: str) -> torch.device:
+    """``auto``: an NVIDIA GPU where there is one. Raises InvalidOptionsError."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InvalidOptionsError("there is no CUDA device")
+    if name not in ("cpu", "cuda"):
+        raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {name:.40}")
+    return torch.device(name)
+
+
+def _train(
+    trainer: Trainer,
+    files: FitFiles,
+    key: str,
+    write: _Writer,
+    progress: ReconstructionProgress | None,
+) -> float:
+    """Run the iterations that are left; the mean loss of the last ones."""
+    total = trainer.options.iterations
+    snapshots = {max(1, round(share * total)): share for share in files.snapshots}
+    pictures = {max(1, round(share * total)): share for share in _PICTURES if files.pictures}
+    interval = max(1, total // _CHECKPOINTS)
+    started, first = time.monotonic(), trainer.iteration
+    recent = math.nan
+    while trainer.iteration < total:
+        trainer.step()
+        done = trainer.iteration
+        if (done in snapshots or done in pictures) and not trainer.is_finite():
+            raise FitDivergedError(f"the fit diverged before iteration {done}")
+        if done in snapshots:
+            write(trainer.averaged, snapshot_path(files.output, snapshots[done]))
+        if done in pictures:
+            drawn = snapshot_path(files.output, pictures[done]).with_suffix(".png")
+            _draw(trainer.averaged, write.bounds, drawn)
+        if done % _REPORT_EVERY == 0 or done == total or done % interval == 0:
+            recent = trainer.mean_loss()
+            if not math.isfinite(recent) or not trainer.is_finite():
+                raise FitDivergedError(f"the fit diverged about iteration {done}")
+            if files.checkpoint is not None and done % interval == 0 and done < total:
+                write_checkpoint(files.checkpoint, trainer.state(), key)
+            if progress is not None:
+                progress(done, recent, (time.monotonic() - started) / (done - first) * (total - done))
+    return recent
+
+
+def snapshot_path(output: Path, share: float) -> Path:
+    """Where the field after a share of the iterations goes: NAME-after-3-percent.safetensors."""
+    return output.with_name(f"{output.stem}-after-{100.0 * share:g}-percent{output.suffix}")
+
+
+def _draw(field: RadianceField, bounds: torch.Tensor, path: Path) -> None:
+    """A picture of the field as it is; none where it has no surface, or is not finite."""
+    with contextlib.suppress(NoSurfaceError, InvalidInputError):
+        field_picture(NeusFactoField(field.function(), bounds)).save(path)
+
+
+@dataclass(frozen=True)
+class _Writer:
+    """Writes fields of one fit."""
+
+    options: ReconstructionOptions
+    bounds: torch.Tensor
+    label: str | None
+    source: dict[str, Any]
+    observation: Observation | None
+
+    def __call__(self, field: RadianceField, path: Path) -> None:
+        description: dict[str, Any] = {
+            "family": "neus_facto",
+            "hash": asdict(self.options.grid),
+            "positional_encoding": {"degree": DEGREE, "two_pi": False},
+            "use_grid": True,
+            "contraction": "none",
+            "level_mask": None,
+            "bounds": self.bounds.tolist(),
+            "label": self.label,
+            "source": self.source,
+        }
+        tensors = field.tensors()
+        if self.observation is not None:
+            grid, tensors[OBSERVATION] = self.observation.stored()
+            description[OBSERVATION] = asdict(grid)
+        write_safe_field(path, description, tensors)
+
+
+def _key(images: PosedImages, options: ReconstructionOptions, seed: int) -> str:
+    """Tells one fit from another: of the pixels, cameras, options and seed."""
+    digest = hashlib.sha256(repr((options, seed)).encode())
+    for array in (images.colours, images.depths, images.masks, images.intrinsics, images.T_world_camera, images.bounds):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -1,0 +1,102 @@
+"""How well a field agrees with pixels that it was not fitted to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_fit.images.network import RadianceField
+from regnf_fit.images.rays import PixelRays
+
+_STEPS = 64
+_CHUNK = 4096
+_SHORTEST = 0.002
+"""Diagonals: the least step; a field that is no exact distance would otherwise be approached for ever."""
+_BISECTIONS = 6
+
+
+@dataclass(frozen=True)
+class HeldOutFigures:
+    """psnr: decibels, over rays that met a surface · depth errors: field units, where a depth was measured too."""
+
+    psnr: float | None
+    depth_error: float | None
+    depth_error_median: float | None
+    eikonal_error: float
+
+
+@dataclass(frozen=True)
+class FirstHits:
+    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3) · colours (R, 3)."""
+
+    depths: Tensor
+    normals: Tensor
+    colours: Tensor
+
+
+@torch.no_grad()
+def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
+    """Where rays first enter matter: sphere tracing with a least step, then bisection."""
+    parts = [_traced(field, rays.take(index), size) for index in _chunks(len(rays))]
+    if not parts:
+        empty = torch.zeros(0, 3)
+        return FirstHits(empty[:, 0], empty, empty)
+    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals", "colours")))
+
+
+@torch.no_grad()
+def judge(field: RadianceField, rays: PixelRays, size: float) -> HeldOutFigures:
+    """The figures of held-out rays."""
+    rays = rays.take(~rays.background)
+    hits = first_hits(field, rays, size)
+    met = hits.depths > 0.0
+    psnr = None
+    if met.any():
+        error = (hits.colours[met] - rays.colours[met]).square().mean()
+        psnr = -10.0 * math.log10(max(float(error), 1e-10))
+    both = met & (rays.depths > 0.0)
+    depth_error = (hits.depths - rays.depths).abs()[both]
+    norms = hits.normals[met].norm(dim=1)
+    return HeldOutFigures(
+        psnr=psnr,
+        depth_error=float(depth_error.mean()) if both.any() else None,
+        depth_error_median=float(depth_error.median()) if both.any() else None,
+        eikonal_error=float((norms - 1.0).abs().mean()) if met.any() else 1.0,
+    )
+
+
+def _chunks(count: int) -> tuple[Tensor, ...]:
+    return tuple(torch.arange(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
+
+
+def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
+    function = field.function()
+    speed = rays.directions.norm(dim=1)
+    before, depth = rays.near.clone(), rays.near.clone()
+    inside = torch.zeros_like(depth, dtype=torch.bool)
+    for _ in range(_STEPS):
+        active = (~inside & (depth <= rays.far)).nonzero()[:, 0]
+        if len(active) == 0:
+            break
+        moving = rays.take(active)
+        distance = function.value(moving.at(depth[active, None])[:, 0])
+        inside[active] = distance < 0.0
+        on = active[distance >= 0.0]
+        before[on] = depth[on]
+        depth[on] += distance[distance >= 0.0].clamp_min(_SHORTEST * size) / speed[on]
+    hit = inside & (depth > rays.near)
+    low, high = before, depth
+    for _ in range(_BISECTIONS):
+        middle = (low + high) / 2.0
+        matter = function.value(rays.at(middle[:, None])[:, 0]) < 0.0
+        low, high = torch.where(matter, low, middle), torch.where(matter, middle, high)
+    points = rays.at(high[:, None])[:, 0]
+    normals = function.value_and_gradient(points)[1]
+    directions = torch.nn.functional.normalize(rays.directions, dim=1)
+    colours = field.colour(
+        points, directions, torch.nn.functional.normalize(normals, dim=1), field.distance_and_feature(points)[1]
+    )
+    return FirstHits(torch.where(hit, high, 0.0), normals, colours)

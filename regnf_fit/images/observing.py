@@ -1,0 +1,121 @@
+"""What posed depth images have seen of a volume."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import load_file
+from torch import Tensor
+
+from regnf_core.errors import DatasetError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation
+from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
+from regnf_core.schema.kinds.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
+from regnf_data.posed_images import PosedImages
+
+_MARGIN = 1.0
+"""Voxels before a measured surface that may be matter as well."""
+_PIXELS = 1.2
+"""Widths of a pixel that a voxel is across at least: narrower ones would fall between the pixels' rays."""
+_CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
+"""So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
+
+
+def observe(images: PosedImages, voxels: int) -> Observation | None:
+    """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colours): what
+    a camera looked through is free, where a depth ends there is a surface, nobody looked at the rest.
+
+    voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
+    Voxels are judged by their centres, in every image that shows them.
+    """
+    if images.depths is None or voxels == 0:
+        return None
+    low, high = torch.from_numpy(images.bounds)
+    voxel = max(float((high - low).max()) / voxels, _PIXELS * _pixel_width(images))
+    counts = [int(n) for n in ((high - low) / voxel - 1e-9).ceil().clamp_min(1)]
+    states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
+    axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
+    centres = torch.cartesian_prod(*axes).float()
+    left = torch.arange(len(centres))
+    for image in range(len(images)):
+        free = _looked_through(centres[left], images, image, _MARGIN * voxel)
+        states[left[free]] = FREE
+        left = left[~free]
+    ends = torch.cat([_ends(images, image) for image in range(len(images))])
+    cells = ((ends - low) / voxel).floor().long()
+    x, y, z = cells[((cells >= 0) & (cells < torch.tensor(counts))).all(-1)].unbind(-1)
+    states.view(counts)[x, y, z] = SURFACE
+    return Observation(states.view(counts), low, voxel)
+
+
+def _pixel_width(images: PosedImages) -> float:
+    """The median width of a pixel where its depth ends; 0 where none does."""
+    assert images.depths is not None
+    widths = (images.depths / images.intrinsics[:, 0, 0, None, None])[images.depths > 0.0]
+    return float(np.median(widths)) if widths.size else 0.0
+
+
+def _looked_through(centres: Tensor, images: PosedImages, image: int, margin: float) -> Tensor:
+    """(N,) bool: which centres (N, 3) lie before what one image shows, by ``margin`` along the camera's axis."""
+    assert images.depths is not None
+    T = torch.from_numpy(np.linalg.inv(images.T_world_camera[image])).float()
+    local = centres @ T[:3, :3].T + T[:3, 3]
+    z = local[:, 2]
+    pixel = local @ torch.from_numpy(images.intrinsics[image]).float().T
+    column, row = (pixel[:, :2] / z.clamp_min(1e-6)[:, None]).floor().unbind(-1)
+    height, width = images.size
+    shown = (z > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = shown.nonzero()[:, 0]
+    places = row[at].long(), column[at].long()
+    measured = torch.from_numpy(images.depths[image])[places]
+    free = (measured > 0.0) & (z[at] < measured - margin)
+    if images.masks is not None:
+        free |= torch.from_numpy(~images.masks[image])[places]
+    return torch.zeros_like(shown).index_put((at,), free)
+
+
+def _ends(images: PosedImages, image: int) -> Tensor:
+    """(M, 3) float64 where one image's depths end, world frame; the background's are none."""
+    assert images.depths is not None
+    depths: NDArray[np.float32] = images.depths[image]
+    row, column = np.nonzero(depths > 0.0 if images.masks is None else (depths > 0.0) & images.masks[image])
+    z = depths[row, column].astype(np.float64)
+    rays = np.stack([column + 0.5, row + 0.5, np.ones_like(z)], -1) @ np.linalg.inv(images.intrinsics[image]).T
+    T = images.T_world_camera[image]
+    return torch.from_numpy((rays * z[:, None]) @ T[:3, :3].T + T[:3, 3])
+
+
+def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Observation:
+    """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
+
+    Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
+    images saw one; FieldFormatError as :func:`regnf_core.fields.safe_format.open_field`.
+    """
+    seen = observe(images, voxels)
+    if seen is None:
+        raise DatasetError("what was seen is told from depths, and there are none", reason="DATASET_DEPTH_MISSING")
+    _check_frame(open_field(path), seen)
+    description = read_description(path)
+    scale = float(description["world_scale"])
+    grid, words = replace(seen, low=seen.low / scale, voxel=seen.voxel / scale).stored()
+    tensors = {**load_file(path), OBSERVATION: words}
+    write_safe_field(path, {**description, OBSERVATION: asdict(grid)}, tensors)
+    return seen
+
+
+def _check_frame(field: SdfField, seen: Observation) -> None:
+    """Raise DatasetError (DATASET_OF_ANOTHER_FRAME) unless the field's surface runs where one was measured."""
+    cells = (seen.states == SURFACE).nonzero()
+    cells = cells[:: max(1, len(cells) // _CHECKED)]
+    points = ((cells + 0.5) * seen.voxel + seen.low).float()
+    distance = field.signed_distance(points.to(field.device)).abs().cpu()
+    if len(cells) == 0 or not float((distance <= _NEAR * seen.voxel).float().mean()) >= _AGREEING:
+        raise DatasetError(
+            "the field has no surface where the images saw one: are they of the same scene, in the same frame?",
+            reason="DATASET_OF_ANOTHER_FRAME",
+        )

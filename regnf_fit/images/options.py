@@ -1,0 +1,119 @@
+"""Options of a fit to images, and what it reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from regnf_core.schema.hash_grid_config import HashGridConfig
+
+ReconstructionProgress = Callable[[int, float, float], None]
+"""Called now and then with the iteration, its loss and an estimate of the seconds left. May raise to stop the fit."""
+
+Start = Literal["auto", "object", "room"]
+"""The shape a field starts from: a ball in free space, a hollow ball in matter, or what the cameras' places suggest."""
+
+
+def _default_grid() -> HashGridConfig:
+    return HashGridConfig.from_top_resolution(
+        512, levels=8, features_per_level=2, log2_table_size=15, base_resolution=16
+    )
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """What each term counts; docs/fitting.md tells what it does and where it comes from.
+
+    Lengths are measured in diagonals of the bounds, so that a cup and a room are weighted alike.
+    """
+
+    colour: float = 1.0
+    eikonal: float = 0.4
+    """The paper's lambda, against a colour term of weight 1."""
+    surface: float = 20.0
+    """|signed distance| where a depth was measured, and the distance along the ray near it."""
+    free_space: float = 10.0
+    rendered_depth: float = 2.0
+    opacity: float = 0.1
+    """Rays of the mask's background let through, the others not; without depth alone."""
+
+
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """How a field is fitted to images. Lengths are shares of the bounds' diagonal."""
+
+    grid: HashGridConfig = field(default_factory=_default_grid)
+    """The hash grid over [-2, 2]^3: more entries and a finer top level keep thinner parts, in a larger file."""
+    hidden_layers: int = 2
+    hidden_width: int = 64
+    feature_width: int = 16
+    """What the geometry's network hands to the colour's."""
+    iterations: int = 3000
+    surface_rays: int = 512
+    """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
+    band_samples: int = 3
+    free_points: int = 1024
+    eikonal_points: int = 512
+    """Points an iteration for the Eikonal term, half of them near surfaces, half anywhere in the bounds."""
+    colour_rays: int = 64
+    """Rays an iteration for colour and opacity, where there is depth."""
+    rays_without_depth: int = 384
+    """The same where there is none: colour is all there is to learn from."""
+    band_deviations: float = 5.0
+    """How far before a measured surface the distance along the ray is believed, in standard deviations of the depth's
+    noise, or a pixel's width there if that is more; half as far behind it."""
+    band: float = 0.012
+    """At most so far before it."""
+    band_behind: float = 0.006
+    """At most so far behind it: half of the thinnest part worth having."""
+    detail_share: float = 0.5
+    """The share of rays and free points that are drawn from within the boxes of the dataset's instances, if any."""
+    weights: LossWeights = field(default_factory=LossWeights)
+    levels_at_start: int = 4
+    """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""
+    level_interval: float = 0.03
+    """The share of the iterations from one level to the next."""
+    averaging: float = 0.99
+    """Decay of the moving average of the parameters, which is what is written; 0 for none."""
+    table_rate: float = 1e-2
+    network_rate: float = 2e-3
+    final_rate: float = 0.01
+    """The learning rates' share that is left at the end of their cosine decay."""
+    start: Start = "auto"
+    observation_voxels: int = 160
+    """Voxels along the longest side of the grid that tells what was seen, where there are depths; 0: none is kept."""
+    half_table: bool = True
+    """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
+
+    def learning_levels(self, iteration: int) -> int:
+        """How many of the grid's levels learn at ``iteration``, coarsest first."""
+        steps = iteration / (self.level_interval * self.iterations) if self.level_interval > 0.0 else math.inf
+        return self.grid.levels if math.isinf(steps) else min(self.levels_at_start + int(steps), self.grid.levels)
+
+    def decay(self, iteration: int) -> float:
+        """Of the moving average at ``iteration``: less at first, so that the start is soon forgotten."""
+        return min(self.averaging, (1.0 + iteration) / (10.0 + iteration))
+
+    def rate_share(self, iteration: int) -> float:
+        """What is left of the learning rates at ``iteration``: a cosine from 1 down to ``final_rate``."""
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(iteration / self.iterations, 1.0)))
+        return self.final_rate + (1.0 - self.final_rate) * cosine
+
+
+@dataclass(frozen=True)
+class ReconstructionReport:
+    """How well a field agrees with pixels that it was not fitted to."""
+
+    loss: float
+    """Mean over the last iterations."""
+    psnr: float | None
+    """Of the colours, decibels; None: no ray met a surface."""
+    depth_error: float | None
+    """Mean |rendered - measured depth|, field units, where both are; None without depth. Sensor noise is part of it."""
+    depth_error_median: float | None
+    eikonal_error: float
+    """Mean ||gradient| - 1| near the surface."""
+    iterations: int
+    seconds: float

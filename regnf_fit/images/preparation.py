@@ -1,0 +1,72 @@
+"""From images to what a fit draws from: rays to learn from, rays to judge by, and the shape to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.checks import check_images, check_seen
+from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.network import StartShape
+from regnf_fit.images.options import Start
+from regnf_fit.images.rays import PixelRays, rays_of_pixels
+
+_MOST_PIXELS = 3_000_000
+_HELD_OUT_SHARE = 0.02
+_MOST_HELD_OUT = 4_000
+_START_RADIUS = 0.2
+"""Diagonals: smaller than most objects, so that what is seen grows from it."""
+
+
+@dataclass(frozen=True)
+class PreparedImages:
+    """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
+    instances that the dataset names · pixel: a pixel's width at depth 1."""
+
+    training: PixelRays
+    held_out: PixelRays
+    start: StartShape
+    bounds: torch.Tensor
+    size: float
+    has_depth: bool
+    boxes: tuple[OrientedBox, ...]
+    pixel: float
+
+
+def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
+    """The rays that meet the bounds, at most three million. Raises DatasetError, see :func:`check_images`."""
+    check_images(images)
+    pixels = rng.permutation(images.colours[..., 0].size)[:_MOST_PIXELS]
+    planes = None if images.depths is None else local_planes(images.depths, images.intrinsics)
+    rays = rays_of_pixels(images, pixels, planes)
+    rays = rays.take(rays.far > rays.near)
+    has_depth = images.depths is not None
+    shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
+    check_seen(int(shown.sum()) if has_depth else int((~rays.background).sum()))
+    judged = min(int(_HELD_OUT_SHARE * len(rays)), _MOST_HELD_OUT)
+    order = torch.arange(len(rays))
+    return PreparedImages(
+        training=rays.take(order[judged:]),
+        held_out=rays.take(order[:judged]),
+        start=start_shape(images, start),
+        bounds=torch.from_numpy(images.bounds),
+        size=float(np.linalg.norm(images.bounds[1] - images.bounds[0])),
+        has_depth=has_depth,
+        boxes=tuple(instance.box for instance in images.instances),
+        pixel=float(1.0 / np.median(images.intrinsics[:, 0, 0])),
+    )
+
+
+def start_shape(images: PosedImages, start: Start) -> StartShape:
+    """A ball in the middle of the bounds; for a room a hollow one, so large that the cameras are in free space."""
+    low, high = images.bounds
+    centre = (low + high) / 2.0
+    cameras = images.T_world_camera[:, :3, 3]
+    within = ((cameras > low) & (cameras < high)).all(axis=1).mean()
+    hollow = start == "room" or (start == "auto" and within > 0.5)
+    size = float(np.linalg.norm(high - low))
+    return StartShape(torch.from_numpy(centre).float(), (0.5 if hollow else _START_RADIUS) * size, hollow)

@@ -1,0 +1,91 @@
+"""Rays through the pixels of posed images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from regnf_data.posed_images import PosedImages
+from regnf_fit.images.depth_normals import LocalPlanes
+
+
+@dataclass(frozen=True)
+class PixelRays:
+    """R rays, one a pixel, world frame.
+
+    A point at depth z lies at origins + z directions: directions (R, 3) are not of unit length, their part along the
+    camera's axis is 1. near, far: (R,) depths between which the ray is inside the bounds · colours: (R, 3) in [0, 1] ·
+    depths: (R,), 0 where none was measured · background: (R,) true where a mask says so · cosines: (R,) between ray
+    and surface normal, 0 where unknown · deviations: (R,) of the depths' noise, 0 where unknown.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    near: Tensor
+    far: Tensor
+    colours: Tensor
+    depths: Tensor
+    background: Tensor
+    cosines: Tensor
+    deviations: Tensor
+
+    def __len__(self) -> int:
+        return self.origins.shape[0]
+
+    def take(self, index: Tensor) -> PixelRays:
+        """The rays at ``index`` (M,), or where a mask (R,) is true."""
+        return PixelRays(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def to(self, device: torch.device) -> PixelRays:
+        """The same rays on another device."""
+        return PixelRays(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+    def at(self, depths: Tensor) -> Tensor:
+        """Points (R, S, 3) at depths (R, S)."""
+        return self.origins[:, None] + depths[..., None] * self.directions[:, None]
+
+
+def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: LocalPlanes | None) -> PixelRays:
+    """The rays of ``pixels`` (R,), indices into the images' (N, H, W) taken as one row.
+
+    planes: of the images' depths.
+    """
+    image, row, column = np.unravel_index(pixels, images.colours.shape[:3])
+    centres = np.stack([column + 0.5, row + 0.5, np.ones(len(pixels))], axis=-1)
+    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
+    directions = np.einsum("rij,rj->ri", T_world_pixel[image], centres)
+    origins = images.T_world_camera[image, :3, 3]
+    near, far = depths_in_box(origins, directions, images.bounds)
+
+    def picked(values: NDArray[np.generic] | None) -> Tensor:
+        if values is None:
+            return torch.zeros(len(pixels))
+        return torch.from_numpy(values[image, row, column]).float()
+
+    return PixelRays(
+        origins=torch.from_numpy(origins).float(),
+        directions=torch.from_numpy(directions).float(),
+        near=torch.from_numpy(near).float(),
+        far=torch.from_numpy(far).float(),
+        colours=picked(images.colours) / 255.0 if len(pixels) else torch.zeros(0, 3),
+        depths=picked(images.depths),
+        background=picked(None if images.masks is None else ~images.masks) > 0.5,
+        cosines=picked(None if planes is None else planes.cosines),
+        deviations=picked(None if planes is None else planes.deviations),
+    )
+
+
+def depths_in_box(
+    origins: NDArray[np.float64], directions: NDArray[np.float64], bounds: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths (R,) at which rays enter and leave ``bounds`` (2, 3); where they miss it, far is not beyond near."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = (bounds[:, None] - origins) / directions  # (2, R, 3)
+    # 0 / 0: the ray lies in the face's plane, which does not cut it off
+    low = np.nan_to_num(crossings.min(axis=0), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+    high = np.nan_to_num(crossings.max(axis=0), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+    return np.maximum(low.max(axis=1), 0.0), high.min(axis=1)

@@ -1,0 +1,55 @@
+"""A fitted field in the layout of sdfstudio's neus-facto checkpoints, colours included."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from regnf_fit.images.network import RadianceField
+
+_EMBEDDING = 32
+"""Columns of the colour's network for an image's appearance, which our fields have not: zeros."""
+
+
+def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path) -> None:
+    """Write a checkpoint {step, pipeline} to ``path``, whole or not at all. bounds: (2, 3), the field's frame.
+
+    The distances are those of the field before its table is rounded to half precision.
+    """
+    layers = dict(enumerate(zip(field.weights, field.biases, strict=True)))
+    last = len(layers) - 1
+    entries: dict[str, Tensor] = {"aabb": bounds.float(), "encoding.params": field.table.flatten()}
+    for i, (weight, bias) in layers.items():
+        if i == last:  # the feature's rows follow the distance's
+            weight, bias = torch.cat((weight, field.feature_weight)), torch.cat((bias, field.feature_bias))
+        entries |= _normalised(f"glin{i}", weight, bias)
+    colours = zip(field.colour_weights, field.colour_biases, strict=True)
+    for i, (weight, bias) in enumerate(colours):
+        if i == 0:
+            weight = torch.cat((weight, weight.new_zeros(len(weight), _EMBEDDING)), dim=1)
+        entries |= _normalised(f"clin{i}", weight, bias)
+    # sdfstudio keeps a tenth of the sharpness's logarithm; the density of VolSDF beside it is not used
+    entries["deviation_network.variance"] = torch.tensor([math.log(sharpness) / 10.0])
+    entries["laplace_density.beta"] = torch.tensor([0.1])
+    entries["laplace_density.beta_min"] = torch.tensor([1e-4])
+    entries["embedding_appearance.embedding.weight"] = torch.zeros(1, _EMBEDDING)
+    pipeline = {f"_model.field.{name}": value.detach().cpu().clone() for name, value in entries.items()}
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
+    try:
+        torch.save({"step": field.options.iterations, "pipeline": pipeline}, temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _normalised(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:
+    """A layer with weight normalisation: W = g v / |v|, row by row; here v = W."""
+    return {
+        f"{name}.weight_g": weight.norm(dim=1, keepdim=True),
+        f"{name}.weight_v": weight,
+        f"{name}.bias": bias,
+    }

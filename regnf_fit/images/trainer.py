@@ -1,0 +1,173 @@
+"""One fit: the field, what it is fitted to, and the state between two iterations."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
+from regnf_fit.images.depth_supervision import DepthSupervision, supervise
+from regnf_fit.images.depth_terms import depth_terms
+from regnf_fit.images.network import RadianceField
+from regnf_fit.images.opacity import least_sharpness
+from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.preparation import PreparedImages
+
+_SHARPEST = 50.0
+"""How far above the least sharpness the learnt one may rise."""
+_SHARPNESS_RATE = 5.0
+"""The sharpness learns so much faster than the networks: it is one number with far to go."""
+
+
+class Trainer:
+    """Fits a :class:`RadianceField`; everything random comes from one generator, so that a state can be resumed."""
+
+    def __init__(
+        self,
+        prepared: PreparedImages,
+        options: ReconstructionOptions,
+        seed: int,
+        device: torch.device,
+        rng: np.random.Generator,
+    ) -> None:
+        self.options = options
+        self.iteration = 0
+        self._losses: list[Tensor] = []
+        self.generator = torch.Generator().manual_seed(seed)
+        self.field = RadianceField(options, prepared.start, self.generator).to(device)
+        self.averaged = copy.deepcopy(self.field).requires_grad_(False)
+        """The moving average of ``field``: what is worth writing while the learning rates are still high."""
+        self._level_ends = list(itertools.accumulate(options.grid.level_entries()))
+        self._size = prepared.size
+        self._rays = prepared.training.to(device)
+        self._data: DepthSupervision | None = None
+        if prepared.has_depth:
+            self._data = supervise(prepared, options, rng).to(device)
+        self._masked = bool(prepared.training.background.any())
+        self._bounds = prepared.bounds.float().to(device)
+        self._device = device
+        field = self.field
+        networks = [*field.weights, *field.biases, *field.colour_weights, *field.colour_biases]
+        networks += [field.feature_weight, field.feature_bias, field.background]
+        self.optimiser = torch.optim.Adam(
+            [
+                {"params": [field.table], "lr": options.table_rate, "eps": 1e-15},
+                {"params": networks, "lr": options.network_rate},
+                {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate},
+            ],
+            betas=(0.9, 0.99),
+            fused=True,
+        )
+        self._rates = [group["lr"] for group in self.optimiser.param_groups]
+
+    def mean_loss(self) -> float:
+        """Of the iterations since the last call; NaN before the first."""
+        losses, self._losses = self._losses, []
+        return float(torch.stack(losses).mean()) if losses else math.nan
+
+    def is_finite(self) -> bool:
+        """Whether all parameters are numbers."""
+        return all(bool(torch.isfinite(parameter).all()) for parameter in self.field.parameters())
+
+    def step(self) -> None:
+        """One iteration."""
+        share = self.options.rate_share(self.iteration)
+        for group, rate in zip(self.optimiser.param_groups, self._rates, strict=True):
+            group["lr"] = rate * share
+        loss = self._loss()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._hold_back_fine_levels()
+        self.optimiser.step()
+        with torch.no_grad():
+            self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
+            keep = self.options.decay(self.iteration)
+            for average, parameter in zip(self.averaged.parameters(), self.field.parameters(), strict=True):
+                average.lerp_(parameter, 1.0 - keep)
+        self.iteration += 1
+        self._losses.append(loss.detach())
+
+    def _hold_back_fine_levels(self) -> None:
+        """Coarse to fine, as Li et al. (2023, "Neuralangelo"): a level that does not learn yet stays next to zero."""
+        levels = self.options.learning_levels(self.iteration)
+        if self.field.table.grad is not None and levels < len(self._level_ends):
+            self.field.table.grad[self._level_ends[levels - 1] :] = 0.0
+
+    def sharpness(self) -> Tensor:
+        """The opacity's sharpness now, per field unit."""
+        least = least_sharpness(self.iteration / self.options.iterations, self._size)
+        return least * self.field.log_sharpness.exp()
+
+    def _loss(self) -> Tensor:
+        weights = self.options.weights
+        function = self.field.function()
+        if self._data is None:
+            loss, near = self._colour_alone()
+            return loss + weights.eikonal * self._eikonal(function, near)
+        surface, free_space, near = depth_terms(function, self._data, self.options, self.generator)
+        loss = weights.surface * surface + weights.free_space * free_space
+        loss = loss + weights.eikonal * self._eikonal(function, near)
+        if self.options.colour_rays > 0:
+            loss = loss + self._colour(self._data)
+        return loss
+
+    def _eikonal(self, function: NeusFactoFunction, near: Tensor) -> Tensor:
+        half = self.options.eikonal_points // 2
+        chosen = torch.randint(len(near), (half,), generator=self.generator).to(self._device)
+        anywhere = torch.rand(half, 3, generator=self.generator).to(self._device)
+        anywhere = self._bounds[0] + anywhere * (self._bounds[1] - self._bounds[0])
+        _, gradient = function.value_and_gradient(torch.cat((near[chosen], anywhere)))
+        loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
+        return loss
+
+    def _colour(self, data: DepthSupervision) -> Tensor:
+        """Colour and rendered depth of rays with depth, L1 both."""
+        options = self.options
+        index = torch.randint(len(data.rays), (options.colour_rays,), generator=self.generator).to(self._device)
+        rays = data.rays.take(index)
+        depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
+        rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
+        colour = (rendered.colours - rays.colours).abs().mean()
+        depth = (rendered.depths - rays.depths).abs().mean() / data.size
+        return options.weights.colour * colour + options.weights.rendered_depth * depth
+
+    def _colour_alone(self) -> tuple[Tensor, Tensor]:
+        """The terms of rays without depth, and points (N, 3) close to where they end."""
+        weights = self.options.weights
+        index = torch.randint(len(self._rays), (self.options.rays_without_depth,), generator=self.generator)
+        rays, sharpness = self._rays.take(index.to(self._device)), self.sharpness()
+        depths = samples_by_weight(self.field.function(), rays, sharpness.detach(), self.generator)
+        rendered = render_rays(self.field, rays, depths, sharpness, self.field.background.sigmoid())
+        error = (rendered.colours - rays.colours).abs().mean(dim=1)
+        # what lies behind a masked thing has no colour of its own
+        loss = weights.colour * error[~rays.background].sum() / len(rays)
+        if self._masked:
+            wanted = (~rays.background).float()
+            opacity = rendered.opacity.clamp(1e-4, 1.0 - 1e-4)
+            loss = loss + weights.opacity * torch.nn.functional.binary_cross_entropy(opacity, wanted)
+        return loss, rays.at(rendered.depths.detach()[:, None])[:, 0]
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next iteration depends on."""
+        return {
+            "iteration": self.iteration,
+            "field": self.field.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def resume(self, state: dict[str, Any]) -> None:
+        """Go on from a :meth:`state`."""
+        self.iteration = state["iteration"]
+        self.field.load_state_dict(state["field"])
+        self.averaged.load_state_dict(state["averaged"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])

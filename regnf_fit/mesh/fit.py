@@ -1,0 +1,151 @@
+"""Fitting a neus-facto field to an exact signed distance field."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.safe_format import open_field, write_safe_field
+from regnf_fit.mesh.network import DEGREE, TrainableField
+from regnf_fit.mesh.options import FitOptions, FitProgress, FitReport
+from regnf_fit.mesh.samples import ExactSamples, diagonal, near_samples, padded_bounds, volume_samples
+
+_CHECK_POINTS = 20_000
+_REPORT_EVERY = 50
+_GRID_RADIUS = 2.0
+
+
+def fit_field(
+    target: SdfField,
+    path: str | os.PathLike[str],
+    options: FitOptions | None = None,
+    seed: int = 0,
+    progress: FitProgress | None = None,
+    label: str | None = None,
+    source: dict[str, Any] | None = None,
+) -> FitReport:
+    """Fit a field to ``target``, write it to ``path`` in the safe format, and say how well it agrees.
+
+    The target's frame is kept: its padded bounds must lie within [-2, 2]^3, the hash grid's cube. Deterministic for
+    ``seed`` on one machine. Raises InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET).
+    """
+    options = options or FitOptions()
+    if padded_bounds(target, options.padding).abs().max() > _GRID_RADIUS:
+        raise InvalidInputError(
+            "the target with its padding reaches beyond [-2, 2]: scale it down", reason="TARGET_OUTSIDE_GRID"
+        )
+    started = time.monotonic()
+    rng = np.random.default_rng(seed)
+    near = near_samples(target, options.near_points, options.noise, rng)
+    volume = volume_samples(target, options.volume_points, options.padding, rng)
+    trained = _train(target, near, volume, options, seed, progress)
+    write_safe_field(
+        path, _description(options, padded_bounds(target, options.margin), label, source or {}), trained.tensors()
+    )
+    return measure_fit(open_field(path), target, options, seed + 1, time.monotonic() - started)
+
+
+def measure_fit(field: SdfField, target: SdfField, options: FitOptions, seed: int, seconds: float) -> FitReport:
+    """How well ``field`` agrees with ``target`` on fresh points, drawn as the options say."""
+    rng = np.random.default_rng(seed)
+    near = near_samples(target, _CHECK_POINTS, options.noise, rng)
+    volume = volume_samples(target, _CHECK_POINTS, options.padding, rng)
+    size = diagonal(target)
+    distance, gradient = field.signed_distance_and_gradient(near.points)
+    error = (distance - near.distances).abs() / size
+    free = near.distances > 0.0
+    norm = gradient[free].norm(dim=-1)
+    cosine = (gradient[free] * near.gradients[free]).sum(dim=-1) / norm.clamp_min(1e-9)
+    return FitReport(
+        mean_error=float(error.mean()),
+        p95_error=float(error.quantile(0.95)),
+        max_error=float(error.max()),
+        volume_mean_error=float((field.signed_distance(volume.points) - volume.distances).abs().mean()) / size,
+        mean_gradient_norm=float(norm.mean()),
+        mean_normal_cosine=float(cosine.mean()),
+        diagonal=size,
+        iterations=options.iterations,
+        seconds=seconds,
+    )
+
+
+def _train(
+    target: SdfField,
+    near: ExactSamples,
+    volume: ExactSamples,
+    options: FitOptions,
+    seed: int,
+    progress: FitProgress | None,
+) -> TrainableField:
+    generator = torch.Generator().manual_seed(seed)
+    size = diagonal(target)
+    network = TrainableField(options, radius=size / 4.0, generator=generator)
+    optimiser = torch.optim.Adam(
+        [
+            {"params": [network.table], "lr": options.table_rate, "eps": 1e-15},
+            {"params": [*network.weights, *network.biases], "lr": options.network_rate},
+        ],
+        betas=(0.9, 0.99),
+        fused=True,
+    )
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, options.rate_share)
+    started = time.monotonic()
+    for iteration in range(1, options.iterations + 1):
+        loss = _loss(network, near, volume, options, size, generator)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+        if progress is not None and (iteration % _REPORT_EVERY == 0 or iteration == options.iterations):
+            spent = time.monotonic() - started
+            progress(iteration, float(loss.detach()), spent / iteration * (options.iterations - iteration))
+    return network
+
+
+def _loss(
+    network: TrainableField,
+    near: ExactSamples,
+    volume: ExactSamples,
+    options: FitOptions,
+    size: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Mean |distance error| in diagonals, plus the weighted squared error of the gradient near the surface."""
+    function = network.function()
+    from_volume = options.batch // 3
+    close = _draw(near, options.batch - from_volume, generator)
+    far = _draw(volume, from_volume, generator)
+    values = function.value(torch.cat((close.points, far.points)))
+    loss = (values - torch.cat((close.distances, far.distances))).abs().mean() / size
+    if options.gradient_batch > 0:
+        slopes = _draw(near, options.gradient_batch, generator)
+        distance, gradient = function.value_and_gradient(slopes.points)
+        loss = loss + (distance - slopes.distances).abs().mean() / size
+        loss = loss + options.gradient_weight * (gradient - slopes.gradients).square().sum(dim=-1).mean()
+    return loss
+
+
+def _draw(samples: ExactSamples, count: int, generator: torch.Generator) -> ExactSamples:
+    return samples.take(torch.randint(len(samples), (count,), generator=generator))
+
+
+def _description(options: FitOptions, bounds: Tensor, label: str | None, source: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "family": "neus_facto",
+        "hash": asdict(options.grid),
+        "positional_encoding": {"degree": DEGREE, "two_pi": False},
+        "use_grid": True,
+        "contraction": "none",
+        "level_mask": None,
+        "bounds": bounds.tolist(),
+        "label": label,
+        "source": source,
+    }

@@ -1,0 +1,1 @@
+"""The blob store: a folder or an object store."""

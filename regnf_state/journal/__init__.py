@@ -1,0 +1,1 @@
+"""The journal in the storage, from which a lost Redis is rebuilt."""

@@ -1,0 +1,51 @@
+"""Whether Redis holds what the journal says: it does not after it was emptied, exchanged, or restarted.
+
+A key in Redis names the blob store whose journal was read into it, and the run of the server: one that restarts may
+have lost the last second of its history.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+from uuid import uuid4
+
+from redis import Redis
+
+from regnf_state.journal.journal import Journal
+from regnf_state.redis.documents import PREFIX, text
+
+_KEY = f"{PREFIX}epoch"
+_MARK = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2]) return 1 end return 0"
+
+
+class Epoch:
+    """The mark of one blob store in one Redis."""
+
+    def __init__(self, redis: Redis, journal: Journal) -> None:
+        self._redis = redis
+        self._journal = journal
+        self._mark = redis.register_script(_MARK)
+
+    @cached_property
+    def _storage_id(self) -> str:
+        return self._journal.storage_id()
+
+    def _name(self) -> str:
+        server: Any = self._redis.info("server")
+        return f"{self._storage_id}:{server.get('run_id', '')}"
+
+    def stands(self) -> bool:
+        """Whether everything in the journal is in Redis."""
+        held: Any = self._redis.get(_KEY)
+        return held is not None and text(held) == self._name()
+
+    def begin(self) -> str:
+        """Say that the journal is about to be read; returns what ``end`` must be given."""
+        token = f"reading:{uuid4().hex}"
+        self._redis.set(_KEY, token)
+        return token
+
+    def end(self, token: str) -> bool:
+        """Say that all of it is in Redis. False when Redis was emptied, or somebody else began, meanwhile."""
+        return bool(self._mark(keys=[_KEY], args=[token, self._name()]))

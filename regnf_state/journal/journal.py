@@ -1,0 +1,129 @@
+"""What was accepted and what became of it, in the blob store: enough to make the records anew when Redis has lost them.
+
+One folder a job, objects in it that are written once and never changed:
+    journal/jobs/{id}/{attempt}-accepted    the record as it was accepted; written before the caller is told
+    journal/jobs/{id}/{attempt}-begun       a later attempt is about to be claimed: whoever counts attempts counts it
+    journal/jobs/{id}/{attempt}-ended       the record as it ended
+One object a field, the record as it was last written: journal/fields/{reference}.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from itertools import groupby
+from typing import Any, TypeVar
+from uuid import uuid4
+
+from regnf_state.blobs.base import BlobStore
+from regnf_state.records import FieldRecord, JobRecord
+
+_JOBS = "journal/jobs"
+_FIELDS = "journal/fields"
+_STORAGE_ID = "journal/storage-id"
+_Record = TypeVar("_Record", JobRecord, FieldRecord)
+logger = logging.getLogger(__name__)
+
+
+def _folder(job_id: str) -> str:
+    return f"{_JOBS}/{job_id}"
+
+
+class Journal:
+    """The journal of one blob store. Everything may raise OSError."""
+
+    def __init__(self, blobs: BlobStore) -> None:
+        self._blobs = blobs
+
+    def storage_id(self) -> str:
+        """What tells this store from every other; made by whoever asks first."""
+        self._blobs.put_if_absent(_STORAGE_ID, uuid4().hex.encode())
+        with self._blobs.open(_STORAGE_ID) as file:
+            return file.read().decode()
+
+    # jobs
+
+    def accept(self, job: JobRecord) -> None:
+        if not self._write(job, "accepted") and self._read(job.id, job.attempt, "accepted").created != job.created:
+            self.forget(job.id)  # a job of this id that has outlived its retention
+            self._write(job, "accepted")
+
+    def begin(self, job_id: str, attempt: int) -> None:
+        self._blobs.put_if_absent(f"{_folder(job_id)}/{attempt:06d}-begun", b"")
+
+    def end(self, job: JobRecord) -> None:
+        self._write(job, "ended")
+
+    def _write(self, job: JobRecord, event: str) -> bool:
+        document = json.dumps(asdict(job) | {"owner": job.owner}, separators=(",", ":"))
+        return self._blobs.put_if_absent(f"{_folder(job.id)}/{job.attempt:06d}-{event}", document.encode())
+
+    def forget(self, job_id: str) -> None:
+        self._blobs.delete_prefix(_folder(job_id))
+
+    def jobs(self) -> Iterator[str]:
+        """The ids of all jobs, sorted; listed a page at a time."""
+        keys = (key.removeprefix(f"{_JOBS}/").split("/") for key in self._blobs.list(_JOBS))
+        return (job_id for job_id, _ in groupby(parts[0] for parts in keys))
+
+    def recall(self, job_id: str, now: float) -> JobRecord | None:
+        """The job as it is to go on: ended as it did, or to be run as an attempt that nobody has had yet."""
+        try:
+            return self._recall(job_id, now)
+        except (ValueError, TypeError) as error:
+            logger.error("the journal of job %s does not read: %s", job_id, error)
+            return None
+
+    def _recall(self, job_id: str, now: float) -> JobRecord | None:
+        events = [key.rpartition("/")[2].split("-") for key in self._blobs.list(_folder(job_id))]
+        attempts = {event: [int(number) for number, name in events if name == event] for _, event in events}
+        if "accepted" not in attempts:
+            return None
+        accepted, latest = max(attempts["accepted"]), max(int(number) for number, _ in events)
+        ended = max(attempts.get("ended", [0]))
+        if ended >= accepted:
+            return self._read(job_id, ended, "ended")
+        job = self._read(job_id, accepted, "accepted")
+        if self._blobs.exists(f"jobs/{job_id}/manifest.json"):
+            return replace(job, status="successful", attempt=latest, progress=1.0, updated=now, finished=now)
+        return replace(job, attempt=latest + 1)
+
+    def _read(self, job_id: str, attempt: int, event: str) -> JobRecord:
+        with self._blobs.open(f"{_folder(job_id)}/{attempt:06d}-{event}") as file:
+            return replace(_as_record(JobRecord, json.load(file)), version=1)
+
+    # fields
+
+    def keep_field(self, field: FieldRecord) -> None:
+        self._blobs.put(f"{_FIELDS}/{field.sha256}", json.dumps(asdict(field), separators=(",", ":")).encode())
+
+    def forget_field(self, reference: str) -> None:
+        self._blobs.delete(f"{_FIELDS}/{reference}")
+
+    def fields(self) -> Iterator[str]:
+        """The references of all fields, sorted; listed a page at a time."""
+        return (key.removeprefix(f"{_FIELDS}/") for key in self._blobs.list(_FIELDS))
+
+    def recall_field(self, reference: str) -> FieldRecord | None:
+        """The field as it is to go on; None when there is none, or its bytes are gone."""
+        try:
+            with self._blobs.open(f"{_FIELDS}/{reference}") as file:
+                field = replace(_as_record(FieldRecord, json.load(file)), version=1)
+        except FileNotFoundError:
+            return None
+        except (ValueError, TypeError) as error:
+            logger.error("the journal of field %s does not read: %s", reference, error)
+            return None
+        if field.state == "rejected" or self._blobs.exists(f"fields/{reference}/field.safetensors"):
+            # an import that was not written down as ended finds its own report, and ends at once
+            return field if field.state != "validating" else replace(field, attempt=field.attempt + 1)
+        if field.state == "validating" and self._blobs.exists(f"fields/{reference}/original"):
+            return replace(field, attempt=field.attempt + 1)
+        return None
+
+
+def _as_record(kind: type[_Record], document: dict[str, Any]) -> _Record:
+    """The record of a document; members that this version does not know are left out."""
+    return kind(**{name: value for name, value in document.items() if name in kind.__dataclass_fields__})

@@ -1,0 +1,146 @@
+"""Records in Redis that the journal could make anew: what is accepted is journaled before anybody is told.
+
+That something has ended is journaled afterwards, if it can be: should both the word of it and Redis be lost, it is done
+once more, and a result that stands is found.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+from redis import Redis
+
+from regnf_state.blobs.base import BlobStore
+from regnf_state.journal.generation import Epoch
+from regnf_state.journal.journal import Journal
+from regnf_state.records import FINISHED, NO_QUOTA, FieldRecord, JobRecord, Quota
+from regnf_state.redis.documents import PREFIX
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.transitions import fields_of
+
+_USED = f"{PREFIX}fields:used"
+logger = logging.getLogger(__name__)
+
+
+class JournaledRecordStore(RedisRecordStore):
+    """A RecordStore in Redis and in the journal of ``blobs``. Accepting raises OSError when that takes no bytes."""
+
+    def __init__(self, redis: Redis, retention_s: int, blobs: BlobStore) -> None:
+        super().__init__(redis, retention_s)
+        self.journal = Journal(blobs)
+
+    @cached_property
+    def epoch(self) -> Epoch:
+        """Tells whether Redis holds what the journal says."""
+        return Epoch(self._redis, self.journal)
+
+    # jobs
+
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        self.get_job(record.id)  # recalls one that Redis has lost: its attempts must not be counted from one again
+        job, created = super().create_job(record, max_active, quota)
+        if created and (names := fields_of(job)):
+            self._redis.zadd(_USED, dict.fromkeys(names, job.updated))
+        if job.status == "accepted":
+            self.journal.accept(job)  # also one known before: whoever recorded it may have died right there
+        return job, created
+
+    def get_job(self, job_id: str) -> JobRecord | None:
+        found = super().get_job(job_id)
+        if found is None and not self.epoch.stands():
+            self.recall_job(job_id)
+            found = super().get_job(job_id)
+        return found
+
+    def recall_job(self, job_id: str) -> JobRecord | None:
+        """Make a lost record anew. The job as it is to go on, None when nothing was to be made."""
+        now = self.now()
+        job = self.journal.recall(job_id, now)
+        if job is None or self.has_expired(job, now):
+            return None
+        return job if self.restore_job(job) else None
+
+    def has_expired(self, job: JobRecord, now: float) -> bool:
+        """Whether the job has outlived its retention."""
+        return job.finished is not None and job.finished + self._retention_s <= now
+
+    def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        if changes.get("status") == "running" and attempt > 1:
+            self.journal.begin(job_id, attempt)
+        job = super().update_job(job_id, attempt, **changes)
+        if changes.get("status") in FINISHED:
+            _if_possible(f"the end of job {job_id}", lambda: self.journal.end(job))
+        return job
+
+    def request_cancel(self, job_id: str) -> JobRecord | None:
+        job = super().request_cancel(job_id)
+        if job is not None and job.status == "dismissed":
+            _if_possible(f"the end of job {job_id}", lambda: self.journal.end(job))
+        return job
+
+    def delete_job(self, job_id: str) -> bool:
+        deleted = super().delete_job(job_id)
+        self.journal.forget(job_id)
+        return deleted
+
+    def expire_jobs(self) -> list[str]:
+        expired = super().expire_jobs()
+        for job_id in expired:
+            self.journal.forget(job_id)
+        return expired
+
+    # fields
+
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
+        field, created = super().create_field(record, quota)
+        if created or field.state == "validating":
+            self.journal.keep_field(field)
+        return field, created
+
+    def last_uses(self, references: Sequence[str]) -> list[float]:
+        """When a job was last accepted that reads each field; now, from now on, where that is not known."""
+        now = self.now()
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for reference in references:
+                pipeline.zadd(_USED, {reference: now}, nx=True)
+                pipeline.zscore(_USED, reference)
+            answers = pipeline.execute()
+        return [float(score) for score in answers[1::2]]
+
+    def get_field(self, sha256: str) -> FieldRecord | None:
+        found = super().get_field(sha256)
+        if found is None and not self.epoch.stands():
+            self.recall_field(sha256)
+            found = super().get_field(sha256)
+        return found
+
+    def recall_field(self, sha256: str) -> FieldRecord | None:
+        """Make a lost record anew. The field as it is to go on, None when nothing was to be made."""
+        field = self.journal.recall_field(sha256)
+        return field if field is not None and self.restore_field(field) else None
+
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        field = super().update_field(sha256, attempt=attempt, **changes)
+        _if_possible(f"what became of field {sha256}", lambda: self.journal.keep_field(field))
+        return field
+
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        field = super().retry_import(sha256, attempt, lost=lost)
+        _if_possible(f"what became of field {sha256}", lambda: self.journal.keep_field(field))
+        return field
+
+    def delete_field(self, sha256: str) -> bool:
+        deleted = super().delete_field(sha256)
+        self._redis.zrem(_USED, sha256)
+        self.journal.forget_field(sha256)
+        return deleted
+
+
+def _if_possible(what: str, write: Callable[[], None]) -> None:
+    try:
+        write()
+    except OSError as error:
+        logger.warning("%s is not in the journal: %s", what, error)

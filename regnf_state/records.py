@@ -1,0 +1,251 @@
+"""The records that are the truth about fields and jobs, and the store that keeps them.
+
+A job's state machine is monotonic: accepted -> running -> successful | failed | dismissed. Every change names the
+attempt it belongs to; a writer of an older attempt loses (StaleAttemptError). RQ is transport, never truth.
+Times are the store's own: one clock for every machine that shares it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from regnf_state.ownership import ANONYMOUS, owner_of
+
+JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
+FieldState = Literal["validating", "ready", "rejected"]
+ACTIVE: frozenset[str] = frozenset({"accepted", "running"})
+FINISHED: frozenset[str] = frozenset({"successful", "failed", "dismissed"})
+
+
+class RecordError(Exception):
+    """Base of the store's refusals."""
+
+
+class QueueFullError(RecordError):
+    """As many jobs are active as the service takes."""
+
+
+class QuotaError(RecordError):
+    """The owner has as much as it may have; ``reason`` says of what."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class StaleAttemptError(RecordError):
+    """The change came from an attempt that is no longer the current one, or from a state that forbids it."""
+
+
+@dataclass(frozen=True)
+class Quota:
+    """The most that one owner may have; None: any number."""
+
+    active_jobs: int | None = None
+    fields: int | None = None
+    stored_bytes: int | None = None
+
+
+NO_QUOTA = Quota()
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """One job. Times are seconds since the epoch; ``error`` is a problem object; ``version`` grows with each change."""
+
+    id: str
+    kind: str
+    status: JobStatus
+    request: dict[str, Any]
+    inputs: dict[str, Any]
+    created: float
+    updated: float
+    version: int = 1
+    attempt: int = 1
+    phase: str | None = None
+    progress: float = 0.0
+    started: float | None = None
+    finished: float | None = None
+    heartbeat: float | None = None
+    cancel_requested: bool = False
+    engine: dict[str, Any] = field(default_factory=dict)
+    error: dict[str, Any] | None = None
+    requeues: int = 0
+    """How often this request was handed out again because its worker vanished, since it was last asked for."""
+    worker: str | None = None
+    """Who claimed the attempt."""
+    phase_since: float | None = None
+    verdict: str | None = None
+    """Of a successful job: what its result says."""
+
+    @property
+    def owner(self) -> str:
+        """The caller whose job it is: whoever owns the scene."""
+        return owner_of(self.request["scene"]) if "scene" in self.request else ANONYMOUS
+
+
+@dataclass(frozen=True)
+class FieldRecord:
+    """One field. ``sha256`` is its reference: the SHA-256 of the bytes that were uploaded, and its owner's name."""
+
+    sha256: str
+    state: FieldState
+    bytes: int
+    created: float
+    updated: float
+    version: int = 1
+    label: str | None = None
+    description: dict[str, Any] = field(default_factory=dict)
+    """What the uploader said that the file does not: family, contraction, level mask ..."""
+    report: dict[str, Any] = field(default_factory=dict)
+    """What the import found: family, bounds, parameters, plausibility, warnings."""
+    error: dict[str, Any] | None = None
+    attempt: int = 1
+    """Grows each time the import starts anew; fences off the writer of an older one."""
+    requeues: int = 0
+    """How often this upload was handed out again because its worker vanished."""
+    symmetry: dict[str, Any] | None = None
+    """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
+
+    @property
+    def owner(self) -> str:
+        """The caller whose field it is."""
+        return owner_of(self.sha256)
+
+
+@dataclass(frozen=True)
+class JobEvent:
+    """One line of a job's event stream; ``id`` orders them and resumes a broken stream.
+
+    ``name`` is ``status`` or ``progress``; ``data`` holds status, phase, progress, attempt, updated, error if failed.
+    """
+
+    id: str
+    name: str
+    data: dict[str, Any]
+
+
+class RecordStore(Protocol):
+    """Where records live. Every method is blocking; the API calls them off the event loop or through short threads."""
+
+    def now(self) -> float:
+        """The store's clock, seconds since the epoch."""
+        ...
+
+    def remember(self, key: str, value: str, ttl_s: int) -> str:
+        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic."""
+        ...
+
+    # jobs
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        """Store a new job, or return the one that exists under its id (False).
+
+        A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
+        returned, with its attempt. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
+        QuotaError when the owner has as many as it may.
+        """
+        ...
+
+    def get_job(self, job_id: str) -> JobRecord | None: ...
+
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
+        """Whether a job of this id and owner was kept once and has outlived its retention."""
+        ...
+
+    def list_jobs(
+        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[JobRecord]:
+        """Newest first, older than ``before`` = (created, id); ``owner`` None: everybody's."""
+        ...
+
+    def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        """Compare-and-set: applies ``changes`` if ``attempt`` is current and the state machine allows it.
+
+        A change of status must be a move: whoever sets ``running`` second loses, so it serves as a claim.
+        Raises StaleAttemptError. Publishes an event whenever status, phase or progress changes.
+        """
+        ...
+
+    def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        """Say that the running attempt lives; the record returned tells whether to stop. Raises StaleAttemptError."""
+        ...
+
+    def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
+        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError.
+
+        ``lost``: its worker vanished, which counts in ``requeues``; otherwise the worker gave it back in good order.
+        """
+        ...
+
+    def request_cancel(self, job_id: str) -> JobRecord | None:
+        """Set cancel_requested; an accepted job is dismissed at once, a running one when its worker notices."""
+        ...
+
+    def delete_job(self, job_id: str) -> bool:
+        """Forget a finished job wholly; False when there is none. Raises StaleAttemptError while it is active."""
+        ...
+
+    def active_jobs(self) -> list[JobRecord]:
+        """Every accepted or running job."""
+        ...
+
+    def expire_jobs(self) -> list[str]:
+        """Drop what is left of finished jobs that have outlived their retention; their ids, for whoever holds more."""
+        ...
+
+    def queue_position(self, job_id: str) -> int | None:
+        """1 for the accepted job that is next; None for a job that does not wait."""
+        ...
+
+    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
+        """Events after the given id (None: from the start), waiting at most ``wait_s`` for the first.
+
+        Raises ValueError when ``after`` is no event id.
+        """
+        ...
+
+    # fields
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
+        """Store a new field, or return the one that exists (False).
+
+        A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        Rejected ones count towards no quota. Raises QuotaError.
+        """
+        ...
+
+    def stored(self, owner: str) -> tuple[int, int]:
+        """How many fields that were not rejected an owner has, and the bytes of their uploads."""
+        ...
+
+    def get_field(self, sha256: str) -> FieldRecord | None: ...
+
+    def list_fields(
+        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[FieldRecord]:
+        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
+        ...
+
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).
+
+        ready and rejected are final within an attempt.
+        """
+        ...
+
+    def delete_field(self, sha256: str) -> bool: ...
+
+    def validating_fields(self) -> list[FieldRecord]:
+        """Every field whose import has not ended."""
+        ...
+
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        """Start an import anew as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
+        ...
+
+    def jobs_using_field(self, sha256: str) -> Iterator[str]:
+        """Ids of active jobs that need this field."""
+        ...
+
+    def ping(self) -> bool: ...

@@ -1,0 +1,1 @@
+"""Records, queue and counters in Redis."""

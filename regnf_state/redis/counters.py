@@ -1,0 +1,84 @@
+"""Counts of what happens to jobs and fields, kept in Redis: written in the same step as the change that they count.
+
+So every process counts, each event counts once whoever brings it about, and nothing is lost with a process. A figure is
+a field of one hash: its name and its labels' values, joined by a bar. Seconds are counted by upper bounds of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from redis import Redis
+
+from regnf_state.records import ACTIVE, FieldRecord, JobRecord
+from regnf_state.redis.documents import PREFIX, Command, text
+
+_KEY = f"{PREFIX}figures"
+BOUNDS_S = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
+
+
+def counted(name: str, *labels: str, by: int = 1) -> Command:
+    return ("HINCRBY", _KEY, "|".join((name, *labels)), str(by))
+
+
+def count(redis: Redis, name: str, *labels: str) -> None:
+    """Count one that is no part of a change."""
+    redis.hincrby(_KEY, "|".join((name, *labels)), 1)
+
+
+def timed(name: str, seconds: float, *labels: str) -> list[Command]:
+    """One observation: its bucket, and what it adds to the sum. A clock that was set back counts as no time."""
+    seconds = max(0.0, seconds)
+    bound = next((str(bound) for bound in BOUNDS_S if seconds <= bound), "+Inf")
+    return [
+        counted(name, *labels, bound),
+        ("HINCRBYFLOAT", _KEY, "|".join((name, *labels, "sum")), f"{seconds:.6f}"),
+    ]
+
+
+def of_job(before: JobRecord | None, after: JobRecord) -> list[Command]:
+    """What a job's change adds. Its time is the record's own: ``updated``."""
+    if before is None or before.attempt != after.attempt:
+        return [counted("job_attempts")]
+    now, commands = after.updated, []
+    if (before.phase, before.status) != (after.phase, after.status) and before.phase and before.phase_since:
+        commands += timed("job_phase_seconds", now - before.phase_since, before.phase)
+    if before.status == "accepted" and after.status == "running":
+        commands += timed("job_wait_seconds", now - before.updated)
+    if before.status in ACTIVE and after.status not in ACTIVE:
+        reason = str((after.error or {}).get("reason", ""))
+        commands.append(counted("jobs_finished", after.status, after.verdict or "", reason))
+        if after.started is not None:
+            commands += timed("job_run_seconds", now - after.started, after.status)
+    return commands
+
+
+def of_field(before: FieldRecord | None, after: FieldRecord) -> list[Command]:
+    """What a field's change adds: an import that has ended."""
+    if before is None or before.state != "validating" or after.state == "validating":
+        return []
+    reason = str((after.error or {}).get("reason", ""))
+    return [counted("imports", after.state, reason), *timed("import_seconds", after.updated - before.updated)]
+
+
+class Figures:
+    """All figures as they were at one moment."""
+
+    def __init__(self, redis: Redis) -> None:
+        held: Any = redis.hgetall(_KEY)
+        self._held = {tuple(text(name).split("|")): float(text(value)) for name, value in held.items()}
+
+    def counts(self, name: str) -> Iterable[tuple[Sequence[str], float]]:
+        """(labels, value) of each count."""
+        return [(labels[1:], value) for labels, value in sorted(self._held.items()) if labels[0] == name]
+
+    def times(self, name: str) -> Iterable[tuple[Sequence[str], list[tuple[str, float]], float]]:
+        """(labels, cumulative counts by upper bound, sum) of each group of times."""
+        groups = sorted({labels[1:-1] for labels in self._held if labels[0] == name})
+        for group in groups:
+            buckets, total = [], 0.0
+            for bound in (*map(str, BOUNDS_S), "+Inf"):
+                total += self._held.get((name, *group, bound), 0.0)
+                buckets.append((bound, total))
+            yield group, buckets, self._held.get((name, *group, "sum"), 0.0)

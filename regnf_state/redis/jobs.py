@@ -1,0 +1,255 @@
+"""The record store in Redis. What a record may become is in ``transitions``; here it is only kept.
+
+Keys:  regnf:job:{id}             hash: the record          regnf:jobs:created    sorted by time of creation,
+                                                            also one for each owner, :{owner}
+       regnf:job:{id}:events      stream                    regnf:jobs:active     set of accepted and running
+       regnf:job:{id}:gone        tombstone: the owner      regnf:jobs:waiting    sorted by time of acceptance
+       regnf:field:{sha256}       hash: the record          regnf:jobs:expiring   sorted by time of expiry
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from typing import Any
+
+from redis import Redis
+
+from regnf_state import transitions
+from regnf_state.ownership import ANONYMOUS
+from regnf_state.records import (
+    ACTIVE,
+    NO_QUOTA,
+    JobEvent,
+    JobRecord,
+    QueueFullError,
+    Quota,
+    QuotaError,
+    StaleAttemptError,
+)
+from regnf_state.redis import counters as figures
+from regnf_state.redis import webhook_outbox as outbox
+from regnf_state.redis.documents import PREFIX, Cap, Command, text
+from regnf_state.redis.fields import RedisFieldRecords
+
+_CREATED = f"{PREFIX}jobs:created"
+_ACTIVE = f"{PREFIX}jobs:active"
+_WAITING = f"{PREFIX}jobs:waiting"
+_EXPIRING = f"{PREFIX}jobs:expiring"
+_EVENTS_KEPT = "1000"
+_LONGEST_BLOCK_S = 2.0
+"""Waiting for events is cut into blocks well below any client's socket timeout."""
+
+_EXPIRE = """
+local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
+if not expires or tonumber(expires) > tonumber(ARGV[2]) then return 0 end
+redis.call('ZREM', KEYS[1], ARGV[1])
+redis.call('ZREM', KEYS[2], ARGV[1])
+local owner = redis.call('GET', KEYS[5])
+if owner then redis.call('ZREM', KEYS[2] .. ':' .. owner, ARGV[1]) end
+redis.call('DEL', KEYS[3], KEYS[4])
+return 1
+"""
+
+
+def _key(job_id: str) -> str:
+    return f"{PREFIX}job:{job_id}"
+
+
+def _created_keys(record: JobRecord) -> tuple[str, str]:
+    """Where a job is listed: among all, and among its owner's."""
+    return _CREATED, f"{_CREATED}:{record.owner}"
+
+
+def _active_key(record: JobRecord) -> str:
+    return f"{PREFIX}owner:{record.owner}:active"
+
+
+def _events_key(job_id: str) -> str:
+    return f"{PREFIX}job:{job_id}:events"
+
+
+def _gone_key(job_id: str) -> str:
+    return f"{PREFIX}job:{job_id}:gone"
+
+
+class RedisRecordStore(RedisFieldRecords):
+    """A RecordStore that any number of processes share. Its clock is the Redis server's."""
+
+    def __init__(self, redis: Redis, retention_s: int = 7 * 24 * 3600) -> None:
+        super().__init__(redis)
+        self._retention_s = retention_s
+        self._expire = redis.register_script(_EXPIRE)
+
+    def remember(self, key: str, value: str, ttl_s: int) -> str:
+        known = self._redis.set(f"{PREFIX}remembered:{key}", value, nx=True, get=True, ex=ttl_s)
+        return value if known is None else text(known)  # type: ignore[arg-type]
+
+    def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
+        """What has to change around a record when ``before`` becomes ``after``."""
+        key, events = _key(after.id), _events_key(after.id)
+        commands: list[Command] = [
+            *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
+            *(("SADD" if after.status in ACTIVE else "SREM", each, after.id) for each in (_ACTIVE, _active_key(after))),
+        ]
+        if after.status != "accepted":
+            commands.append(("ZREM", _WAITING, after.id))
+        elif before is None or before.status != "accepted":
+            commands.append(("ZADD", _WAITING, repr(after.updated), after.id))
+        commands += figures.of_job(before, after)
+        event = transitions.event_of(before, after)
+        if event is not None:
+            name, data = event
+            commands.append(("XADD", events, "MAXLEN", "~", _EVENTS_KEPT, "*", "name", name, "data", json.dumps(data)))
+        if after.finished is not None:
+            expires = after.finished + self._retention_s
+            commands.append(("ZADD", _EXPIRING, repr(expires), after.id))
+            gone = str(int((expires + self._retention_s) * 1000))
+            commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
+            commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
+            commands += outbox.entering(after, expires)
+        else:
+            commands += [("PERSIST", each) for each in (key, events)]
+            commands += outbox.forgetting(before) if before is not None else []
+            commands += [("ZREM", _EXPIRING, after.id), ("DEL", _gone_key(after.id))]
+        return commands
+
+    def _change_job(self, job_id: str, change: Callable[[JobRecord, float], JobRecord]) -> JobRecord:
+        while True:
+            document, now = self._read(_key(job_id))
+            if document is None:
+                raise StaleAttemptError("there is no such job")
+            known = JobRecord(**document)
+            changed = change(known, now)
+            if changed is known:
+                return known
+            commands = self._commands(known, changed)
+            if self._compare_and_set(_key(job_id), known.version, commands, asdict(changed)) == "OK":
+                return changed
+
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
+        if quota.active_jobs is not None:
+            caps.append(("SCARD", _active_key(record), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
+        while True:
+            document, now = self._read(_key(record.id))
+            known = JobRecord(**document) if document is not None else None
+            fresh = transitions.restarted_job(known, now) if known is not None else record
+            if fresh is None:
+                assert known is not None
+                return known, False
+            version = known.version if known is not None else 0
+            commands = self._commands(known, fresh)
+            answer = self._compare_and_set(_key(record.id), version, commands, asdict(fresh), caps)
+            if answer == "FULL":
+                raise QueueFullError(f"{max_active} jobs are active already")
+            if answer.startswith("QUOTA"):
+                raise QuotaError(answer)
+            if answer == "OK":
+                return fresh, True
+
+    def restore_job(self, record: JobRecord) -> bool:
+        """Put a record that was lost back as it is; False when the job is known."""
+        commands = self._commands(None, record)
+        return self._compare_and_set(_key(record.id), 0, commands, asdict(record)) == "OK"
+
+    def get_job(self, job_id: str) -> JobRecord | None:
+        document, _ = self._read(_key(job_id))
+        return JobRecord(**document) if document is not None else None
+
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
+        with self._redis.pipeline(transaction=False) as pipeline:
+            pipeline.exists(_key(job_id))
+            pipeline.get(_gone_key(job_id))
+            held, gone = pipeline.execute()
+        return not held and gone is not None and text(gone) == owner
+
+    def list_jobs(
+        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
+    ) -> list[JobRecord]:
+        found: list[JobRecord] = []
+        index = _CREATED if owner is None else f"{_CREATED}:{owner}"
+        for document in self._newest_first(index, _key, before):
+            if status in (None, document["status"]):
+                found.append(JobRecord(**document))
+            if len(found) == limit:
+                break
+        return found
+
+    def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        return self._change_job(job_id, lambda known, now: transitions.changed_job(known, attempt, changes, now))
+
+    def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        return self._change_job(job_id, lambda known, now: transitions.beaten_job(known, attempt, now))
+
+    def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
+        return self._change_job(job_id, lambda known, now: transitions.requeued_job(known, attempt, now, lost))
+
+    def request_cancel(self, job_id: str) -> JobRecord | None:
+        try:
+            return self._change_job(job_id, transitions.cancelled_job)
+        except StaleAttemptError:
+            return None
+
+    def delete_job(self, job_id: str) -> bool:
+        while True:
+            document, _ = self._read(_key(job_id))
+            if document is not None and document["status"] in ACTIVE:
+                raise StaleAttemptError(f"a job that is {document['status']} is not deleted")
+            version = document["version"] if document is not None else 0
+            commands: list[Command] = [("DEL", _key(job_id), _events_key(job_id), _gone_key(job_id))]
+            indexes = [_CREATED, _WAITING, _EXPIRING]
+            if document is not None:
+                known = JobRecord(**document)
+                indexes.append(_created_keys(known)[1])
+                commands += outbox.forgetting(known)
+            commands += [("ZREM", index, job_id) for index in indexes]
+            if self._compare_and_set(_key(job_id), version, commands) == "OK":
+                return document is not None
+
+    def active_jobs(self) -> list[JobRecord]:
+        names = sorted(text(name) for name in self._redis.smembers(_ACTIVE))
+        return [JobRecord(**document) for document in self._read_many(map(_key, names))]
+
+    def expire_jobs(self) -> list[str]:
+        now = self.now()
+        expired = []
+        names: Any = self._redis.zrangebyscore(_EXPIRING, "-inf", now)
+        for job_id in map(text, names):
+            keys = [_EXPIRING, _CREATED, _key(job_id), _events_key(job_id), _gone_key(job_id)]
+            if self._expire(keys=keys, args=[job_id, now]):
+                expired.append(job_id)
+        return expired
+
+    def queue_position(self, job_id: str) -> int | None:
+        rank: Any = self._redis.zrank(_WAITING, job_id)
+        return None if rank is None else int(rank) + 1
+
+    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
+        start = "{}-{}".format(*transitions.parse_event_id(after)) if after is not None else "0-0"
+        deadline = time.monotonic() + wait_s
+        while True:
+            remaining = deadline - time.monotonic()
+            block = max(1, int(1000 * min(remaining, _LONGEST_BLOCK_S))) if remaining > 0 else None
+            answer: Any = self._redis.xread({_events_key(job_id): start}, block=block)
+            entries = [entry for entries in _streams(answer) for entry in entries]
+            if entries or block is None:
+                return [_event(entry) for entry in entries]
+
+    def jobs_using_field(self, sha256: str) -> Iterator[str]:
+        return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
+
+
+def _streams(answer: Any) -> list[Any]:
+    """The entries of each stream in an answer to XREAD, in either protocol's shape."""
+    if isinstance(answer, dict):
+        return [entries for chunks in answer.values() for entries in chunks]
+    return [entries for _, entries in answer or []]
+
+
+def _event(entry: tuple[bytes | str, dict[bytes | str, bytes | str]]) -> JobEvent:
+    identifier, fields = entry
+    values = {text(name): text(value) for name, value in fields.items()}
+    return JobEvent(text(identifier), values["name"], json.loads(values["data"]))

@@ -1,0 +1,164 @@
+"""What a record may become: pure functions from one record to the next, shared by every record store."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, StaleAttemptError
+
+_MOVES: dict[str, frozenset[str]] = {
+    "accepted": frozenset({"running", "failed", "dismissed"}),
+    "running": frozenset({"successful", "failed", "dismissed"}),
+}
+_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker", "verdict"})
+_CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes", "symmetry"})
+
+
+def _refuse_unknown(changes: dict[str, Any], allowed: frozenset[str]) -> None:
+    unknown = changes.keys() - allowed
+    if unknown:
+        raise TypeError(f"cannot change {', '.join(sorted(unknown))}")
+
+
+def _require_attempt(record: JobRecord | FieldRecord, attempt: int) -> None:
+    if record.attempt != attempt:
+        raise StaleAttemptError(f"attempt {attempt} is not the current one, {record.attempt} is")
+
+
+def changed_job(record: JobRecord, attempt: int, changes: dict[str, Any], now: float) -> JobRecord:
+    """The job after ``changes`` by ``attempt``. Progress never falls; every change of status must be a move.
+
+    Raises StaleAttemptError, and TypeError for an attribute that is not for changing.
+    """
+    _refuse_unknown(changes, _CHANGEABLE_IN_JOB)
+    _require_attempt(record, attempt)
+    status = changes.get("status", record.status)
+    if "status" in changes and status not in _MOVES.get(record.status, frozenset()):
+        raise StaleAttemptError(f"a job that is {record.status} cannot become {status}")
+    if record.status in FINISHED:
+        raise StaleAttemptError(f"a job that is {record.status} no longer changes")
+    derived: dict[str, Any] = {}
+    if "progress" in changes:
+        derived["progress"] = max(record.progress, min(1.0, float(changes["progress"])))
+    if changes.get("phase", record.phase) != record.phase:
+        derived["phase_since"] = now
+    if "status" in changes:
+        if status == "running":
+            derived |= {"started": now, "heartbeat": now}
+        else:
+            derived["finished"] = now
+        if status == "successful":
+            derived["progress"] = 1.0
+    return replace(record, version=record.version + 1, updated=now, **(changes | derived))
+
+
+def beaten_job(record: JobRecord, attempt: int, now: float) -> JobRecord:
+    """The running job with a fresh heartbeat. Raises StaleAttemptError."""
+    _require_attempt(record, attempt)
+    if record.status != "running":
+        raise StaleAttemptError(f"a job that is {record.status} has no heartbeat")
+    return replace(record, version=record.version + 1, heartbeat=now)
+
+
+def cancelled_job(record: JobRecord, now: float) -> JobRecord:
+    """The job after a request to cancel it: waiting ones end at once, finished ones stay as they are."""
+    if record.status not in ACTIVE or record.cancel_requested:
+        return record
+    asked = replace(record, version=record.version + 1, updated=now, cancel_requested=True)
+    return replace(asked, status="dismissed", finished=now) if record.status == "accepted" else asked
+
+
+def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
+    return JobRecord(
+        id=record.id,
+        kind=record.kind,
+        status="accepted",
+        request=record.request,
+        inputs=record.inputs,
+        created=record.created,
+        updated=now,
+        version=record.version + 1,
+        attempt=record.attempt + 1,
+        requeues=requeues,
+    )
+
+
+def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> JobRecord:
+    """The running job handed out anew. Raises StaleAttemptError."""
+    _require_attempt(record, attempt)
+    if record.status != "running":
+        raise StaleAttemptError(f"a job that is {record.status} is not requeued")
+    return _next_attempt(record, now, record.requeues + (1 if lost else 0))
+
+
+def restarted_job(record: JobRecord, now: float) -> JobRecord | None:
+    """A failed or dismissed job as its next attempt; None for a job that stands."""
+    return _next_attempt(record, now, 0) if record.status in ("failed", "dismissed") else None
+
+
+def changed_field(record: FieldRecord, attempt: int | None, changes: dict[str, Any], now: float) -> FieldRecord:
+    """The field after ``changes``. Raises StaleAttemptError when its import has ended or the attempt is older."""
+    _refuse_unknown(changes, _CHANGEABLE_IN_FIELD)
+    if attempt is not None:
+        _require_attempt(record, attempt)
+    if "state" in changes and record.state != "validating":
+        raise StaleAttemptError(f"a field that is {record.state} cannot become {changes['state']}")
+    return replace(record, version=record.version + 1, updated=now, **changes)
+
+
+def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldRecord | None:
+    """A rejected field, uploaded again, as its next attempt; None for a field that stands."""
+    if record.state != "rejected":
+        return None
+    return replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
+
+
+def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> FieldRecord:
+    """The field with its import started anew. Raises StaleAttemptError."""
+    _require_attempt(record, attempt)
+    if record.state != "validating":
+        raise StaleAttemptError(f"a field that is {record.state} is not imported again")
+    requeues = record.requeues + (1 if lost else 0)
+    return replace(record, version=record.version + 1, updated=now, attempt=attempt + 1, requeues=requeues)
+
+
+def fields_of(record: JobRecord) -> list[str]:
+    """The fields that the job reads."""
+    request = record.request
+    named = (request.get("scene"), request.get("object"), *(request.get("candidates") or ()))
+    return [name for name in named if name]
+
+
+def uses_field(record: JobRecord, sha256: str) -> bool:
+    """Whether the job reads this field."""
+    return sha256 in fields_of(record) or sha256 in record.inputs.values()
+
+
+def event_of(before: JobRecord | None, after: JobRecord) -> tuple[str, dict[str, object]] | None:
+    """Name and data of the event that this change deserves, if it deserves one."""
+    if before is not None and (before.status, before.attempt) == (after.status, after.attempt):
+        if (before.phase, before.progress) == (after.phase, after.progress):
+            return None
+        name = "progress"
+    else:
+        name = "status"
+    data: dict[str, object] = {
+        "status": after.status,
+        "phase": after.phase,
+        "progress": after.progress,
+        "attempt": after.attempt,
+        "updated": after.updated,
+    }
+    if after.error is not None:
+        data["error"] = after.error
+    return name, data
+
+
+def parse_event_id(text: str) -> tuple[int, int]:
+    """(milliseconds, sequence) of an event id. Raises ValueError."""
+    first, _, second = text.partition("-")
+    parts = (first, second or "0")
+    if not all(part.isascii() and part.isdigit() and len(part) <= 19 for part in parts):
+        raise ValueError("not an event id")
+    return int(parts[0]), int(parts[1])

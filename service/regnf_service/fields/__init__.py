@@ -1,0 +1,1 @@
+"""Uploads of fields: bytes to the storage, a record, an import job."""

@@ -1,0 +1,96 @@
+"""What happens to an upload once all its bytes are here: its record, and its way to the import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.fields.uploads import Received, Upload
+from regnf_service.http.body import CLOSE
+from regnf_service.http.dependencies import Services, off_loop
+from regnf_service.http.problems import Problem
+from regnf_service.http.schemas.fields import function_of
+from regnf_state.ownership import reference_of
+from regnf_state.records import FieldRecord, QuotaError
+
+
+def check_room(services: Services, caller: str, sha256: str, size: int | None) -> None:
+    """Refuse an upload of ``size`` bytes before it comes if the caller has no room for it. Raises Problem."""
+    quota = services.quota
+    if size is None or (quota.fields is None and quota.stored_bytes is None):
+        return
+    known = services.records.get_field(reference_of(caller, sha256))
+    if known is not None and known.state != "rejected":
+        return
+    count, stored = services.records.stored(caller)
+    if quota.fields is not None and count >= quota.fields:
+        raise Problem("QUOTA_FIELDS", headers=CLOSE)
+    if quota.stored_bytes is not None and stored + size > quota.stored_bytes:
+        raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
+
+
+@dataclass(frozen=True)
+class Intake:
+    """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried anew."""
+
+    record: FieldRecord
+    created: bool
+
+
+def original_key(reference: str) -> str:
+    """Where the uploaded bytes lie until the import has ended."""
+    return f"fields/{reference}/original"
+
+
+async def take_in(
+    services: Services, caller: str, upload: Upload, received: Received, description: UploadDescription | None = None
+) -> Intake:
+    """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
+
+    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, and QuotaError.
+    """
+    reference = reference_of(caller, received.sha256)
+    known = await off_loop(services.records.get_field, reference)
+    if known is not None and known.state != "rejected":
+        return await off_loop(_keep, services, known, description)
+    await upload.commit(original_key(reference))
+    return await off_loop(_record, services, reference, received.bytes, description)
+
+
+def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> Intake:
+    if description is not None:
+        if function_of(description) != known.description:
+            raise Problem("FIELD_DESCRIPTION_DIFFERS")
+        if description.label is not None and description.label != known.label:
+            known = services.records.update_field(known.sha256, label=description.label)
+    if known.state == "validating":
+        # mends an import that was recorded but never queued; queueing twice changes nothing
+        services.queue.enqueue_import(known.sha256, known.attempt)
+    return Intake(known, created=False)
+
+
+def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> Intake:
+    now = services.records.now()
+    said: dict[str, Any] = {} if description is None else function_of(description)
+    field = FieldRecord(
+        sha256=reference,
+        state="validating",
+        bytes=size,
+        created=now,
+        updated=now,
+        label=None if description is None else description.label,
+        description=said,
+    )
+    try:
+        record, created = services.records.create_field(field, services.quota)
+    except QuotaError:
+        services.blobs.delete(original_key(reference))
+        raise
+    if record.state == "ready":
+        # another upload of the same bytes came first and is imported already
+        services.blobs.delete(original_key(reference))
+    if not created:
+        return _keep(services, record, description)
+    services.queue.enqueue_import(record.sha256, record.attempt)
+    return Intake(record, created=True)

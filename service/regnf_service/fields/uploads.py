@@ -1,0 +1,100 @@
+"""One upload on its way into the blob store: counted, hashed and looked at while it streams.
+
+Nothing is spooled elsewhere and nothing bears a name before ``commit``: an upload that breaks off leaves nothing.
+Hashing and writing happen in a thread, a mebibyte at a time, so that the event loop keeps answering others.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+import anyio
+from anyio import CapacityLimiter, to_thread
+
+from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
+from regnf_service.http.body import CLOSE
+from regnf_service.http.problems import Problem
+from regnf_state.blobs.base import BlobStore, BlobWriter
+
+_BLOCK_BYTES = 1 << 20
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class Received:
+    """What arrived: the SHA-256 of the bytes in lower-case hexadecimal, and how many they were."""
+
+    sha256: str
+    bytes: int
+
+
+class Upload:
+    """Takes an upload's bytes in order. Use ``open_upload``; ``commit`` gives the bytes their name."""
+
+    def __init__(self, writer: BlobWriter, limit: int, limiter: CapacityLimiter) -> None:
+        self._writer = writer
+        self._limit = limit
+        self._limiter = limiter
+        self._hash = hashlib.sha256()
+        self._bytes = 0
+        self._pending = bytearray()
+        self._recognised = False
+
+    async def feed(self, data: bytes) -> None:
+        """Take the next bytes. Raises Problem UPLOAD_TOO_LARGE, FIELD_NOT_RECOGNISED as soon as the bytes show it."""
+        if self._bytes + len(self._pending) + len(data) > self._limit:
+            raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)
+        self._pending += data
+        if not self._recognised and len(self._pending) >= HEAD_BYTES:
+            self._recognise()
+        if len(self._pending) >= _BLOCK_BYTES:
+            await self._flush()
+
+    async def finish(self) -> Received:
+        """Write what is left. Raises Problem UPLOAD_EMPTY, FIELD_NOT_RECOGNISED."""
+        if not self._bytes and not self._pending:
+            raise Problem("UPLOAD_EMPTY")
+        if not self._recognised:
+            self._recognise()
+        await self._flush()
+        return Received(self._hash.hexdigest(), self._bytes)
+
+    async def commit(self, key: str) -> None:
+        """Name the bytes, whole and at once."""
+        await self._in_thread(lambda: self._writer.commit(key))
+
+    def _recognise(self) -> None:
+        head = bytes(self._pending[:HEAD_BYTES])
+        if sniff_format(head) is None:
+            _, sentence = explain_refusal(head)
+            raise Problem("FIELD_NOT_RECOGNISED", f"The file is {sentence}.", headers=CLOSE)
+        self._recognised = True
+
+    async def _flush(self) -> None:
+        block, self._pending = self._pending, bytearray()
+        await self._in_thread(lambda: self._take(block))
+
+    def _take(self, block: bytearray) -> None:
+        self._hash.update(block)
+        self._writer.write(bytes(block))
+        self._bytes += len(block)
+
+    async def _in_thread(self, work: Callable[[], _Result]) -> _Result:
+        return await to_thread.run_sync(work, limiter=self._limiter)
+
+
+@asynccontextmanager
+async def open_upload(blobs: BlobStore, limit: int, limiter: CapacityLimiter) -> AsyncIterator[Upload]:
+    """An upload of at most ``limit`` bytes; ``limiter`` caps the threads that all uploads together may hold."""
+    writer = blobs.writer()
+    opened = await to_thread.run_sync(writer.__enter__, limiter=limiter)
+    try:
+        yield Upload(opened, limit, limiter)
+    finally:
+        # also when the request is cancelled: what was written must go
+        with anyio.CancelScope(shield=True):
+            await to_thread.run_sync(lambda: writer.__exit__(None, None, None), limiter=limiter)

@@ -1,0 +1,75 @@
+"""Reading a request's body ourselves: counted, timed, and never more than was allowed."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+from starlette.requests import Request
+
+from regnf_service.http.problems import Problem
+
+# the connection cannot be used again when the body was not read to its end
+CLOSE = {"Connection": "close"}
+
+
+def declared_length(request: Request) -> int | None:
+    """The Content-Length, None for a chunked body. Raises Problem INVALID_HEADER."""
+    text = request.headers.get("content-length")
+    if text is None:
+        return None
+    if not (text.isascii() and text.isdigit() and len(text) <= 19):
+        raise Problem("INVALID_HEADER", "Content-Length is not a number of bytes.", headers=CLOSE)
+    return int(text)
+
+
+def refuse_encoding(request: Request) -> None:
+    """Compressed bodies are not taken: their size would be a guess. Raises Problem UNSUPPORTED_MEDIA_TYPE."""
+    if request.headers.get("content-encoding", "identity").strip().lower() != "identity":
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send the body without Content-Encoding.", headers=CLOSE)
+
+
+def media_type(request: Request) -> str:
+    """The Content-Type without its parameters, lower case; "" when there is none."""
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
+
+
+async def chunks(
+    request: Request, limit: int, stall_s: float, too_large: str = "UPLOAD_TOO_LARGE"
+) -> AsyncIterator[bytes]:
+    """The body as it arrives, at most ``limit`` bytes of it.
+
+    Raises Problem: ``too_large`` by header or by count, UPLOAD_STALLED when nothing comes for ``stall_s`` seconds,
+    UPLOAD_INCOMPLETE when the client leaves or the count differs from what it declared.
+    """
+    declared = declared_length(request)
+    if declared is not None and declared > limit:
+        raise Problem(too_large, f"At most {limit} bytes are taken.", headers=CLOSE)
+    received = 0
+    more = True
+    while more:
+        try:
+            async with asyncio.timeout(stall_s):
+                message = await request.receive()
+        except TimeoutError as error:
+            raise Problem("UPLOAD_STALLED", headers=CLOSE) from error
+        if message["type"] == "http.disconnect":
+            raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
+        data: bytes = message.get("body", b"")
+        received += len(data)
+        if received > limit:
+            raise Problem(too_large, f"At most {limit} bytes are taken.", headers=CLOSE)
+        if data:
+            yield data
+        more = message.get("more_body", False)
+    if declared is not None and received != declared:
+        raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
+
+
+async def read_small(request: Request, limit: int, stall_s: float) -> bytes:
+    """A whole body of at most ``limit`` bytes, for JSON. Raises as ``chunks``, with REQUEST_TOO_LARGE."""
+    refuse_encoding(request)
+    body = bytearray()
+    async for data in chunks(request, limit, stall_s, "REQUEST_TOO_LARGE"):
+        body += data
+    return bytes(body)

@@ -1,0 +1,79 @@
+"""How many things of a kind may go on at once in this process: of each caller, and of all together."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from regnf_service.http.body import CLOSE
+from regnf_service.http.problems import RETRY_LATER, Problem
+
+_LOOK_EVERY_S = 0.02
+
+
+class Slots:
+    """At most ``most`` for each caller; ``reason`` is what a caller that has as many is told. For one thread."""
+
+    def __init__(self, most: int, reason: str) -> None:
+        self._most = most
+        self._reason = reason
+        self._taken: Counter[str] = Counter()
+
+    def take(self, caller: str) -> None:
+        """Take one; give it back with ``free``. Raises Problem."""
+        if self._taken[caller] >= self._most:
+            raise Problem(self._reason, headers=RETRY_LATER | CLOSE)
+        self._taken[caller] += 1
+
+    def free(self, caller: str) -> None:
+        self._taken[caller] -= 1
+        if not self._taken[caller]:
+            del self._taken[caller]
+
+    @contextmanager
+    def held(self, caller: str) -> Iterator[None]:
+        """One for as long as the context lasts. Raises Problem."""
+        self.take(caller)
+        try:
+            yield
+        finally:
+            self.free(caller)
+
+    async def emptied(self, seconds: float) -> None:
+        """Wait until none is taken, at most this long."""
+        deadline = time.monotonic() + seconds
+        while self._taken and time.monotonic() < deadline:
+            await asyncio.sleep(_LOOK_EVERY_S)
+
+    @property
+    def taken(self) -> int:
+        """How many are taken by all callers together."""
+        return self._taken.total()
+
+
+class Waiters:
+    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many."""
+
+    def __init__(self, looks_per_s: float = 200.0) -> None:
+        self._looks_per_s = looks_per_s
+        self._held = 0
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """One answer is held while the block runs."""
+        self._held += 1
+        try:
+            yield
+        finally:
+            self._held -= 1
+
+    def pause_s(self, wanted_s: float) -> float:
+        """Seconds until one of them looks again: what it would like, or more where others look too.
+
+        Up to a quarter more or less, so that those that began together do not look together ever after.
+        """
+        return max(wanted_s, self._held / self._looks_per_s) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -1,0 +1,118 @@
+"""openapi.yaml: the contract, made from the routes and the schemas, and committed at the top of the repository."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal
+
+import yaml
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import TypeAdapter
+
+from regnf_core import __version__
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.http.schemas.common import ProblemDocument
+from regnf_service.http.schemas.jobs import JobDocument
+from regnf_service.http.schemas.registrations import DryRunDocument, Question, RegisterRequest
+
+_DESCRIPTION = """\
+Register neural signed distance fields: given the field of a scene, a detection box in it and the field of a library
+object, find the similarity transform that carries the scene's copy of the object onto the library's.
+
+Upload both fields, post a detection to `/register`, follow the job, fetch its result. Every error is a problem object
+(RFC 9457) with a stable `reason`; switch on it, never on text. Answers may gain members.
+
+Where tokens are configured every call but `/healthz`, `/static` and a job's page needs `Authorization: Bearer`, and is
+refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's fields and jobs are 404.
+A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any address that needs a token.
+
+Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
+"""
+_MODELS: tuple[Any, ...] = (
+    ProblemDocument, UploadDescription, RegisterRequest, Question, DryRunDocument, JobDocument,
+)  # fmt: skip
+_UNUSED = ("HTTPValidationError", "ValidationError")
+
+
+def build_contract(app: FastAPI) -> dict[str, Any]:
+    """The contract of an app's routes, OpenAPI 3.1."""
+    contract = get_openapi(
+        title="regnf",
+        version=__version__,
+        description=_DESCRIPTION,
+        routes=app.routes,
+        servers=[{"url": "/"}, {"url": "/v1"}],
+        license_info={"name": "MIT", "identifier": "MIT"},
+    )
+    components = contract.setdefault("components", {})
+    inputs: list[tuple[Any, Literal["validation"], TypeAdapter[Any]]] = [
+        (model.__name__, "validation", TypeAdapter(model)) for model in _MODELS
+    ]
+    _, extra = TypeAdapter.json_schemas(inputs, ref_template="#/components/schemas/{model}")
+    components["schemas"] = dict(sorted((extra["$defs"] | components.get("schemas", {})).items()))
+    for name in _UNUSED:
+        components["schemas"].pop(name, None)
+    components["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+    contract["security"] = [{}, {"token": []}]
+    for operations in contract["paths"].values():
+        for method, operation in operations.items():
+            _mend(operation)
+            if method == "head":
+                _drop_content(operation)
+    return contract
+
+
+def _mend(operation: dict[str, Any]) -> None:
+    """Drop the framework's own 422, which this service never sends, and what it says twice; statuses in order."""
+    for parameter in operation.get("parameters", []):
+        for repeated in ("title", "description"):
+            parameter["schema"].pop(repeated, None)
+        _drop_null(parameter["schema"])
+    responses = operation["responses"]
+    schema = responses.get("422", {}).get("content", {}).get("application/json", {}).get("schema", {})
+    if schema.get("$ref", "").endswith("/HTTPValidationError"):
+        del responses["422"]
+    operation["responses"] = dict(sorted(responses.items()))
+
+
+def _drop_null(schema: dict[str, Any]) -> None:
+    """Nobody can send null in a query or a header: what is not required is left out."""
+    match [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]:
+        case [only]:
+            del schema["anyOf"]
+            schema |= only
+
+
+def _drop_content(operation: dict[str, Any]) -> None:
+    for response in operation["responses"].values():
+        response.pop("content", None)
+
+
+def allowed_methods(contract: dict[str, Any], path: str) -> list[str]:
+    """The methods that a path answers to, below whatever prefix; none for one the contract does not know."""
+    found = set()
+    for template, operations in contract["paths"].items():
+        pattern = re.sub(r"\\{[^}]+\\}", "[^/]+", re.escape(template))
+        if re.fullmatch(f"(/v1)?{pattern}", path):
+            found |= {method.upper() for method in operations}
+    return sorted(found)
+
+
+class _Dumper(yaml.SafeDumper):
+    """Texts of several lines as blocks, as people write them; no references between equal parts."""
+
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 -- the base class's signature
+        return True
+
+
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None),
+)
+
+
+def contract_yaml(app: FastAPI) -> str:
+    """The contract as the file holds it."""
+    text: str = yaml.dump(app.openapi(), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return text

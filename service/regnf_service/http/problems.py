@@ -1,0 +1,180 @@
+"""Problem details (RFC 9457): the one place where what went wrong becomes an HTTP answer.
+
+No traceback and no input value ever leaves through here: clients get a stable reason, a sentence, and JSON Pointers.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.exceptions import RequestValidationError
+from redis.exceptions import RedisError
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from regnf_core.errors import RegnfError
+from regnf_service.http.contract import allowed_methods
+from regnf_state.blobs.base import StorageFullError
+from regnf_state.reasons import REASONS
+from regnf_state.records import QueueFullError, QuotaError, RecordError
+
+logger = logging.getLogger(__name__)
+MEDIA_TYPE = "application/problem+json"
+RETRY_LATER = {"Retry-After": "5"}
+_MAX_ERRORS = 32
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: "REQUEST_TOO_LARGE"}
+
+
+class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
+    """An answer that refuses. ``reason`` must be in REASONS; it gives status and title."""
+
+    def __init__(
+        self,
+        reason: str,
+        detail: str | None = None,
+        *,
+        errors: Sequence[Mapping[str, str]] = (),
+        headers: Mapping[str, str] | None = None,
+        extra: Mapping[str, Any] | None = None,
+    ) -> None:
+        entry = REASONS[reason]
+        super().__init__(detail or entry.title)
+        self.reason = reason
+        self.status = entry.status
+        self.title = entry.title
+        self.detail = detail or entry.meaning
+        self.errors = list(errors)[:_MAX_ERRORS]
+        self.headers = dict(headers or {})
+        self.extra = dict(extra or {})
+
+    @classmethod
+    def stored(cls, document: Mapping[str, Any]) -> Problem:
+        """The problem that a record holds, as an answer: its reason may be one of the engine's own."""
+        problem = cls("INTERNAL")
+        problem.reason, problem.title, problem.detail = (str(document[name]) for name in ("reason", "title", "detail"))
+        problem.status = int(document["status"])
+        known = {"type", "status", "reason", "title", "detail", "instance", "request_id"}
+        problem.extra = {name: value for name, value in document.items() if name not in known}
+        return problem
+
+    def document(self, instance: str | None = None, request_id: str | None = None) -> dict[str, Any]:
+        """The problem object as it travels."""
+        document: dict[str, Any] = {
+            "type": f"/docs#{self.reason}",
+            "title": self.title,
+            "status": self.status,
+            "reason": self.reason,
+            "detail": self.detail,
+        }
+        if instance is not None:
+            document["instance"] = instance
+        if request_id is not None:
+            document["request_id"] = request_id
+        if self.errors:
+            document["errors"] = self.errors
+        return document | self.extra
+
+
+def json_pointer(location: Sequence[str | int]) -> str:
+    """The JSON Pointer (RFC 6901) of a place in the request; a member with an odd name is pointed at by its parent."""
+    pointer = ""
+    for part in location:
+        text = str(part)
+        if not _PLAIN_NAME.fullmatch(text):
+            break
+        pointer += f"/{text}"
+    return pointer
+
+
+def problem_of(error: Exception) -> Problem:
+    """The problem that an exception stands for. What nobody foresaw is INTERNAL."""
+    match error:
+        case Problem():
+            return error
+        case RequestValidationError():
+            return _query_problem(error)
+        case HTTPException():
+            reason = _STATUS_REASONS.get(error.status_code, "INTERNAL")
+            return Problem(reason, headers=error.headers)
+        case QueueFullError():
+            return Problem("QUEUE_FULL", headers=RETRY_LATER)
+        case QuotaError():
+            return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
+        case RecordError():
+            return Problem("CONFLICT")
+        case RegnfError():
+            return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error))
+        case RedisError():
+            return Problem("STORE_UNAVAILABLE", headers=RETRY_LATER)
+        case StorageFullError():
+            return Problem("STORAGE_FULL", headers=RETRY_LATER)
+        case OSError():
+            return Problem("STORAGE_UNAVAILABLE", headers=RETRY_LATER)
+        case _:
+            return Problem("INTERNAL")
+
+
+def _query_problem(error: RequestValidationError) -> Problem:
+    """Parameters and headers that FastAPI refused: named by their own names, which are ours."""
+    places = {str(entry["loc"][0]) for entry in error.errors()}
+    if "path" in places:
+        return Problem("NOT_FOUND")
+    errors = [{"parameter": str(entry["loc"][-1]), "detail": str(entry["msg"])} for entry in error.errors()]
+    return Problem("INVALID_HEADER" if places == {"header"} else "INVALID_QUERY", errors=errors)
+
+
+def problem_response(problem: Problem, scope: Mapping[str, Any]) -> JSONResponse:
+    """The answer to send, carrying the request's id in body and header."""
+    request_id = scope.get("state", {}).get("request_id")
+    headers = {"Cache-Control": "no-store"} | problem.headers
+    if request_id is not None:
+        headers["X-Request-ID"] = request_id
+    instance = json_instance(scope.get("path", ""))
+    return JSONResponse(
+        problem.document(instance, request_id), status_code=problem.status, headers=headers, media_type=MEDIA_TYPE
+    )
+
+
+def json_instance(path: str) -> str | None:
+    """The request's path when it is made of plain characters; never an echo of anything odd or long."""
+    return path if re.fullmatch(r"[A-Za-z0-9/_.-]{1,200}", path) else None
+
+
+async def _answer(request: Request, error: Exception) -> JSONResponse:
+    problem = problem_of(error)
+    request_id = getattr(request.state, "request_id", None)
+    if problem.reason == "INTERNAL":
+        # written outside of everything that gives entries their context
+        told = {"request_id": request_id, "caller": getattr(request.state, "caller", None)}
+        logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error, extra=told)
+    elif problem.reason == "STORE_UNAVAILABLE":
+        request.app.state.metrics.redis_errors.inc()
+    if problem.reason != "INTERNAL" and problem.status >= 500:
+        logger.warning("%s request_id=%s: %s", problem.reason, request_id, type(error).__name__)
+    if problem.reason == "METHOD_NOT_ALLOWED":
+        # the framework names the methods of the first route that fits, not of the address
+        problem.headers["Allow"] = (
+            ", ".join(allowed_methods(request.app.openapi(), request.scope["path"])) or "GET, HEAD"
+        )
+    return problem_response(problem, request.scope)
+
+
+def install(app: FastAPI) -> None:
+    """Make every exception of the app leave as a problem."""
+    for kind in (
+        Problem,
+        RequestValidationError,
+        HTTPException,
+        RegnfError,
+        RecordError,
+        RedisError,
+        OSError,
+        Exception,
+    ):
+        app.add_exception_handler(kind, _answer)

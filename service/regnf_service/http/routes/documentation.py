@@ -1,0 +1,83 @@
+"""How routes say in the contract what they answer: refusals by their reasons, headers by their names."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from fastapi import APIRouter
+
+from regnf_service.http.problems import MEDIA_TYPE
+from regnf_state.reasons import REASONS
+
+_PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
+JSON = "application/json"
+_Endpoint = TypeVar("_Endpoint", bound=Callable[..., Any])
+
+
+def get_and_head(router: APIRouter, path: str, *, summary: str, **how: Any) -> Callable[[_Endpoint], _Endpoint]:
+    """Declare an endpoint for GET, and for HEAD, which has GET's status and headers; servers leave its content out."""
+
+    def declare(endpoint: _Endpoint) -> _Endpoint:
+        name = "head_" + endpoint.__name__.removeprefix("get_")
+        router.get(path, summary=summary, **how)(endpoint)
+        router.head(path, summary=f"{summary}: headers alone", operation_id=name, **how)(endpoint)
+        return endpoint
+
+    return declare
+
+
+def refusals(*reasons: str) -> dict[int | str, dict[str, Any]]:
+    """The responses entry for these reasons, grouped by status."""
+    by_status: dict[int, list[str]] = defaultdict(list)
+    for reason in reasons:
+        by_status[REASONS[reason].status].append(reason)
+    return {
+        status: {
+            "description": ", ".join(f"`{reason}`" for reason in names),
+            "content": {MEDIA_TYPE: {"schema": _PROBLEM}},
+        }
+        for status, names in sorted(by_status.items())
+    }
+
+
+def reference(model: type) -> dict[str, Any]:
+    """A reference to a model's schema; the contract lists the schema itself."""
+    return {"$ref": f"#/components/schemas/{model.__name__}"}
+
+
+def header(description: str) -> dict[str, Any]:
+    return {"description": description, "schema": {"type": "string"}}
+
+
+def links(parameter: str, source: str, *operations: str, **fixed: str) -> dict[str, Any]:
+    """What can be done next with what an answer names: operations whose ``parameter`` is ``source``, a JSON Pointer.
+
+    ``fixed`` are further parameters, taken from the request's path by their names.
+    """
+    known = {name: f"$request.path.{place}" for name, place in fixed.items()}
+    parameters = {parameter: f"$response.body#{source}"} | known
+    return {operation: {"operationId": operation, "parameters": parameters} for operation in operations}
+
+
+FIELD_LINKS = links("sha256", "/sha256", "get_field", "delete_field")
+JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
+FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
+BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
+UPLOAD_REFUSALS = (
+    "INVALID_HEADER",
+    "INVALID_DIGEST",
+    "DIGEST_MISMATCH",
+    "UPLOAD_EMPTY",
+    "UPLOAD_INCOMPLETE",
+    "UPLOAD_STALLED",
+    "UPLOAD_TOO_LARGE",
+    "UNSUPPORTED_MEDIA_TYPE",
+    "FIELD_NOT_RECOGNISED",
+    "TOO_MANY_UPLOADS",
+    "QUOTA_FIELDS",
+    "QUOTA_STORED_BYTES",
+    "STORAGE_FULL",
+)
+MULTIPART_REFUSALS = ("MALFORMED_MULTIPART", "MISSING_PART", "UNKNOWN_PART", "DUPLICATE_PART", "REQUEST_TOO_LARGE")

@@ -1,0 +1,125 @@
+"""GET, HEAD and DELETE of fields: what is held, and in which state."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from starlette.responses import JSONResponse, Response
+
+from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_service.http.dependencies import (
+    CallerDep,
+    LimitQuery,
+    PageTokenQuery,
+    PrefixDep,
+    Services,
+    ServicesDep,
+    WaitQuery,
+    off_loop,
+)
+from regnf_service.http.digests import is_sha256
+from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.problems import Problem
+from regnf_service.http.routes.documentation import BINARY, get_and_head, refusals
+from regnf_service.http.routes.uploads import field_etag
+from regnf_service.http.schemas.fields import FieldDocument, FieldPage, field_document
+from regnf_service.http.waiting import wait_for
+from regnf_state.ownership import reference_of
+from regnf_state.records import FieldRecord
+
+router = APIRouter(tags=["fields"])
+
+
+def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
+    """The caller's field. Raises Problem FIELD_NOT_FOUND."""
+    record = services.records.get_field(reference_of(caller, sha256)) if is_sha256(sha256) else None
+    if record is None:
+        raise Problem("FIELD_NOT_FOUND")
+    return record
+
+
+@get_and_head(
+    router,
+    "/fields/{sha256}",
+    summary="A field's state and what its import found",
+    response_model=FieldDocument,
+    responses=refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+)
+async def get_field(
+    sha256: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep, wait: WaitQuery = 0
+) -> JSONResponse:
+    """With `wait`, the answer comes as soon as the field is no longer `validating`.
+
+    200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
+    """
+    record = await wait_for(
+        lambda: _require(services, caller, sha256), lambda found: found.state != "validating", wait, services
+    )
+    headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
+    if record.state == "validating":
+        headers["Retry-After"] = "1"
+    return JSONResponse(field_document(record, prefix), headers=headers)
+
+
+@get_and_head(
+    router,
+    "/fields/{sha256}/preview.png",
+    summary="A picture of a field",
+    response_class=Response,
+    responses={
+        200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
+        **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
+    },
+)
+def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
+    """The surface from two sides, and its section with lines of equal distance: orange is inside."""
+    record = _require(services, caller, sha256)
+    if record.state != "ready":
+        raise Problem("FIELD_PREVIEW_NOT_FOUND")
+    try:
+        with services.blobs.open(f"fields/{record.sha256}/{PICTURE_NAME}") as file:
+            data = file.read()
+    except FileNotFoundError as error:
+        raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
+    headers = {"ETag": field_etag(record), "Cache-Control": "private, max-age=3600"}
+    return Response(data, media_type="image/png", headers=headers)
+
+
+@router.get(
+    "/fields",
+    summary="Fields, newest first",
+    response_model=FieldPage,
+    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+)
+async def list_fields(
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    limit: LimitQuery = 50,
+    page_token: PageTokenQuery = None,
+    label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
+) -> dict[str, Any]:
+    before = decode_token(page_token)
+    # one more than asked for tells whether there is a next page
+    found = await off_loop(services.records.list_fields, label, limit + 1, before, caller)
+    page = found[:limit]
+    more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
+    return {"fields": [field_document(record, prefix) for record in page], "next_page_token": more}
+
+
+@router.delete(
+    "/fields/{sha256}",
+    summary="Forget a field and its bytes",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"),
+)
+def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
+    """Refused while an active job needs the field. Results of finished jobs stay."""
+    reference = _require(services, caller, sha256).sha256
+    if next(iter(services.records.jobs_using_field(reference)), None) is not None:
+        raise Problem("FIELD_IN_USE")
+    services.records.delete_field(reference)
+    services.blobs.delete_prefix(f"fields/{reference}")
+    return Response(status_code=204)

@@ -1,0 +1,219 @@
+"""Jobs: their documents, their events, and their end."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any, NamedTuple
+
+from fastapi import APIRouter, Header, Query
+from starlette.responses import JSONResponse, Response, StreamingResponse
+
+from regnf_service.http import sse
+from regnf_service.http.dependencies import (
+    CallerDep,
+    LimitQuery,
+    PageTokenQuery,
+    PrefixDep,
+    Services,
+    ServicesDep,
+    WaitQuery,
+    off_loop,
+)
+from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.problems import Problem
+from regnf_service.http.routes.documentation import header, refusals
+from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document
+from regnf_service.http.waiting import wait_for
+from regnf_service.jobs.canonical import digest
+from regnf_service.jobs.lookup import find_job
+from regnf_state.records import ACTIVE, JobRecord
+from regnf_state.redis.webhook_outbox import Delivery
+
+router = APIRouter(tags=["jobs"])
+_RETRY_AFTER_S = "1"
+_EVENT_ID = {"pattern": "^[0-9]{1,19}(-[0-9]{1,19})?$"}
+_EVENT = {
+    "description": "One event of the stream.",
+    "type": "object",
+    "required": ["id", "event", "data"],
+    "properties": {
+        "id": {"type": "string"} | _EVENT_ID,
+        "event": {"enum": ["status", "progress"]},
+        "data": {"type": "string", "contentMediaType": "application/json"},
+    },
+}
+
+
+async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
+    """The job's document, with the headers that tell a poller when to come back."""
+    return _answer(services, await off_loop(_seen, services, record), prefix, status)
+
+
+class _Seen(NamedTuple):
+    """A job with what its document shows beside the record."""
+
+    record: JobRecord
+    position: int | None
+    delivery: Delivery | None
+
+
+def _seen(services: Services, record: JobRecord) -> _Seen:
+    position = services.records.queue_position(record.id) if record.status == "accepted" else None
+    return _Seen(record, position, services.webhooks.delivery(record))
+
+
+def _answer(services: Services, seen: _Seen, prefix: str, status: int) -> JSONResponse:
+    record, position, delivery = seen
+    headers = {"ETag": _etag(seen), "Cache-Control": "no-cache"}
+    if record.status in ACTIVE:
+        headers["Retry-After"] = _RETRY_AFTER_S
+    document = job_document(record, position, services.settings.retention_s, prefix, delivery)
+    return JSONResponse(document, status_code=status, headers=headers)
+
+
+def _etag(seen: _Seen) -> str:
+    # by what the document shows, not by the version: heartbeats change that every few seconds
+    record, position, delivery = seen
+    shown: list[Any] = [record.attempt, record.status, record.phase, record.progress, record.updated, position]
+    if delivery is not None:
+        shown.append(asdict(delivery))
+    return f'"{digest(shown)[:24]}"'
+
+
+@router.get(
+    "/jobs",
+    summary="Jobs, newest first",
+    response_model=JobPage,
+    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+)
+def list_jobs(
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    limit: LimitQuery = 50,
+    page_token: PageTokenQuery = None,
+    status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
+) -> dict[str, Any]:
+    """`queue_position` is left out here: ask for the job itself."""
+    found = services.records.list_jobs(status, limit + 1, decode_token(page_token), caller)
+    page = found[:limit]
+    more = encode_token(page[-1].created, page[-1].id) if len(found) > limit else None
+    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page]
+    return {"jobs": documents, "next_page_token": more}
+
+
+@router.get(
+    "/jobs/{id}",
+    summary="A job's state",
+    response_model=JobDocument,
+    responses={
+        200: {"headers": {"ETag": header("For If-None-Match."), "Retry-After": header("While the job is active.")}},
+        304: {"description": "Nothing has changed since the ETag given."},
+        **refusals("INVALID_QUERY", "JOB_NOT_FOUND", "JOB_EXPIRED"),
+    },
+)
+async def get_job(
+    id: str,  # noqa: A002 -- the contract's own word
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    wait: WaitQuery = 0,
+    if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
+) -> Response:
+    """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
+
+    def look() -> _Seen:
+        record = find_job(services, id, caller)
+        if if_none_match is None and wait:
+            return _Seen(record, None, None)  # its state is all that is waited for
+        return _seen(services, record)
+
+    def is_news(seen: _Seen) -> bool:
+        return seen.record.status not in ACTIVE or (if_none_match is not None and _etag(seen) != if_none_match)
+
+    seen = await wait_for(look, is_news, wait, services)
+    if if_none_match is None and wait:
+        seen = await off_loop(_seen, services, seen.record)
+    response = _answer(services, seen, prefix, 200)
+    if if_none_match is not None and response.headers["ETag"] == if_none_match:
+        return Response(status_code=304, headers={"ETag": if_none_match})
+    return response
+
+
+@router.get(
+    "/jobs/{id}/events",
+    summary="A job's changes as server-sent events",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Events `status` and `progress`; the data are status, phase, progress, attempt, updated. "
+            "The stream ends after the event that ends the job.",
+            "content": {sse.MEDIA_TYPE: {"schema": _EVENT}},
+        },
+        204: {"description": "The job has finished and `Last-Event-ID` was its last event: do not reconnect."},
+        **refusals("INVALID_EVENT_ID", "JOB_NOT_FOUND", "JOB_EXPIRED", "TOO_MANY_STREAMS"),
+    },
+)
+async def job_events(
+    id: str,  # noqa: A002
+    services: ServicesDep,
+    caller: CallerDep,
+    last_event_id: Annotated[
+        str | None, Header(description="Resume after this event.", json_schema_extra=_EVENT_ID)
+    ] = None,
+) -> Response:
+    """From the beginning, or after `Last-Event-ID`."""
+    record = await off_loop(find_job, services, id, caller)
+    try:
+        waiting = await off_loop(services.records.events, id, last_event_id, 0.0)
+    except ValueError as error:
+        raise Problem("INVALID_EVENT_ID") from error
+    if last_event_id is not None and record.status not in ACTIVE and not waiting:
+        return Response(status_code=204)
+    return sse.EventStream(services.streams, caller, sse.event_stream(services, id, last_event_id))
+
+
+@router.post(
+    "/jobs/{id}/cancel",
+    summary="Stop a job",
+    response_model=JobDocument,
+    status_code=202,
+    responses={
+        200: {"description": "It was dismissed already.", "model": JobDocument},
+        202: {"description": "A waiting job is dismissed at once, a running one within seconds."},
+        **refusals("JOB_NOT_FOUND", "JOB_FINISHED", "JOB_EXPIRED"),
+    },
+)
+async def cancel_job(
+    id: str,  # noqa: A002
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+) -> JSONResponse:
+    """Cancelling twice is no error."""
+    before = await off_loop(find_job, services, id, caller)
+    if before.status == "dismissed":
+        return await job_answer(services, before, prefix)
+    after = await off_loop(services.records.request_cancel, id)
+    if after is None:
+        raise Problem("JOB_NOT_FOUND")
+    if after.status in ("successful", "failed"):
+        raise Problem("JOB_FINISHED")
+    await off_loop(services.queue.stop, id, after.attempt)
+    return await job_answer(services, after, prefix, 202)
+
+
+@router.delete(
+    "/jobs/{id}",
+    summary="Forget a job and its artifacts",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("JOB_NOT_FOUND", "JOB_ACTIVE", "JOB_EXPIRED"),
+)
+def delete_job(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
+    """Only a finished job: cancel it first."""
+    if find_job(services, id, caller).status in ACTIVE:
+        raise Problem("JOB_ACTIVE")
+    services.records.delete_job(id)
+    services.blobs.delete_prefix(f"jobs/{id}")
+    return Response(status_code=204)

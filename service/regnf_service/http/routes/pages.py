@@ -1,0 +1,36 @@
+"""The page of a job. It reads the job through the API, so it holds no data itself and needs no token."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastapi import APIRouter
+from starlette.responses import FileResponse
+
+from regnf_service.http.dependencies import ServicesDep
+from regnf_service.http.routes.documentation import get_and_head, refusals
+from regnf_service.jobs.lookup import find_job
+from regnf_state.ownership import ANONYMOUS
+
+router = APIRouter(tags=["results"])
+WEB = Path(__file__).resolve().parents[2] / "web"
+PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+
+
+@get_and_head(
+    router,
+    "/jobs/{id}/view",
+    summary="A job's page, with the registration in 3D",
+    response_class=FileResponse,
+    responses={
+        200: {"description": "The page.", "content": {"text/html": {"schema": {"type": "string"}}}},
+        **refusals("JOB_NOT_FOUND", "JOB_EXPIRED"),
+    },
+)
+def view(id: str, services: ServicesDep) -> FileResponse:  # noqa: A002
+    """Shows progress while the job is active. Where tokens are needed, the page asks for one."""
+    if not services.settings.needs_token:
+        # with tokens the page comes before the token, so it must not tell which jobs there are
+        find_job(services, id, ANONYMOUS)
+    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-cache"}
+    return FileResponse(WEB / "view.html", media_type="text/html", headers=headers)

@@ -1,0 +1,183 @@
+"""POST /register: one registration, by reference or with its files."""
+
+from __future__ import annotations
+
+import re
+from contextlib import AsyncExitStack
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Query
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from regnf_service.fields.ingest import take_in
+from regnf_service.http import body
+from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.multipart import boundary_of, read_parts
+from regnf_service.http.problems import Problem
+from regnf_service.http.routes.documentation import (
+    FILE,
+    JOB_LINKS,
+    JSON,
+    MULTIPART_REFUSALS,
+    UPLOAD_REFUSALS,
+    header,
+    reference,
+    refusals,
+)
+from regnf_service.http.routes.examples import REGISTER_EXAMPLES
+from regnf_service.http.routes.jobs import job_answer
+from regnf_service.http.schemas.jobs import JobDocument
+from regnf_service.http.schemas.reading import read_model
+from regnf_service.http.schemas.registrations import DryRunDocument, Question, RegisterRequest
+from regnf_service.http.waiting import wait_for
+from regnf_service.jobs.canonical import canonical_request, job_id_of
+from regnf_service.jobs.submit import check_fields, check_idempotency_key, submit
+from regnf_state.ownership import owned_request
+from regnf_state.records import ACTIVE, FINISHED
+
+router = APIRouter(tags=["registrations"])
+_PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
+_LONGEST_WAIT_S = 30
+_ONE_SHOT = {
+    "schema": {
+        "type": "object",
+        "required": ["scene", "object", "request"],
+        "additionalProperties": False,
+        "properties": {"scene": FILE, "object": FILE, "request": reference(Question)},
+    }
+}
+
+
+def preferred_wait(prefer: str | None) -> int | None:
+    """The seconds of `Prefer: wait=N` (RFC 7240), at most thirty; what is malformed is ignored, as the RFC has it."""
+    for preference in (prefer or "").split(","):
+        match = _PREFERENCE.fullmatch(preference)
+        if match:
+            return min(int(match.group(1)), _LONGEST_WAIT_S)
+    return None
+
+
+@router.post(
+    "/register",
+    summary="Find the transform that lays the scene's copy of the object onto the library's",
+    response_model=JobDocument,
+    status_code=202,
+    responses={
+        200: {
+            "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
+            "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
+            "links": JOB_LINKS,
+        },
+        202: {
+            "description": "Accepted.",
+            "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
+            "links": JOB_LINKS,
+        },
+        **refusals(
+            *UPLOAD_REFUSALS,
+            *MULTIPART_REFUSALS,
+            "MALFORMED_JSON",
+            "INVALID_QUERY",
+            "INVALID_IDEMPOTENCY_KEY",
+            "FIELD_NOT_FOUND",
+            "INVALID_REQUEST",
+            "INVALID_DETECTION",
+            "INVALID_OPTIONS",
+            "INVALID_TRANSFORM",
+            "INITIAL_TRANSFORM_UNSUPPORTED",
+            "LIBRARY_SEARCH_UNSUPPORTED",
+            "FIELD_REJECTED",
+            "INVALID_WEBHOOK",
+            "WEBHOOK_NOT_ALLOWED",
+            "DETECTION_OUTSIDE_SCENE",
+            "IDEMPOTENCY_KEY_REUSED",
+            "QUEUE_FULL",
+            "QUOTA_ACTIVE_JOBS",
+        ),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                JSON: {"schema": reference(RegisterRequest), "examples": REGISTER_EXAMPLES},
+                "multipart/form-data": _ONE_SHOT,
+            },
+        }
+    },
+)
+async def register(
+    request: Request,
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    dry_run: Annotated[bool, Query(description="Check everything, start nothing.")] = False,
+    prefer: Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")] = None,
+    idempotency_key: Annotated[
+        str | None,
+        Header(
+            description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
+            json_schema_extra={"pattern": "^[!-~]([ -~]{0,253}[!-~])?$"},
+        ),
+    ] = None,
+) -> JSONResponse:
+    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew."""
+    check_idempotency_key(idempotency_key)
+    kind = body.media_type(request)
+    if kind == JSON:
+        asked = await _by_reference(request, services, caller)
+    elif kind == "multipart/form-data":
+        asked = await _one_shot(request, services, caller, keep=not dry_run)
+    else:
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
+    if dry_run:
+        return JSONResponse({"valid": True, "id": job_id_of(owned_request(asked, caller)), "request": asked})
+    record = await off_loop(submit, services, caller, asked, idempotency_key)
+    wait = preferred_wait(prefer)
+    if wait and record.status in ACTIVE:
+        record = await wait_for(
+            lambda: services.records.get_job(record.id) or record,
+            lambda found: found.status in FINISHED,
+            wait,
+            services,
+        )
+    response = await job_answer(services, record, prefix, 200 if record.status in FINISHED else 202)
+    response.headers["Location"] = f"{prefix}/jobs/{record.id}"
+    if wait is not None:
+        response.headers["Preference-Applied"] = f"wait={wait}"
+    return response
+
+
+async def _by_reference(request: Request, services: Services, caller: str) -> dict[str, Any]:
+    settings = services.settings
+    text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
+    question = read_model(RegisterRequest, text)
+    asked = canonical_request(question, question.scene, question.object, question.candidates)
+    named = {"/scene": question.scene}
+    if question.object is not None:
+        named["/object"] = question.object
+    named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(question.candidates or ())}
+    await off_loop(check_fields, services, caller, asked, named)
+    return asked
+
+
+async def _one_shot(request: Request, services: Services, caller: str, keep: bool) -> dict[str, Any]:
+    """Both files and the question in one body. Nothing is kept before all of it has arrived and been checked."""
+    body.refuse_encoding(request)
+    settings = services.settings
+    limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
+    async with AsyncExitStack() as stack:
+        files = {name: await stack.enter_async_context(services.open_upload(caller)) for name in ("scene", "object")}
+        data = body.chunks(request, limit, settings.upload_stall_s)
+        parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
+        missing = [name for name in ("scene", "object", "request") if name not in parts]
+        if missing:
+            raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
+        question = read_model(Question, parts["request"])
+        received = {name: await upload.finish() for name, upload in files.items()}
+        asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
+        await off_loop(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
+        if keep:
+            for name, upload in files.items():
+                await take_in(services, caller, upload, received[name])
+    return asked

@@ -1,0 +1,176 @@
+"""PUT /fields/{sha256} and POST /fields: the bytes of a field."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Path
+from starlette.requests import Request
+from starlette.responses import JSONResponse
+
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.fields.ingest import Intake, check_room, take_in
+from regnf_service.fields.uploads import Received, Upload
+from regnf_service.http import body
+from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.digests import announced_digest, is_sha256
+from regnf_service.http.multipart import boundary_of, read_parts
+from regnf_service.http.problems import Problem
+from regnf_service.http.routes.documentation import (
+    FIELD_LINKS,
+    FILE,
+    MULTIPART_REFUSALS,
+    UPLOAD_REFUSALS,
+    header,
+    reference,
+    refusals,
+)
+from regnf_service.http.schemas.fields import FieldDocument, field_document
+from regnf_service.http.schemas.reading import read_model
+from regnf_state.records import FieldRecord
+
+router = APIRouter(tags=["fields"])
+DESCRIPTION_BYTES = 16 * 1024
+_HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
+_DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
+_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The bytes were held already.",
+        "model": FieldDocument,
+        "headers": _HEADERS,
+        "links": FIELD_LINKS,
+    },
+    201: {"description": "Stored; the import is queued.", "headers": _HEADERS, "links": FIELD_LINKS},
+}
+_MULTIPART = {
+    "schema": {
+        "type": "object",
+        "required": ["file"],
+        "additionalProperties": False,
+        "properties": {"file": FILE, "description": reference(UploadDescription)},
+    }
+}
+
+
+@router.put(
+    "/fields/{sha256}",
+    summary="Upload a field under its SHA-256",
+    response_model=FieldDocument,
+    status_code=201,
+    responses={
+        **_ANSWERS,
+        **refusals(*UPLOAD_REFUSALS),
+    },
+    openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": FILE}}}},
+)
+async def put_field(
+    request: Request,
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    sha256: Annotated[str, Path(description="SHA-256 of the file.", json_schema_extra={"pattern": "^[0-9a-f]{64}$"})],
+    content_digest: Annotated[
+        str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.", json_schema_extra=_DIGEST)
+    ] = None,
+) -> JSONResponse:
+    """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held."""
+    if not is_sha256(sha256):
+        raise Problem("INVALID_DIGEST", headers=body.CLOSE)
+    if body.media_type(request).startswith("multipart/"):
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=body.CLOSE)
+    digest = announced_digest(content_digest)
+    await off_loop(check_room, services, caller, sha256, body.declared_length(request))
+    async with services.open_upload(caller) as upload:
+        received = await _receive_raw(request, services, upload)
+        if received.sha256 != sha256 or digest not in (None, received.sha256):
+            raise Problem("DIGEST_MISMATCH")
+        taken = await take_in(services, caller, upload, received)
+    return _answer(taken, prefix)
+
+
+@router.post(
+    "/fields",
+    summary="Upload a field; the service computes its SHA-256",
+    response_model=FieldDocument,
+    status_code=201,
+    responses={
+        **_ANSWERS,
+        **refusals(
+            *UPLOAD_REFUSALS, *MULTIPART_REFUSALS, "MALFORMED_JSON", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"
+        ),
+    },
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/octet-stream": {"schema": FILE}, "multipart/form-data": _MULTIPART},
+        }
+    },
+)
+async def post_field(
+    request: Request,
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    content_digest: Annotated[
+        str | None, Header(description="RFC 9530, of the body as sent.", json_schema_extra=_DIGEST)
+    ] = None,
+) -> JSONResponse:
+    """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
+    digest = announced_digest(content_digest)
+    async with services.open_upload(caller) as upload:
+        if body.media_type(request) == "multipart/form-data":
+            received, description = await _receive_parts(request, services, upload, digest)
+        else:
+            received, description = await _receive_raw(request, services, upload), None
+            if digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+        taken = await take_in(services, caller, upload, received, description)
+    return _answer(taken, prefix)
+
+
+async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+    body.refuse_encoding(request)
+    settings = services.settings
+    async for data in body.chunks(request, settings.max_upload_bytes, settings.upload_stall_s):
+        await upload.feed(data)
+    return await upload.finish()
+
+
+async def _receive_parts(
+    request: Request, services: Services, upload: Upload, digest: str | None
+) -> tuple[Received, UploadDescription | None]:
+    body.refuse_encoding(request)
+    settings = services.settings
+    limit = settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
+    data = body.chunks(request, limit, settings.upload_stall_s)
+    if digest is not None:
+        data = _compared(data, digest)
+    parts = await read_parts(data, boundary_of(request), {"file": upload}, {"description": DESCRIPTION_BYTES})
+    if "file" not in parts:
+        raise Problem("MISSING_PART", "The part `file` is missing.")
+    text = parts.get("description")
+    description = None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
+    return await upload.finish(), description
+
+
+async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises Problem DIGEST_MISMATCH at its end: the digest is of the parts and all between."""
+    found = hashlib.sha256()
+    async for piece in data:
+        found.update(piece)
+        yield piece
+    if found.hexdigest() != digest:
+        raise Problem("DIGEST_MISMATCH")
+
+
+def _answer(taken: Intake, prefix: str) -> JSONResponse:
+    document = field_document(taken.record, prefix)
+    headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
+    return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)
+
+
+def field_etag(record: FieldRecord) -> str:
+    """Changes with every change of the field's record."""
+    return f'"{record.sha256[:16]}.{record.version}"'

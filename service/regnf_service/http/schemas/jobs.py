@@ -1,0 +1,110 @@
+"""Jobs as the contract shows them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Literal
+
+from pydantic import Field
+
+from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem, rfc3339
+from regnf_state.records import ACTIVE, JobRecord
+from regnf_state.redis.webhook_outbox import Delivery
+
+Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+
+
+class WebhookDocument(Outgoing):
+    """How the message about the job's end fares."""
+
+    url: str
+    state: Literal["waiting", "pending", "delivered", "failed"] | None = Field(
+        None, description="Waiting for the job's end; to be sent, again perhaps; received; given up. Null in lists."
+    )
+    sends: int = 0
+    last_status: int | None = Field(None, description="What the receiver answered last.")
+    last_error: str | None = Field(None, description="A word for why there was no answer.")
+    next_at: str | None = None
+    delivered_at: str | None = None
+
+
+class JobDocument(Outgoing):
+    """One job. `successful` means that it has a result, whose verdict may still be `rejected`."""
+
+    id: str
+    kind: Literal["registration"]
+    status: Status
+    phase: str | None = Field(
+        None, description="loading, sampling, initialising, optimising, verifying or exporting: where it is, or ended."
+    )
+    progress: float = Field(0.0, ge=0, le=1)
+    queue_position: int | None = Field(None, description="1 is next; null for a job that does not wait.")
+    attempts: int = Field(1, ge=1, description="How often the job was handed to a worker.")
+    cancel_requested: bool = False
+    created_at: str
+    updated_at: str
+    started_at: str | None = None
+    finished_at: str | None = None
+    expires_at: str | None = Field(None, description="When a finished job and its artifacts will be gone.")
+    inputs: dict[str, Any] = Field(
+        description="scene, object or the number of candidates, detection, seed, initial_transform, and the SHA-256 of "
+        "the full options."
+    )
+    engine: dict[str, Any] = Field({}, description="Version and device.")
+    verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
+    error: ProblemDocument | None = Field(None, description="Why the job failed.")
+    webhook: WebhookDocument | None = None
+    links: Links
+
+
+class JobPage(Outgoing):
+    """Jobs, newest first."""
+
+    jobs: list[JobDocument]
+    next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
+
+
+def job_document(
+    record: JobRecord, queue_position: int | None, retention_s: float, prefix: str, delivery: Delivery | None = None
+) -> dict[str, Any]:
+    """The job as it travels; ``prefix`` is what the API's paths begin with."""
+    return {
+        "id": record.id,
+        "kind": record.kind,
+        "status": record.status,
+        "phase": record.phase,
+        "progress": record.progress,
+        "queue_position": queue_position,
+        "attempts": record.attempt,
+        "cancel_requested": record.cancel_requested,
+        "created_at": rfc3339(record.created),
+        "updated_at": rfc3339(record.updated),
+        "started_at": rfc3339(record.started),
+        "finished_at": rfc3339(record.finished),
+        "expires_at": None if record.finished is None else rfc3339(record.finished + retention_s),
+        "inputs": record.inputs,
+        "engine": record.engine,
+        "verdict": record.verdict,
+        "error": outgoing_problem(record.error),
+        "webhook": _webhook(record, delivery),
+        "links": _links(record, f"{prefix}/jobs/{record.id}"),
+    }
+
+
+def _webhook(record: JobRecord, delivery: Delivery | None) -> dict[str, Any] | None:
+    if "webhook" not in record.request:
+        return None
+    document: dict[str, Any] = {"url": record.request["webhook"]["url"], "state": None}
+    if delivery is not None:
+        times = {"next_at": rfc3339(delivery.next_at), "delivered_at": rfc3339(delivery.delivered_at)}
+        document |= asdict(delivery) | times
+    return document
+
+
+def _links(record: JobRecord, address: str) -> Links:
+    links = {"self": address, "events": f"{address}/events", "view": f"{address}/view"}
+    if record.status in ACTIVE:
+        links["cancel"] = f"{address}/cancel"
+    if record.status == "successful":
+        links["result"] = f"{address}/result"
+    return links

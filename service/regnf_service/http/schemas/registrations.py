@@ -1,0 +1,145 @@
+"""What POST /register takes."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from regnf_core.options import RegistrationOptions
+from regnf_service.http.schemas.common import Incoming, Outgoing, Sha256
+from regnf_service.http.schemas.detections import Detection
+from regnf_service.http.schemas.transforms import Similarity
+
+START_UNSUPPORTED = "initial_transform_unsupported"
+SEARCH_UNSUPPORTED = "library_search_unsupported"
+_MOST_CANDIDATES = 512
+
+
+class FieldReference(Incoming):
+    """A field by the SHA-256 of the bytes that were uploaded."""
+
+    field: Sha256
+
+
+def _bare_reference(value: Any) -> Any:
+    return value["field"] if isinstance(value, dict) and value.keys() == {"field"} else value
+
+
+Reference = Annotated[Sha256, BeforeValidator(_bare_reference, json_schema_input_type=Sha256 | FieldReference)]
+
+
+def _given(value: Any) -> Any:
+    if value is None:
+        raise ValueError("leave it out, or name something")
+    return value
+
+
+def _distinct(names: list[str]) -> list[str]:
+    if len(set(names)) < len(names):
+        raise ValueError("a field is named twice")
+    return names
+
+
+Candidates = Annotated[
+    list[Reference], Field(min_length=1, max_length=_MOST_CANDIDATES, json_schema_extra={"uniqueItems": True})
+]
+
+
+class GroundTruth(Incoming):
+    """The known transform, scene coordinates to object coordinates; the result's metrics then hold the errors."""
+
+    T_object_scene: Similarity
+
+
+class Webhook(Incoming):
+    """Where to send a signed message once the job has ended."""
+
+    url: Annotated[str, StringConstraints(min_length=8, max_length=2000)]
+
+
+class Question(Incoming):
+    """What a registration asks, apart from the fields: the part `request` of a one-shot upload."""
+
+    detection: Detection = Field(description="Where in the scene the object is.")
+    options: RegistrationOptions = Field(default_factory=RegistrationOptions)
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="The same seed gives the same result.")] = 0
+    initial_transform: Similarity | None = Field(
+        None,
+        description="A T_object_scene to look at first; everything else is searched only if that is rejected. "
+        "For the preset `robust`.",
+    )
+    ground_truth: GroundTruth | None = None
+    webhook: Webhook | None = Field(
+        None, description="Told of the job's end. Only hosts that the service allows; another webhook is another job."
+    )
+
+    @field_validator("initial_transform")
+    @classmethod
+    def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
+        options = info.data.get("options")  # absent when they were refused themselves
+        if start is not None and options is not None and options.preset != "robust":
+            raise PydanticCustomError(START_UNSUPPORTED, "only the preset `robust` starts from a given transform")
+        return start
+
+
+def _one_of_both(schema: dict[str, Any]) -> None:
+    schema["oneOf"] = [{"required": ["object"]}, {"required": ["candidates"]}]
+    for name in ("object", "candidates"):
+        schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
+
+
+class RegisterRequest(Question):
+    """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
+
+    model_config = ConfigDict(json_schema_extra=_one_of_both)
+
+    scene: Reference = Field(description="The scene's field.")
+    object: Annotated[Reference | None, BeforeValidator(_given, json_schema_input_type=Sha256 | FieldReference)] = (
+        Field(None, description="The library object's field.")
+    )
+    candidates: Annotated[
+        Candidates | None, AfterValidator(_distinct), BeforeValidator(_given, json_schema_input_type=Candidates)
+    ] = Field(
+        None,
+        description="Instead of `object`: the fields of a library. The likeliest is found and registered by the preset "
+        "`robust`, and the result ranks them.",
+    )
+
+    @field_validator("candidates")
+    @classmethod
+    def _can_be_searched(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
+        if names is None:
+            return None
+        options = info.data.get("options")
+        if options is not None and options.preset != "robust":
+            raise PydanticCustomError(SEARCH_UNSUPPORTED, "only the preset `robust` searches a library")
+        if info.data.get("initial_transform") is not None:
+            raise PydanticCustomError(START_UNSUPPORTED, "a search of a library starts from no given transform")
+        if info.data.get("ground_truth") is not None:
+            raise ValueError("a ground truth is of one object, not of several candidates")
+        return names
+
+    @model_validator(mode="after")
+    def _asks_for_one_or_several(self) -> RegisterRequest:
+        if (self.object is None) == (self.candidates is None):
+            raise ValueError("exactly one of `object` and `candidates` must be given")
+        return self
+
+
+class DryRunDocument(Outgoing):
+    """The answer to `?dry_run=true`: the request would be accepted, and this is what it would become."""
+
+    valid: bool
+    id: str
+    request: dict[str, Any]

@@ -1,0 +1,102 @@
+"""What a registration found, as the contract shows it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from regnf_service.http.schemas.common import Outgoing
+
+Verdict = Literal["registered", "ambiguous", "rejected"]
+_Three = Annotated[list[float | None], Field(min_length=3, max_length=3)]
+_Seven = Annotated[list[float | None], Field(min_length=7, max_length=7)]
+
+
+class TransformDocument(Outgoing):
+    """A similarity transform x -> s R x + t. `matrix` is row-major 4x4 and holds all of it."""
+
+    matrix: list[list[float]]
+    scale: float
+    rotation_quaternion_xyzw: list[float]
+    translation: list[float]
+
+
+class AlternativeDocument(Outgoing):
+    """Another pose that explains the data as well, such as a table's twin."""
+
+    T_object_scene: TransformDocument
+    score: float = Field(description="0..1, smaller is better; the result's own is the metric `score`.")
+    relation: str = Field(description="How it differs from the result, such as `180 degrees about z`: object axes.")
+
+
+class UncertaintyDocument(Outgoing):
+    """One standard deviation each, from the covariance's diagonal."""
+
+    rotation_deg: _Three = Field(description="Degrees about the object frame's x, y, z.")
+    translation: _Three = Field(description="Of T_object_scene's translation, along x, y, z, object units.")
+    scale_percent: float | None = Field(description="Of the scale.")
+
+
+class SymmetryDocument(Outgoing):
+    """The turns that carry the object onto itself, found by registering it with itself."""
+
+    order: int = Field(
+        ge=1, description="How many, the identity included; with `continuous`, how many ends look alike: 1 or 2."
+    )
+    axis: list[float] | None = Field(description="Unit vector, object frame, that all of them turn about; or null.")
+    continuous: bool = Field(description="Whether every turn about the axis is one.")
+
+
+class CandidateDocument(Outgoing):
+    """What a search found out about one object of a library."""
+
+    object: str = Field(description="SHA-256 of its field.")
+    stage: Literal["refined", "coarse", "signature", "unusable"] = Field(
+        description="How far it came: refined on its field and judged, searched coarsely, compared by signature alone; "
+        "or unusable as an object."
+    )
+    score: float | None = Field(description="0..1, smaller is better; to be compared within one stage.")
+    verdict: Verdict | None = Field(None, description="Of refined ones.")
+    verdict_reason: str | None = Field(None, description="Of refined and unusable ones.")
+    T_object_scene: TransformDocument | None = Field(None, description="Of refined ones.")
+
+
+class ArtifactEntry(Outgoing):
+    """One file that the job wrote."""
+
+    name: str
+    bytes: int
+    sha256: str
+    url: str
+
+
+class ResultDocument(Outgoing):
+    """What a registration found. Transforms carry their direction in their name."""
+
+    verdict: Verdict
+    verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
+    verdict_detail: str = Field("", description="The reason in words, for people.")
+    T_object_scene: TransformDocument = Field(description="Scene coordinates to object coordinates.")
+    T_scene_object: TransformDocument = Field(description="Its inverse.")
+    T_object_scene_initial: TransformDocument | None = Field(None, description="Where the refinement began.")
+    alternatives: list[AlternativeDocument] = Field(
+        [], description="Every other pose that explains the data as well; empty unless `ambiguous`."
+    )
+    covariance: Annotated[list[_Seven], Field(min_length=7, max_length=7)] | None = Field(
+        None,
+        description="7x7 in the order of `covariance_ordering`: a left perturbation of T_object_scene, "
+        "s e^(log_s), exp(omega) R, t + dt; radians and object units. Null from the preset `paper`.",
+    )
+    covariance_ordering: list[str] | None = Field(None, description="omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s.")
+    uncertainty: UncertaintyDocument | None = None
+    symmetry: SymmetryDocument | None = Field(None, description="The object's own; null from the preset `paper`.")
+    metrics: dict[str, float | None] = Field({})
+    object: str | None = Field(None, description="SHA-256 of the object's field; of a search, of the likeliest's.")
+    candidates: list[CandidateDocument] | None = Field(
+        None, description="All candidates of a search, the likeliest first; null for one object."
+    )
+    seed: int = 0
+    options: dict[str, Any] = Field({}, description="Every option that was used, defaults included.")
+    engine: dict[str, Any] = Field({}, description="Name, version, device.")
+    artifacts: list[ArtifactEntry] = Field([])

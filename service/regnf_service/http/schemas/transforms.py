@@ -1,0 +1,88 @@
+"""Similarity transforms as clients send them: a bare 4x4, or the transform object that results carry."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+
+from regnf_core.geometry.similarity import similarity_fault
+from regnf_service.http.schemas.common import Coordinate, Incoming
+from regnf_service.jobs.boxes import normal_quaternion, rotation_columns
+
+Rows = list[list[float]]
+_AGREE = 1e-4
+
+
+def _similar(rows: Rows) -> Rows:
+    fault = similarity_fault(rows)
+    if fault is not None:
+        raise ValueError(f"not a similarity transform: {fault}")
+    return [[float(value) + 0.0 for value in row] for row in rows]
+
+
+Row = Annotated[list[Coordinate], Field(min_length=4, max_length=4)]
+Matrix = Annotated[
+    list[Row], Field(min_length=4, max_length=4, description="Row-major 4x4, (s R, t)."), AfterValidator(_similar)
+]
+_Three = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+_Four = Annotated[list[Coordinate], Field(min_length=4, max_length=4)]
+
+
+class TransformObject(Incoming):
+    """A transform as results carry it. `matrix` holds all of it; the others may be left out, not contradict it."""
+
+    matrix: Matrix
+    scale: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
+    rotation_quaternion_xyzw: _Four | None = None
+    translation: _Three | None = None
+
+    @model_validator(mode="after")
+    def _agrees(self) -> TransformObject:
+        if not (self._same_scale() and self._same_rotation() and self._same_translation()):
+            raise ValueError("scale, rotation_quaternion_xyzw or translation contradict the matrix")
+        return self
+
+    def _matrix_scale(self) -> float:
+        return math.sqrt(sum(value * value for row in self.matrix[:3] for value in row[:3]) / 3)
+
+    def _same_scale(self) -> bool:
+        return self.scale is None or math.isclose(self.scale, self._matrix_scale(), rel_tol=_AGREE)
+
+    def _same_translation(self) -> bool:
+        return self.translation is None or _close(self.translation, [row[3] for row in self.matrix[:3]])
+
+    def _same_rotation(self) -> bool:
+        if self.rotation_quaternion_xyzw is None:
+            return True
+        if not any(self.rotation_quaternion_xyzw):
+            return False
+        scale = self._matrix_scale()
+        columns = rotation_columns(normal_quaternion(self.rotation_quaternion_xyzw))
+        turned = zip(*columns, strict=True)
+        return all(
+            _close(row, [value / scale for value in held[:3]])
+            for row, held in zip(turned, self.matrix[:3], strict=True)
+        )
+
+
+def _close(a: Sequence[float], b: Sequence[float]) -> bool:
+    return all(math.isclose(p, q, rel_tol=_AGREE, abs_tol=_AGREE) for p, q in zip(a, b, strict=True))
+
+
+def _spelling(value: Any) -> str:
+    return "transform_object" if isinstance(value, dict | TransformObject) else "matrix_rows"
+
+
+Similarity = Annotated[
+    Annotated[Matrix, Tag("matrix_rows")] | Annotated[TransformObject, Tag("transform_object")],
+    Discriminator(_spelling),
+]
+SPELLINGS = frozenset({"matrix_rows", "transform_object"})
+
+
+def rows_of(transform: Rows | TransformObject) -> Rows:
+    """The 4x4 of either spelling."""
+    return transform.matrix if isinstance(transform, TransformObject) else transform

@@ -1,0 +1,67 @@
+"""A job's events as a stream of server-sent events (WHATWG HTML, section 9.2)."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import AsyncIterator
+
+from starlette.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from regnf_service.http.concurrency import Slots
+from regnf_service.http.dependencies import Services, off_loop
+from regnf_service.http.waiting import pause
+from regnf_state.records import FINISHED, JobEvent
+
+MEDIA_TYPE = "text/event-stream"
+_POLL_S = 0.2
+_HEARTBEAT_S = 10.0
+_RECONNECT_MS = 2000
+
+
+def format_event(event: JobEvent) -> str:
+    """One event. JSON without line breaks needs no splitting."""
+    return f"id: {event.id}\nevent: {event.name}\ndata: {json.dumps(event.data)}\n\n"
+
+
+async def event_stream(services: Services, job_id: str, after: str | None) -> AsyncIterator[str]:
+    """The job's events after the given one, until it has finished, is gone, or the service stops.
+
+    A comment every ten seconds keeps proxies from taking the connection for dead.
+    """
+    yield f"retry: {_RECONNECT_MS}\n\n"
+    last_sent = time.monotonic()
+    while True:
+        # the record first: what it says has finished has all its events in the stream read next
+        record = await off_loop(services.records.get_job, job_id)
+        events = await off_loop(services.records.events, job_id, after, 0.0)
+        for event in events:
+            yield format_event(event)
+            after = event.id
+        if events:
+            last_sent = time.monotonic()
+        if record is None or record.status in FINISHED:
+            return
+        if time.monotonic() - last_sent >= _HEARTBEAT_S:
+            yield ": still here\n\n"
+            last_sent = time.monotonic()
+        if await pause(_POLL_S, services.stopping):
+            return
+
+
+class EventStream(StreamingResponse):
+    """A stream as one of those that a caller may read at once: held while it is sent, however that ends.
+
+    Raises Problem TOO_MANY_STREAMS before anything is sent.
+    """
+
+    def __init__(self, slots: Slots, caller: str, stream: AsyncIterator[str]) -> None:
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        super().__init__(stream, media_type=MEDIA_TYPE, headers=headers)
+        self._slots = slots
+        self._caller = caller
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        with self._slots.held(self._caller):
+            await super().__call__(scope, receive, send)

@@ -1,0 +1,56 @@
+"""JSON as RFC 8259 has it and no laxer: UTF-8, each member once, no wild nesting."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from regnf_service.http.problems import Problem
+
+_MAX_DEPTH = 32
+_LARGEST_EXACT = 2**53
+
+
+def parse_json(body: bytes) -> Any:
+    """The value in ``body``; a number without a fraction is an int, as JSON Schema has it, however it is spelt.
+
+    NaN and Infinity pass, for the schema to refuse them where they stand.
+
+    Raises Problem MALFORMED_JSON.
+    """
+    try:
+        value = json.loads(body.decode("utf-8"), object_pairs_hook=_object, parse_float=_number)
+    except UnicodeDecodeError as error:
+        raise Problem("MALFORMED_JSON", "The body is not UTF-8.") from error
+    except json.JSONDecodeError as error:
+        raise Problem("MALFORMED_JSON", f"Not JSON from byte {error.pos} on.") from error
+    except (RecursionError, ValueError) as error:
+        raise Problem("MALFORMED_JSON", "Too deep, or a number of too many digits.") from error
+    _check_depth(value)
+    return value
+
+
+def _number(text: str) -> float | int:
+    value = float(text)
+    return int(value) if value.is_integer() and abs(value) <= _LARGEST_EXACT else value
+
+
+def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        raise Problem("MALFORMED_JSON", "An object names a member twice.")
+    return members
+
+
+def _check_depth(value: Any) -> None:
+    level = [value]
+    for _ in range(_MAX_DEPTH):
+        level = [child for item in level if isinstance(item, dict | list) for child in _children(item)]
+        if not level:
+            return
+    raise Problem("MALFORMED_JSON", "The body nests too deeply.")
+
+
+def _children(item: dict[str, Any] | list[Any]) -> list[Any]:
+    return list(item.values()) if isinstance(item, dict) else item

@@ -1,0 +1,66 @@
+"""Which token is whose. Entries are ``name:token``, or a token alone, whose caller is named after its digest."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from regnf_state.ownership import ANONYMOUS, CALLER_NAME
+
+Callers = Mapping[bytes, str]
+"""The names of callers by the SHA-256 of their tokens. A caller may have several tokens, while one replaces another."""
+
+
+class TokensError(ValueError):
+    """The tokens cannot be told apart, or a file of them cannot be read. The text names no token."""
+
+    reason = "TOKENS_UNUSABLE"
+
+
+def read_callers(entries: Iterable[str], file: Path | None) -> Callers:
+    """The callers of all entries, those of the file included. Raises TokensError."""
+    callers: dict[bytes, str] = {}
+    for entry in (*entries, *(read_lines(file) if file is not None else ())):
+        name, token = split_entry(entry)
+        digest = _digest(token)
+        name = name or f"token-{digest.hex()[:8]}"
+        if callers.setdefault(digest, name) != name:
+            raise TokensError(f"the callers {callers[digest]} and {name} have the same token")
+    return callers
+
+
+def read_lines(file: Path) -> list[str]:
+    """The entries of a file: one a line; empty lines and those that begin with # are left out. Raises TokensError."""
+    try:
+        lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise TokensError(f"the file {file} cannot be read: {type(error).__name__}") from error
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def split_entry(entry: str) -> tuple[str | None, str]:
+    """(caller's name, secret). Raises TokensError for a secret that is no printable word, and for a reserved name."""
+    name, colon, secret = entry.partition(":")
+    named = bool(colon) and CALLER_NAME.fullmatch(name) is not None
+    if not named:
+        name, secret = "", entry
+    if not secret or not secret.isascii() or not secret.isprintable() or " " in secret:
+        raise TokensError(f"the entry of {name or 'a caller without a name'} holds no token")
+    if name == ANONYMOUS:
+        raise TokensError(f"the name {ANONYMOUS} is taken: it is who calls where no token is asked for")
+    return name or None, secret
+
+
+def caller_of(callers: Callers, authorization: str) -> str | None:
+    """The caller whose token an Authorization header bears. Takes as long for a wrong token as for a right one."""
+    scheme, _, token = authorization.partition(" ")
+    # digests have one length, so that a comparison tells nothing about a token's
+    digest = _digest(token.strip())
+    found = [name for known, name in callers.items() if hmac.compare_digest(digest, known)]
+    return found[0] if found and scheme.lower() == "bearer" else None
+
+
+def _digest(token: str) -> bytes:
+    return hashlib.sha256(token.encode("utf-8", "surrogateescape")).digest()

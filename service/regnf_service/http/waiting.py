@@ -1,0 +1,42 @@
+"""Holding an answer back until there is news, without holding a thread."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from anyio import to_thread
+
+from regnf_service.http.dependencies import Services, off_loop
+
+_FIRST_PAUSE_S = 0.02
+_LONGEST_PAUSE_S = 0.25
+_Value = TypeVar("_Value")
+
+
+async def pause(seconds: float, stopping: asyncio.Event) -> bool:
+    """Sleep, or less if the service stops. Returns whether it does."""
+    try:
+        async with asyncio.timeout(seconds):
+            await stopping.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
+async def wait_for(
+    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services
+) -> _Value:
+    """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops."""
+    deadline = time.monotonic() + seconds
+    step = _FIRST_PAUSE_S
+    with services.waiters.held():
+        value = await off_loop(fetch)
+        while True:
+            left = deadline - time.monotonic()
+            if enough(value) or left <= 0 or await pause(min(services.waiters.pause_s(step), left), services.stopping):
+                return value
+            value = await to_thread.run_sync(fetch, limiter=services.look_limiter)
+            step = min(step * 1.5, _LONGEST_PAUSE_S)

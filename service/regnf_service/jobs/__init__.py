@@ -1,0 +1,1 @@
+"""Registration jobs at the front end: from a request to a job id, and from a job to its result."""

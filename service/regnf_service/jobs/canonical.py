@@ -1,0 +1,51 @@
+"""The one form of each registration request, and the job id that follows from it.
+
+Two requests that ask for the same thing have the same canonical form, hence the same job: asking twice costs nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from regnf_core import __version__
+from regnf_service.http.schemas.registrations import Question
+from regnf_service.http.schemas.transforms import rows_of
+
+_ID_DIGITS = 32
+
+
+def canonical_request(
+    question: Question, scene: str, object_: str | None, candidates: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """What a worker reads from the job record: every default filled in, every spelling of a value made one.
+
+    The order of candidates says nothing, so they are sorted.
+    """
+    start, truth, hook = question.initial_transform, question.ground_truth, question.webhook
+    told = (
+        {} if hook is None else {"webhook": {"url": hook.url}}
+    )  # none leaves a request as it was before there were any
+    return told | {
+        "scene": scene,
+        "object": object_,
+        "candidates": None if candidates is None else sorted(candidates),
+        "detection": question.detection.canonical(),
+        "options": question.options.to_dict(),
+        "seed": question.seed,
+        "initial_transform": None if start is None else rows_of(start),
+        "ground_truth": None if truth is None else {"T_object_scene": rows_of(truth.T_object_scene)},
+    }
+
+
+def digest(value: Any) -> str:
+    """SHA-256, lower-case hexadecimal, of a JSON value in canonical spelling."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def job_id_of(request: dict[str, Any]) -> str:
+    """The job's id: another engine may answer differently, so its version is part of the question."""
+    return digest({"kind": "registration", "engine": __version__, "request": request})[:_ID_DIGITS]

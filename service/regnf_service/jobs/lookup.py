@@ -1,0 +1,21 @@
+"""Finding a job by the id in a path."""
+
+from __future__ import annotations
+
+import re
+
+from regnf_service.http.dependencies import Services
+from regnf_service.http.problems import Problem
+from regnf_state.records import JobRecord
+
+_JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def find_job(services: Services, job_id: str, caller: str) -> JobRecord:
+    """The caller's job; of another's it tells nothing. Raises Problem JOB_NOT_FOUND, JOB_EXPIRED."""
+    if not _JOB_ID.fullmatch(job_id):
+        raise Problem("JOB_NOT_FOUND")
+    record = services.records.get_job(job_id)
+    if record is None or record.owner != caller:
+        raise Problem("JOB_EXPIRED" if services.records.job_expired(job_id, caller) else "JOB_NOT_FOUND")
+    return record

@@ -1,0 +1,121 @@
+"""From a checked question to a job: fields looked up, the box compared with the scene, the job recorded and queued."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from regnf_service.http.dependencies import Services
+from regnf_service.http.problems import Problem
+from regnf_service.jobs.boxes import boxes_overlap
+from regnf_service.jobs.canonical import digest, job_id_of
+from regnf_state.ownership import ANONYMOUS, owned_request, reference_of
+from regnf_state.records import FieldRecord, JobRecord
+
+_KEY_LIFETIME_S = 24 * 3600
+_MAX_KEY_LENGTH = 255
+
+
+def check_idempotency_key(key: str | None) -> None:
+    """Raises Problem INVALID_IDEMPOTENCY_KEY."""
+    if key is not None and not (0 < len(key) <= _MAX_KEY_LENGTH and key.isascii() and key.isprintable()):
+        raise Problem("INVALID_IDEMPOTENCY_KEY")
+
+
+def check_fields(services: Services, caller: str, request: dict[str, Any], named: Mapping[str, str]) -> None:
+    """Refuse what can be refused now; a field that is still validating is waited for by the worker.
+
+    ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
+    Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
+    """
+
+    services.webhooks.check(caller, request)
+
+    def field(sha256: str) -> FieldRecord | None:
+        return services.records.get_field(reference_of(caller, sha256))
+
+    _require_usable({pointer: field(sha256) for pointer, sha256 in named.items()})
+    bounds = _bounds(field(request["scene"]))
+    box = request["detection"]
+    if bounds is None or boxes_overlap(box["centre"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
+        return
+    raise Problem("DETECTION_OUTSIDE_SCENE", errors=[{"pointer": "/detection", "detail": "outside the scene's bounds"}])
+
+
+def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
+    missing = [{"pointer": pointer, "detail": "no such field"} for pointer, record in found.items() if record is None]
+    if missing:
+        raise Problem("FIELD_NOT_FOUND", errors=missing)
+    rejected = [
+        {"pointer": pointer, "detail": f"rejected: {(record.error or {}).get('reason', 'unknown')}"}
+        for pointer, record in found.items()
+        if record is not None and record.state == "rejected"
+    ]
+    if rejected:
+        raise Problem("FIELD_REJECTED", errors=rejected)
+
+
+def _bounds(scene: FieldRecord | None) -> tuple[Sequence[float], Sequence[float]] | None:
+    """Lowest and highest corner of a ready scene, as its import reported them."""
+    match scene.report.get("bounds") if scene is not None else None:
+        case [[_, _, _] as lower, [_, _, _] as upper]:
+            return lower, upper
+        case {"min": [_, _, _] as lower, "max": [_, _, _] as upper}:
+            return lower, upper
+    return None
+
+
+def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_key: str | None) -> JobRecord:
+    """The job for a caller's canonical request: a new one, or the one that exists, queued if it has not run.
+
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError.
+    """
+    request = owned_request(asked, caller)
+    job_id = job_id_of(request)
+    if idempotency_key is not None:
+        key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]
+        existing = _earlier_answer(services, digest(key), job_id)
+        if existing is not None:
+            return existing
+    now = services.records.now()
+    record, _ = services.records.create_job(
+        JobRecord(
+            id=job_id,
+            kind="registration",
+            status="accepted",
+            request=request,
+            inputs=_inputs(asked),
+            created=now,
+            updated=now,
+        ),
+        services.settings.max_queued_jobs,
+        services.quota,
+    )
+    if record.status == "accepted":
+        # also for a job known before: mends one that was recorded but never queued
+        services.queue.enqueue_registration(record.id, record.attempt)
+    return record
+
+
+def _earlier_answer(services: Services, key: str, job_id: str) -> JobRecord | None:
+    """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
+    mine = f"{job_id} {services.records.now()!r}"
+    bound = services.records.remember(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
+    bound_id, _, bound_at = bound.partition(" ")
+    if bound_id != job_id:
+        raise Problem("IDEMPOTENCY_KEY_REUSED")
+    known = services.records.get_job(job_id) if bound != mine else None
+    # a job that has not changed since the key came up is not that call's doing: the call never got so far
+    return known if known is not None and known.updated >= float(bound_at) else None
+
+
+def _inputs(request: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "scene": request["scene"],
+        "object": request["object"],
+        "candidates": None if request["candidates"] is None else len(request["candidates"]),
+        "detection": request["detection"],
+        "seed": request["seed"],
+        "initial_transform": request["initial_transform"],
+        "options_sha256": digest(request["options"]),
+    }

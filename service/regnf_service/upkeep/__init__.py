@@ -1,0 +1,1 @@
+"""What runs beside the requests: lost jobs, retention, leadership."""

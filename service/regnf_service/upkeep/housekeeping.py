@@ -1,0 +1,181 @@
+"""What the store holds that nobody needs any more: unused fields, what is beyond the cap, what crashes left behind.
+
+Nothing here is urgent, so it is done once an hour, by the leader. What a live job needs is never touched: the record of
+a field goes first, and comes back if a job has asked for the field meanwhile; only then go the bytes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from redis import Redis
+
+from regnf_service.upkeep.lease import Term
+from regnf_state.blobs.base import BlobStore
+from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.records import ACTIVE, FieldRecord, JobRecord
+from regnf_state.redis.documents import PREFIX
+from regnf_state.settings import Settings
+from regnf_state.transitions import fields_of
+
+_DONE_KEY = f"{PREFIX}housekeeping"
+_EVERY_S = 3600
+_ORPHANED_AFTER_S = 24 * 3600.0
+_UNTOUCHED_FOR_S = 3600.0
+"""The cap takes nothing that is younger: its owner may be about to use it."""
+_PAGE = 200
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """How many bytes a job's or a field's folder holds, and when the newest of them was written."""
+
+    bytes: int = 0
+    modified: float = 0.0
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What one round took away."""
+
+    fields: tuple[str, ...] = ()
+    jobs: tuple[str, ...] = ()
+    orphans: tuple[str, ...] = ()
+    temporary: int = 0
+
+
+class Housekeeper:
+    """Tidies the blob store of one service."""
+
+    def __init__(self, records: JournaledRecordStore, blobs: BlobStore, redis: Redis, settings: Settings) -> None:
+        self._records = records
+        self._blobs = blobs
+        self._redis = redis
+        self._keep_unused_s = settings.unused_field_retention_s
+        self._keep_rejected_s = settings.retention_s
+        self._cap = settings.storage_cap_bytes
+
+    def run_if_due(self, term: Term) -> Removed:
+        """A round, if the last one is an hour ago."""
+        if not self._redis.set(_DONE_KEY, term.number, nx=True, ex=_EVERY_S):
+            return Removed()
+        return self.run(term)
+
+    def run(self, term: Term) -> Removed:
+        """One round. Raises LeaseLostError, RedisError, OSError."""
+        if not self._records.epoch.stands():
+            return Removed()  # what Redis has lost must not pass for what nobody needs
+        temporary = self._blobs.sweep(_ORPHANED_AFTER_S)
+        folders = self._folders()
+        self._forget_expired(term)
+        orphans = tuple(self._drop_orphans(term, folders))
+        fields = self._unused_fields()
+        now = self._records.now()
+        dropped = [
+            field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
+        ]
+        total = sum(kept.bytes for kept in self._folders().values()) if self._cap is not None else 0
+        more_jobs, more_fields = self._drop_beyond_cap(term, total, folders, now)
+        return Removed((*dropped, *more_fields), tuple(more_jobs), orphans, temporary)
+
+    def _is_old(self, used: float, field: FieldRecord, now: float) -> bool:
+        if field.state == "rejected":
+            return field.updated + self._keep_rejected_s <= now
+        return self._keep_unused_s is not None and used + self._keep_unused_s <= now
+
+    def _folders(self) -> dict[str, Kept]:
+        """Everything below jobs/ and fields/, by folder."""
+        found: dict[str, Kept] = defaultdict(Kept)
+        for top in ("jobs", "fields"):
+            for entry in self._blobs.entries(top):
+                folder = "/".join(entry.key.split("/")[:2])
+                kept = found[folder]
+                found[folder] = Kept(kept.bytes + entry.bytes, max(kept.modified, entry.modified))
+        return found
+
+    def _forget_expired(self, term: Term) -> None:
+        """What the journal still says of jobs whose records went while somebody died."""
+        for job_id in self._records.journal.jobs():
+            if self._records.get_job(job_id) is not None:
+                continue
+            now = self._records.now()
+            job = self._records.journal.recall(job_id, now)
+            if job is not None and self._records.has_expired(job, now):
+                term.confirm()
+                self._blobs.delete_prefix(f"jobs/{job_id}")
+                self._records.journal.forget(job_id)
+
+    def _drop_orphans(self, term: Term, folders: dict[str, Kept]) -> Iterator[str]:
+        """Folders that were written a day ago at least and belong to no record."""
+        now = self._records.now()
+        for folder, kept in list(folders.items()):
+            top, name = folder.split("/")
+            known = self._records.get_job(name) if top == "jobs" else self._records.get_field(name)
+            if known is None and kept.modified + _ORPHANED_AFTER_S <= now:
+                term.confirm()
+                self._blobs.delete_prefix(folder)
+                del folders[folder]
+                yield folder
+
+    def _unused_fields(self) -> list[tuple[float, FieldRecord]]:
+        """Fields that no active job needs, least recently used first, each with the time of its last use."""
+        needed = {name for job in self._records.active_jobs() for name in fields_of(job)}
+        idle = [field for field in self._fields() if field.state != "validating" and field.sha256 not in needed]
+        uses = self._records.last_uses([field.sha256 for field in idle])
+        return sorted(zip(uses, idle, strict=True), key=lambda one: (one[0], one[1].sha256))
+
+    def _fields(self) -> Iterator[FieldRecord]:
+        before = None
+        while page := self._records.list_fields(None, _PAGE, before):
+            yield from page
+            before = page[-1].created, page[-1].sha256
+
+    def _finished_jobs(self) -> Iterator[JobRecord]:
+        before = None
+        while page := self._records.list_jobs(None, _PAGE, before):
+            yield from (job for job in page if job.status not in ACTIVE)
+            before = page[-1].created, page[-1].id
+
+    def _drop_field(self, term: Term, field: FieldRecord) -> bool:
+        """Forget a field unless a job has asked for it meanwhile."""
+        term.confirm()
+        self._records.delete_field(field.sha256)
+        if next(iter(self._records.jobs_using_field(field.sha256)), None) is not None:
+            self._records.restore_field(field)
+            self._records.journal.keep_field(field)
+            return False
+        self._blobs.delete_prefix(f"fields/{field.sha256}")
+        logger.info("field %s is dropped: nobody has used it for long", field.sha256)
+        return True
+
+    def _drop_beyond_cap(
+        self, term: Term, total: int, folders: dict[str, Kept], now: float
+    ) -> tuple[list[str], list[str]]:
+        """Finished jobs and unused fields, oldest first, until the rest is within the cap."""
+        jobs: list[str] = []
+        fields: list[str] = []
+        if self._cap is None or total <= self._cap:
+            return jobs, fields
+        candidates: list[tuple[float, str, Any]] = [
+            *((job.finished or 0.0, f"jobs/{job.id}", job) for job in self._finished_jobs()),
+            *((used, f"fields/{field.sha256}", field) for used, field in self._unused_fields()),
+        ]
+        for touched, folder, record in sorted(candidates, key=lambda one: one[:2]):
+            if total <= self._cap or touched + _UNTOUCHED_FOR_S > now:
+                break
+            if isinstance(record, FieldRecord):
+                if not self._drop_field(term, record):
+                    continue
+                fields.append(record.sha256)
+            else:
+                term.confirm()
+                self._records.delete_job(record.id)
+                self._blobs.delete_prefix(folder)
+                jobs.append(record.id)
+            total -= folders.get(folder, Kept()).bytes
+        return jobs, fields

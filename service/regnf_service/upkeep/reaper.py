@@ -1,0 +1,191 @@
+"""Finds what died without a word: jobs without a heartbeat, work that no queue holds, results past their time.
+
+Every change of a record is fenced off by its attempt, whoever makes it; what cannot be undone is done only by a leader
+that has made sure that it still leads.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from redis import Redis
+
+from regnf_service.upkeep.housekeeping import Housekeeper
+from regnf_service.upkeep.lease import Lease, LeaseLostError, Term
+from regnf_service.upkeep.staleness import Stillness
+from regnf_state.blobs.base import BlobStore
+from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.queue import JobQueue
+from regnf_state.reasons import REASONS
+from regnf_state.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
+from regnf_state.redis.documents import PREFIX
+from regnf_state.settings import Settings
+
+_LEADER_KEY = f"{PREFIX}reaper"
+_LEADS_FOR_S = 30
+"""A leader that is killed during a round keeps the others waiting for so long."""
+_UNHELD_FOR_S = 15.0
+"""Work that has been in no queue for so long was lost on its way, or with its worker."""
+_LEAST_UNBROKEN_S = 30.0
+"""Rounds that are twice as far apart as usual still follow on one another, however early a job is taken for lost."""
+_IMPORT_RETRIES = 2
+_Record = TypeVar("_Record", JobRecord, FieldRecord)
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Reaped:
+    """What one round did: ids by deed."""
+
+    requeued: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+    dismissed: tuple[str, ...] = ()
+    enqueued: tuple[str, ...] = ()
+    expired: tuple[str, ...] = ()
+    recalled: tuple[str, ...] = ()
+    """Jobs and fields whose records were made anew from the journal."""
+
+
+class Reaper:
+    """Call ``run_once`` every fifteen seconds or so, from as many processes as like: one at a time does the work."""
+
+    def __init__(
+        self,
+        records: RecordStore,
+        queue: JobQueue,
+        redis: Redis,
+        settings: Settings,
+        blobs: BlobStore | None = None,
+        rebuilder: Rebuilder | None = None,
+        housekeeper: Housekeeper | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._records = records
+        self._queue = queue
+        self._lost_after_s = settings.lost_after_s
+        self._blobs = blobs
+        self._rebuilder = rebuilder
+        self._housekeeper = housekeeper
+        unbroken = max(settings.lost_after_s / 2, _LEAST_UNBROKEN_S)
+        self._stillness = Stillness(unbroken_s=unbroken, clock=clock)
+        self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
+
+    def run_once(self) -> Reaped:
+        """One round; nothing when another process is at it. Raises RedisError when Redis cannot be reached."""
+        recalled = self._rebuild()
+        with self._lease.held() as term:
+            if term is None:
+                return Reaped(recalled=recalled)
+            deeds: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}
+            try:
+                expired = self._lead(term, deeds)
+            except LeaseLostError as error:
+                logger.warning("the round ends early: %s", error)
+                expired = []
+            return Reaped(
+                **{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(expired), recalled=recalled
+            )
+
+    def _rebuild(self) -> tuple[str, ...]:
+        """Whoever finds Redis emptied mends it, leader or not: reading the journal takes longer than a term."""
+        if self._rebuilder is None:
+            return ()
+        rebuilt = self._rebuilder.run_if_needed()
+        return rebuilt.jobs + rebuilt.fields
+
+    def _lead(self, term: Term, deeds: dict[str, list[str]]) -> list[str]:
+        """Look after everything; the ids of what has expired. Raises LeaseLostError."""
+        now = self._records.now()
+        self._stillness.begin_round()
+        for job in self._records.active_jobs():
+            term.confirm()
+            _note(deeds, job.id, self._look_after_job, job, now)
+        for field in self._records.validating_fields():
+            term.confirm()
+            _note(deeds, field.sha256, self._look_after_import, field, now)
+        expired = self._expire(term)
+        if self._housekeeper is not None:
+            self._housekeeper.run_if_due(term)
+        return expired
+
+    def _look_after_job(self, job: JobRecord, now: float) -> str | None:
+        """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
+        if job.status == "accepted":
+            if self._queue.holds_registration(job.id, job.attempt) or not self._is_unheld(job.id, job.attempt):
+                return None
+            self._queue.enqueue_registration(job.id, job.attempt)
+            return "enqueued"
+        if not self._is_lost(job, now):
+            return None
+        if job.cancel_requested:
+            self._records.update_job(job.id, job.attempt, status="dismissed")
+            return "dismissed"
+        if job.requeues == 0:
+            again = self._records.requeue_job(job.id, job.attempt)
+            self._queue.enqueue_registration(again.id, again.attempt)
+            return "requeued"
+        self._records.update_job(job.id, job.attempt, status="failed", error=_worker_lost())
+        return "failed"
+
+    def _is_unheld(self, name: str, attempt: int) -> bool:
+        """Whether work that no queue holds now has been seen in none for a while: somebody may be about to queue it."""
+        return self._stillness.of(f"{name}:unheld", attempt) >= _UNHELD_FOR_S
+
+    def _is_lost(self, job: JobRecord, now: float) -> bool:
+        """Whether the job's heartbeat is so old, and has been seen to stand still for so long, that its worker is gone.
+
+        How old it is Redis' clock tells, which may be stepped; and nobody could beat while Redis was away.
+        """
+        beaten = job.heartbeat or job.updated
+        still = self._stillness.of(job.id, (job.attempt, beaten))
+        silent = now - beaten >= self._lost_after_s
+        return still >= self._lost_after_s or (silent and still >= self._lost_after_s / 6)
+
+    def _look_after_import(self, field: FieldRecord, _now: float) -> str | None:
+        sha256, attempt = field.sha256, field.attempt
+        if self._queue.holds_import(sha256, attempt) or not self._is_unheld(sha256, attempt):
+            return None
+        if field.requeues < _IMPORT_RETRIES:
+            again = self._records.retry_import(field.sha256, field.attempt)
+            self._queue.enqueue_import(again.sha256, again.attempt)
+            return "requeued"
+        self._records.update_field(field.sha256, attempt=field.attempt, state="rejected", error=_worker_lost())
+        if self._blobs is not None:
+            self._blobs.delete_prefix(f"fields/{field.sha256}")
+        return "failed"
+
+    def _expire(self, term: Term) -> list[str]:
+        term.confirm()
+        expired = self._records.expire_jobs()
+        if self._blobs is not None:
+            for job_id in expired:
+                self._blobs.delete_prefix(f"jobs/{job_id}")
+        return expired
+
+
+def _note(
+    deeds: dict[str, list[str]], name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float
+) -> None:
+    try:
+        deed = look(record, now)
+    except StaleAttemptError:
+        return  # it moved on by itself meanwhile
+    if deed is not None:
+        deeds[deed].append(name)
+        logger.warning("%s: %s", name, deed)
+
+
+def _worker_lost() -> dict[str, Any]:
+    reason = "WORKER_LOST"
+    known = REASONS[reason]
+    return {
+        "type": f"/docs#{reason}",
+        "title": known.title,
+        "status": known.status,
+        "reason": reason,
+        "detail": known.meaning,
+    }

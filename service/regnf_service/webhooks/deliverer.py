@@ -1,0 +1,104 @@
+"""Takes messages from the outbox and sends them until they are received, or for some 32 hours in vain."""
+
+from __future__ import annotations
+
+import json
+import logging
+from dataclasses import replace
+
+from regnf_service.http.schemas.common import rfc3339
+from regnf_service.webhooks.sender import Sender, SendError
+from regnf_service.webhooks.signing import Secrets, signed_headers
+from regnf_service.webhooks.targets import AllowList
+from regnf_state.records import FINISHED, JobRecord, RecordStore
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+
+logger = logging.getLogger(__name__)
+BACK_OFF_S = (5.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 2 * 3600.0, 4 * 3600.0, 8 * 3600.0, 16 * 3600.0)
+"""Pauses before the second send, the third, and so on; after the last the message is given up."""
+_GONE = 410
+"""A receiver that answers so wants no more."""
+
+
+class Deliverer:
+    """Call ``run_once`` again and again, from as many threads and processes as like."""
+
+    def __init__(
+        self,
+        records: RecordStore,
+        outbox: RedisOutbox,
+        sender: Sender,
+        allowed: AllowList,
+        secrets: Secrets,
+        back_off_s: tuple[float, ...] = BACK_OFF_S,
+    ) -> None:
+        self._records = records
+        self._outbox = outbox
+        self._sender = sender
+        self._allowed = allowed
+        self._secrets = secrets
+        self._back_off_s = back_off_s
+
+    def run_once(self) -> bool:
+        """Send one message that is due; False when none is. Raises RedisError: the message comes up again."""
+        message = self._outbox.claim()
+        if message is None:
+            return False
+        job_id, _, attempt = message.rpartition("-")
+        record = self._records.get_job(job_id)
+        if record is None or record.attempt != int(attempt) or record.status not in FINISHED:
+            self._outbox.settle(message, Delivery("failed", last_error="JOB_GONE"))
+            return True
+        known = self._outbox.delivery(job_id)
+        self._settle(message, replace(known, sends=known.sends + 1, next_at=None), *self._send(record))
+        return True
+
+    def _send(self, record: JobRecord) -> tuple[int | None, str | None]:
+        """Status of the answer, or a word for why there was none."""
+        url, keys = record.request["webhook"]["url"], self._secrets.get(record.owner)
+        if not keys or not self._allowed.allows(url):
+            return None, "WEBHOOK_NOT_ALLOWED"
+        body = payload(record)
+        headers = signed_headers(keys, message_id(record), int(self._records.now()), body) | {
+            "Content-Type": "application/json"
+        }
+        try:
+            return self._sender.send(url, headers, body), None
+        except SendError as error:
+            return None, error.reason
+
+    def _settle(self, message: str, sent: Delivery, status: int | None, error: str | None) -> None:
+        now = self._records.now()
+        sent = replace(sent, last_status=status, last_error=error)
+        if status is not None and 200 <= status < 300:
+            sent = replace(sent, state="delivered", delivered_at=now)
+        elif status == _GONE or sent.sends > len(self._back_off_s):
+            sent = replace(sent, state="failed")
+        else:
+            sent = replace(sent, state="pending", next_at=now + self._back_off_s[sent.sends - 1])
+        logger.info(
+            "webhook %s, send %d: %s", message, sent.sends, sent.state, extra={"status": status, "error": error}
+        )
+        outcome = "delivered" if sent.state == "delivered" else error or f"status_{(status or 0) // 100}xx"
+        self._outbox.settle(message, sent, outcome)
+
+
+def message_id(record: JobRecord) -> str:
+    """Each message's own: the same at every send, another when a job is deleted, asked for anew and ends again."""
+    return f"{record.id}-{record.attempt}-{int(1000 * (record.finished or 0))}"
+
+
+def payload(record: JobRecord) -> bytes:
+    """The message: the same bytes at every send. It says that a job ended and how; what it found is asked for."""
+    document = {
+        "type": f"job.{record.status}",
+        "timestamp": rfc3339(record.finished),
+        "data": {
+            "id": record.id,
+            "kind": record.kind,
+            "status": record.status,
+            "attempt": record.attempt,
+            "reason": None if record.error is None else record.error.get("reason"),
+        },
+    }
+    return json.dumps(document, separators=(",", ":")).encode()

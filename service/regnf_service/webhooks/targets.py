@@ -1,0 +1,85 @@
+"""Where messages may go: hosts on an allow-list, and of these only addresses that belong to the public Internet.
+
+A name that resolves to a private address is not followed there, unless the list names that very address: whoever can
+register a name must not reach what only this service can reach.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterable
+from contextlib import suppress
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+from regnf_service.http.tokens import TokensError
+
+_PORTS = {"http": 80, "https": 443}
+_LONGEST_URL = 2000
+_TRANSLATED = ipaddress.ip_network("64:ff9b::/96")
+
+
+class Target(NamedTuple):
+    """What must be equal for a URL to be allowed."""
+
+    scheme: str
+    host: str
+    port: int
+
+
+class AllowList:
+    """Entries are ``host``, ``host:port``, or with ``http://`` in front where there is no TLS."""
+
+    def __init__(self, entries: Iterable[str]) -> None:
+        """Raises TokensError for an entry that is none."""
+        self._targets = frozenset(map(_entry, entries))
+        self._addresses = frozenset(target.host for target in self._targets)
+
+    def __bool__(self) -> bool:
+        return bool(self._targets)
+
+    def allows(self, url: str) -> bool:
+        """Whether messages may go to this URL, as far as the URL itself tells."""
+        target = target_of(url)
+        return target is not None and target in self._targets
+
+    def permits(self, address: str) -> bool:
+        """Whether a connection to this address, which a host's name resolved to, may be opened."""
+        return str(_plain(address)) in self._addresses or is_public(address)
+
+
+def _entry(entry: str) -> Target:
+    target = target_of(entry if "://" in entry else f"https://{entry}")
+    if target is None or urlsplit(entry if "://" in entry else f"https://{entry}").path:
+        raise TokensError(f"{entry[:80]!r} is no host for webhooks: host, host:port or http://host:port")
+    return target
+
+
+def target_of(url: str) -> Target | None:
+    """Scheme, host and port of a URL that a message can be sent to; None for any other."""
+    if len(url) > _LONGEST_URL or not url.isascii() or not url.isprintable() or " " in url or "\\" in url:
+        return None
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        return None
+    if parts.scheme not in _PORTS or not parts.hostname or "@" in parts.netloc or parts.fragment:
+        return None
+    host = parts.hostname.rstrip(".")
+    with suppress(ValueError):  # a name
+        host = str(_plain(host))
+    return Target(parts.scheme, host, _PORTS[parts.scheme] if port is None else port)
+
+
+def _plain(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    found = ipaddress.ip_address(address.partition("%")[0])
+    return getattr(found, "ipv4_mapped", None) or found
+
+
+def is_public(address: str) -> bool:
+    """Whether an address belongs to the public Internet, those that carry another address inside aside."""
+    found = _plain(address)
+    if isinstance(found, ipaddress.IPv6Address) and (found.sixtofour or found.teredo or found in _TRANSLATED):
+        return False
+    return found.is_global and not found.is_multicast

@@ -1,0 +1,163 @@
+"""Similarity transforms: the algebra, the exponential against the matrix exponential, the ways in and out."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.sim3_tangent import skew
+
+_unit = st.floats(-1.0, 1.0, allow_nan=False)
+_vector = st.tuples(_unit, _unit, _unit)
+
+
+@st.composite
+def tangents(draw: st.DrawFn) -> Tensor:
+    """Tangents with translation parts to 2, angles from 0 to just below pi (both ends often), scales e^-3 to e^3."""
+    rho = 2 * torch.tensor(draw(_vector), dtype=torch.float64)
+    axis = torch.tensor(draw(_vector), dtype=torch.float64)
+    if axis.norm() < 1e-3:
+        axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    angle = draw(st.one_of(st.floats(0, math.pi - 1e-6), st.sampled_from([0.0, 1e-12, 1e-6, 1e-4, math.pi - 1e-7])))
+    sigma = draw(st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 1e-12, -1e-6, 1e-3, -0.5, 0.5])))
+    return torch.cat([rho, angle * axis / axis.norm(), torch.tensor([sigma], dtype=torch.float64)])
+
+
+def generator_matrix(tangent: Tensor) -> Tensor:
+    M = torch.zeros(4, 4, dtype=torch.float64)
+    M[:3, :3] = skew(tangent[3:6]) + tangent[6] * torch.eye(3, dtype=torch.float64)
+    M[:3, 3] = tangent[:3]
+    return M
+
+
+@settings(deadline=None, max_examples=200)
+@given(tangents())
+def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
+    expected = torch.linalg.matrix_exp(generator_matrix(tangent))
+    torch.testing.assert_close(Sim3.exp(tangent).matrix(), expected, rtol=1e-11, atol=1e-11)
+
+
+@settings(deadline=None, max_examples=200)
+@given(tangents())
+@example(torch.tensor([0.3, -0.2, 0.9, math.pi - 1e-9, 0.0, 0.0, 0.7], dtype=torch.float64))
+def test_log_undoes_exp(tangent: Tensor) -> None:
+    torch.testing.assert_close(Sim3.exp(tangent).log(), tangent, rtol=1e-7, atol=1e-7)
+
+
+@settings(deadline=None)
+@given(tangents())
+def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
+    half_turn = tangent.clone()
+    half_turn[3:6] = tangent[3:6] / tangent[3:6].norm().clamp_min(1e-12) * math.pi
+    T = Sim3.exp(half_turn)
+    torch.testing.assert_close(Sim3.exp(T.log()).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(tangents(), tangents(), tangents())
+def test_group_laws(a: Tensor, b: Tensor, c: Tensor) -> None:
+    A, B, C = Sim3.exp(a), Sim3.exp(b), Sim3.exp(c)
+    torch.testing.assert_close((A @ B).matrix(), A.matrix() @ B.matrix(), rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(((A @ B) @ C).matrix(), (A @ (B @ C)).matrix(), rtol=1e-9, atol=1e-9)
+    identity = torch.eye(4, dtype=torch.float64)
+    torch.testing.assert_close((A @ A.inverse()).matrix(), identity, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close((A.inverse() @ A).matrix(), identity, rtol=1e-9, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(tangents())
+def test_dictionary_round_trip(tangent: Tensor) -> None:
+    T = Sim3.exp(tangent)
+    values = json.loads(json.dumps(T.to_dict()))
+    assert set(values) == {"matrix", "scale", "rotation_quaternion_xyzw", "translation"}
+    torch.testing.assert_close(Sim3.from_dict(values).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
+    del values["matrix"]
+    torch.testing.assert_close(Sim3.from_dict(values).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
+
+
+def test_apply_by_hand() -> None:
+    # A quarter turn about z, doubled, then moved by (1, 2, 3): (1, 0, 0) -> (0, 1, 0) -> (0, 2, 0) -> (1, 4, 3).
+    h = math.sqrt(0.5)
+    T = Sim3.from_quaternion(2.0, [0.0, 0.0, h, h], [1.0, 2.0, 3.0])
+    points = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], dtype=torch.float32)
+    expected = torch.tensor([[1.0, 4.0, 3.0], [-1.0, 2.0, 5.0]], dtype=torch.float32)
+    torch.testing.assert_close(T.apply(points), expected)
+    torch.testing.assert_close(T.inverse().apply(expected), points)
+
+
+def test_batches_broadcast_over_points() -> None:
+    tangent = torch.randn(5, 7, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    points = torch.randn(11, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    batch = Sim3.exp(tangent)
+    assert batch.matrix().shape == (5, 4, 4)
+    single = torch.stack([Sim3.exp(row).apply(points) for row in tangent])
+    torch.testing.assert_close(batch.apply(points), single)
+    torch.testing.assert_close(Sim3.exp(batch.log()).matrix(), batch.matrix(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close((batch @ batch.inverse()).matrix(), torch.eye(4).double().expand(5, 4, 4))
+
+
+def test_a_float32_matrix_is_accepted_and_cleaned() -> None:
+    T = Sim3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6, 0.3], dtype=torch.float64))
+    cleaned = Sim3.from_matrix(T.matrix().float())
+    R = cleaned.rotation
+    torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+    torch.testing.assert_close(cleaned.matrix(), T.matrix(), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "what"),
+    [
+        (lambda M: M[:3], "shape"),
+        (lambda M: M * torch.tensor([1.0, 1.0, float("nan"), 1.0]), "not finite"),
+        (lambda M: M * torch.tensor([[1.0], [1.0], [1.0], [2.0]]), "last row"),
+        (lambda M: M * torch.tensor([1.0, 1.01, 1.0, 1.0]), "stretched"),
+        (lambda M: M * torch.tensor([1.0, -1.0, 1.0, 1.0]), "mirrored"),
+        (lambda M: M * torch.tensor([0.0, 0.0, 0.0, 1.0]), "vanishing"),
+    ],
+)
+def test_what_is_no_similarity_is_refused(spoil, what) -> None:  # type: ignore[no-untyped-def]
+    good = Sim3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6, 0.3], dtype=torch.float64)).matrix()
+    with pytest.raises(InvalidInputError) as caught:
+        Sim3.from_matrix(spoil(good))
+    assert caught.value.reason == "INVALID_TRANSFORM", what
+
+
+@pytest.mark.parametrize("matrix", ["abc", [[1, 2], [3]], [["a"] * 4] * 4, {"x": 1}, None, [[10**400] * 4] * 4])
+def test_what_is_no_matrix_of_numbers_is_refused(matrix) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InvalidInputError) as caught:
+        Sim3.from_dict({"matrix": matrix})
+    assert caught.value.reason == "INVALID_TRANSFORM"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"scale": 1.0, "translation": [0, 0, 0]},
+        {"scale": "large", "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]},
+        {"scale": 0.0, "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]},
+        {"scale": 1.0, "rotation_quaternion_xyzw": [0, 0, 0, 0], "translation": [0, 0, 0]},
+        {"scale": 1.0, "rotation_quaternion_xyzw": [0, 0, 1], "translation": [0, 0, 0]},
+        {"scale": float("inf"), "rotation_quaternion_xyzw": [0, 0, 0, 1], "translation": [0, 0, 0]},
+    ],
+)
+def test_faulty_parts_are_refused(values: dict[str, object]) -> None:
+    with pytest.raises(InvalidInputError) as caught:
+        Sim3.from_dict(values)
+    assert caught.value.reason == "INVALID_TRANSFORM"
+
+
+def test_gradients_flow_through_exp_at_zero() -> None:
+    zero = torch.zeros(7, dtype=torch.float64, requires_grad=True)
+    points = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
+    # Moving by rho, turning (omega x p) and scaling (sigma p), to first order.
+    jacobian = torch.autograd.functional.jacobian(lambda v: Sim3.exp(v).apply(points)[0], zero)
+    expected = torch.cat([torch.eye(3), -skew(points[0].float()), points[0, :, None]], dim=1).double()
+    torch.testing.assert_close(jacobian, expected, rtol=1e-9, atol=1e-9)

@@ -1,0 +1,232 @@
+""".npz files: the zip as strict as torch's, deflate without bombs, headers by a grammar, no pickled objects."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers import npz
+from regnf_core.importing.containers.npz import ArraySource
+from tests.core.importing.archives import assert_refused, central_header_at, patched, zip_bytes
+
+NUMBERS = np.arange(6, dtype=np.float32).reshape(2, 3)
+METHOD_AT, CRC_AT, PACKED_AT, SIZE_AT = 10, 16, 20, 24
+"""Offsets within a central header."""
+LOCAL_METHOD_AT, LOCAL_CRC_AT, LOCAL_SIZE_AT = 8, 14, 22
+
+
+def npy(array: Any, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.asarray(array), **options)
+    return buffer.getvalue()
+
+
+def npy_with(header: bytes, data: bytes = NUMBERS.tobytes(), version: bytes = b"\x01\x00") -> bytes:
+    width = 2 if version == b"\x01\x00" else 4
+    return b"\x93NUMPY" + version + len(header).to_bytes(width, "little") + header + data
+
+
+def source(data: bytes, budget: int = 1 << 20) -> ArraySource:
+    return ArraySource(memoryview(data), budget)
+
+
+def read(entry: bytes, compression: int = zipfile.ZIP_STORED, budget: int = 1 << 20) -> Any:
+    return source(zip_bytes([("a.npy", entry)], compression), budget).array("a")
+
+
+def savez(compressed: bool = False, **arrays: Any) -> bytes:
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_reads_what_numpy_saved(compressed: bool) -> None:
+    rng = np.random.default_rng(0)
+    real = {f"r{i}": rng.normal(size=(3, 4, 5)).astype(t) for i, t in enumerate(("f2", "f4", "f8"))}
+    whole = {f"w{i}": np.arange(7).astype(t) for i, t in enumerate(("i1", "i2", "i4", "i8", "u1", "u2", "u4"))}
+    arrays = source(savez(compressed, **real, **whole, order=np.asfortranarray(real["r2"]), few=np.float64(0.1)))
+    assert set(arrays.names) == {*real, *whole, "order", "few"}
+    for name, values in real.items():
+        np.testing.assert_array_equal(arrays.array(name), values.astype(np.float32))
+    for name, values in whole.items():
+        np.testing.assert_array_equal(arrays.integers(name), values)
+    np.testing.assert_array_equal(arrays.array("order"), real["r2"].astype(np.float32))
+    assert float(arrays.numbers("few")) == 0.1
+
+
+def test_reads_a_file_that_was_written_to_a_pipe() -> None:
+    """Without going back, the sizes stand in descriptors behind the data."""
+
+    class Pipe(io.RawIOBase):
+        def __init__(self) -> None:
+            self.data = bytearray()
+
+        def writable(self) -> bool:
+            return True
+
+        def write(self, data: Any) -> int:
+            self.data += data
+            return len(data)
+
+    pipe = Pipe()
+    with zipfile.ZipFile(pipe, "w", zipfile.ZIP_DEFLATED) as archive:  # type: ignore[arg-type]
+        archive.writestr("a.npy", npy(NUMBERS))
+    np.testing.assert_array_equal(source(bytes(pipe.data)).array("a"), NUMBERS)
+
+
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
+@pytest.mark.parametrize("array", [NUMBERS, np.float32(3.0), np.zeros(0, np.float32), np.zeros((0, 4), np.float32)])
+@pytest.mark.filterwarnings("ignore:Stored array in format")
+def test_every_version_and_shape_of_header(version: tuple[int, int], array: Any) -> None:
+    np.testing.assert_array_equal(read(npy(array, version=version)), array)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }",
+        b"{'descr': '<f4', 'fortran_order': False, 'shape': (2,3)}  \n",
+    ],
+)
+def test_headers_as_other_writers_spell_them(header: bytes) -> None:
+    np.testing.assert_array_equal(read(npy_with(header)), NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("entry", "reason"),
+    [
+        (b"", "NPY_MALFORMED"),
+        (b"\x93NUMPY\x01\x00", "NPY_MALFORMED"),
+        (b"\x93NUMPZ" + npy(NUMBERS)[6:], "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3)}", version=b"\x04\x00"), "NPY_MALFORMED"),
+        (b"\x93NUMPY\x02\x00\xff\xff\xff\x7f" + bytes(64), "NPY_MALFORMED"),
+        (npy_with(b" " * 5000), "NPY_MALFORMED"),
+        (npy_with(b"__import__('os').system('true')"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), 'more': 1}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': 0, 'shape': (2, 3)}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (-2, 3)}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3**9)}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': [('x', '<f4')], 'fortran_order': False, 'shape': (6,)}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (1,1,1,1,1,1,1,2,3)}"), "NPY_MALFORMED"),
+        (npy_with(b"{'descr': '>f4', 'fortran_order': False, 'shape': (2, 3)}"), "TENSOR_DTYPE"),
+        (npy_with(b"{'descr': '<c8', 'fortran_order': False, 'shape': (3,)}"), "TENSOR_DTYPE"),
+        (npy_with(b"{'descr': '|V24', 'fortran_order': False, 'shape': (1,)}"), "TENSOR_DTYPE"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 4)}"), "TENSOR_STORAGE_MISMATCH"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (2, 2)}"), "TENSOR_STORAGE_MISMATCH"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (99999999, 99999999)}"), "TENSOR_TOO_LARGE"),
+        (npy_with(b"{'descr': '<f4', 'fortran_order': False, 'shape': (0, 999999999, 9999999999)}"), "TENSOR_SHAPE"),
+        (npy(np.array([{}, []], dtype=object), allow_pickle=True), "NPY_OBJECT_ARRAY"),
+        (npy(np.arange(6)), "TENSOR_DTYPE"),
+        (npy(np.array([1.0, np.inf])), "TENSOR_NOT_FINITE"),
+        (npy(np.array([1e300])), "TENSOR_NOT_FINITE"),
+    ],
+)
+def test_faulty_arrays_are_refused(entry: bytes, reason: str) -> None:
+    assert_refused(lambda: read(entry), reason)
+
+
+def test_whole_numbers_are_no_real_ones_nor_the_other_way_round() -> None:
+    arrays = source(savez(r=NUMBERS, w=np.arange(3), u=np.arange(3, dtype=np.uint64), b=np.array([True])))
+    for name in ("w", "u", "b"):
+        assert_refused(lambda name=name: arrays.array(name), "TENSOR_DTYPE")
+    for name in ("r", "u", "b"):
+        assert_refused(lambda name=name: arrays.integers(name), "TENSOR_DTYPE")
+    assert_refused(lambda: arrays.numbers("b"), "TENSOR_DTYPE")
+
+
+def test_few_numbers_are_few() -> None:
+    assert_refused(lambda: source(savez(a=np.zeros(65))).numbers("a"), "TENSOR_SHAPE")
+
+
+def test_the_budget_counts_what_is_asked_for() -> None:
+    data = savez(a=NUMBERS, b=NUMBERS)
+    arrays = source(data, budget=40)
+    arrays.array("a")
+    assert_refused(lambda: arrays.array("b"), "TENSOR_TOO_LARGE")
+    assert_refused(lambda: source(data).array("c"), "TENSOR_MISSING")
+
+
+def test_a_bomb_is_refused_by_its_claim_before_it_is_inflated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(npz, "MAX_UNPACKED_BYTES", 1 << 16)
+
+    def never(*_: object) -> None:
+        raise AssertionError("inflated")
+
+    monkeypatch.setattr(zlib, "decompressobj", never)
+    assert_refused(lambda: read(npy(np.zeros(1 << 15)), zipfile.ZIP_DEFLATED), "TENSOR_TOO_LARGE")
+
+
+@pytest.mark.parametrize("claimed", [100, 1 << 30])
+def test_a_bomb_that_claims_another_size_is_found(claimed: int) -> None:
+    data = zip_bytes([("a.npy", npy(np.zeros(1 << 15)))], zipfile.ZIP_DEFLATED)
+    size = claimed.to_bytes(4, "little")
+    lying = patched(patched(data, central_header_at(data, 0) + SIZE_AT, size), LOCAL_SIZE_AT, size)
+    assert_refused(lambda: source(lying, 1 << 40).array("a"), "ARCHIVE_DEFLATE_MALFORMED")
+
+
+def test_faulty_deflate_and_bytes_behind_its_end_are_found() -> None:
+    content = npy(NUMBERS)
+    for packed in (bytes(40), zlib.compress(content)[2:-4] + b"more", zlib.compress(content)[2:-8]):
+        data = zip_bytes([("a.npy", packed)])
+        at = central_header_at(data, 0)
+        size, crc = len(content).to_bytes(4, "little"), zlib.crc32(content).to_bytes(4, "little")
+        for place, value in ((METHOD_AT, b"\x08\x00"), (SIZE_AT, size), (CRC_AT, crc)):
+            data = patched(data, at + place, value)
+        for place, value in ((LOCAL_METHOD_AT, b"\x08\x00"), (LOCAL_SIZE_AT, size), (LOCAL_CRC_AT, crc)):
+            data = patched(data, place, value)
+        assert_refused(lambda data=data: source(data).array("a"), "ARCHIVE_DEFLATE_MALFORMED")
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_a_wrong_checksum_is_found(compression: int) -> None:
+    data = zip_bytes([("a.npy", npy(NUMBERS))], compression)
+    wrong = b"\1\2\3\4"
+    data = patched(patched(data, central_header_at(data, 0) + CRC_AT, wrong), LOCAL_CRC_AT, wrong)
+    assert_refused(lambda: source(data).array("a"), "ARCHIVE_CRC_MISMATCH")
+
+
+@pytest.mark.parametrize(
+    ("entries", "compression", "reason"),
+    [
+        ([("a.npy", npy(NUMBERS))], zipfile.ZIP_BZIP2, "ARCHIVE_COMPRESSED_ENTRY"),
+        ([("a.npy", npy(NUMBERS))], zipfile.ZIP_LZMA, "ARCHIVE_COMPRESSED_ENTRY"),
+        ([("a.npy", npy(NUMBERS)), ("readme.txt", b"x")], zipfile.ZIP_STORED, "ARCHIVE_ENTRY_NAME"),
+        ([("a.npy", npy(NUMBERS)), ("b/c.npy", npy(NUMBERS))], zipfile.ZIP_STORED, "ARCHIVE_ENTRY_NAME"),
+        ([("../a.npy", npy(NUMBERS))], zipfile.ZIP_STORED, "ARCHIVE_ENTRY_NAME"),
+    ],
+)
+def test_other_archives_are_refused(entries: list[tuple[str, bytes]], compression: int, reason: str) -> None:
+    assert_refused(lambda: source(zip_bytes(entries, compression)), reason)
+
+
+def test_the_container_is_as_strict_as_torchs() -> None:
+    data = savez(a=NUMBERS)
+    assert_refused(lambda: source(data + b"x"), "ARCHIVE_TRAILING_DATA")
+    assert_refused(lambda: source(b"x" + data), "ARCHIVE_PREFIXED_DATA")
+    for end in range(1, len(data), 17):
+        assert_refused(lambda end=end: source(data[:end]), "FILE_TRUNCATED")
+    assert_refused(lambda: source(patched(data, 6, b"\x01\x00")), "ARCHIVE_HEADER_MISMATCH")
+
+
+def test_damage_anywhere_is_refused_or_does_no_harm() -> None:
+    random = Random(3)
+    refused = 0
+    for number in range(600):
+        data = bytearray(savez(number % 2 == 1, a=NUMBERS, b=np.arange(40)))
+        for _ in range(random.randint(1, 4)):
+            data[random.randrange(len(data))] = random.choice((random.randrange(256), 0, 255))
+        try:
+            arrays = source(bytes(data))
+            arrays.array("a")
+            arrays.integers("b")
+        except FieldFormatError:
+            refused += 1
+    assert 500 < refused < 600

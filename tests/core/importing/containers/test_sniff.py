@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
+from tests.core.importing.archives import torch_zip, zip_bytes
+
+PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
+LEGACY_TORCH = bytes.fromhex("80028a0a6cfc9c46f9206aa850192e80024de903")
+LEGACY_TAR = b"sys_info".ljust(257, b"\0") + b"ustar\x0000"
+
+
+def test_names_what_the_gate_takes() -> None:
+    assert sniff_format(torch_zip()) == "torch-zip"
+    assert sniff_format(LEGACY_TORCH) == "torch-legacy"
+    assert sniff_format((64).to_bytes(8, "little") + b'{"a":') == "safetensors"
+
+
+def test_names_meshes() -> None:
+    facet = struct.pack("<12fH", 0, 0, 1, *range(1, 10), 0)
+    assert sniff_format(b"ply\nformat binary_little_endian 1.0\n") == "ply"
+    assert sniff_format(b"glTF\x02\0\0\0") == "glb"
+    assert sniff_format(b"solid thing\n  facet normal 0 0 1\n") == "stl"
+    assert sniff_format((b"solid, says the header".ljust(80) + struct.pack("<I", 900) + 20 * facet)[:512]) == "stl"
+    assert sniff_format(b"# Blender v2.92\n# \xc3\xa9\nmtllib a.mtl\no Cube\n") == "obj"
+    assert sniff_format(b"\r\nv 1.0 -2e-3 .5\r\n") == "obj"
+    assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"
+
+
+def test_arrays_and_databases_are_named() -> None:
+    assert sniff_format(zip_bytes([("points.npy", b"\x93NUMPY")])) == "npz"
+    assert sniff_format(b"SQLite format 3\x00".ljust(100, b"\x01")) == "sqlite"
+
+
+def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
+    assert sniff_format(b"PK\x03\x04\x00") == "torch-zip"
+
+
+@pytest.mark.parametrize(
+    ("head", "reason"),
+    [
+        (b"", "FILE_EMPTY"),
+        (b"x", "FORMAT_NOT_RECOGNISED"),
+        (PNG, "FORMAT_NOT_RECOGNISED"),
+        (LEGACY_TORCH[:10], "RAW_PICKLE"),
+        (LEGACY_TAR, "LEGACY_TORCH_FILE"),
+        (b"\x80\x04\x95\x05", "RAW_PICKLE"),
+        (b'{"asset": {"version": "2.0"}, "buffers": []}', "FORMAT_NOT_SUPPORTED"),
+        (b"v is for vertex", "FORMAT_NOT_RECOGNISED"),
+        (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNISED"),
+        (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNISED"),  # an STL file's facets have corners
+        (b"x" * 512, "FORMAT_NOT_RECOGNISED"),
+        (zip_bytes([("points.txt", b"1 2 3")]), "FORMAT_NOT_SUPPORTED"),
+        (b" BDV\0\0\0\0\xe0\0\0\0", "FORMAT_NOT_SUPPORTED"),
+        (b"NanoVDB2" + bytes(40), "FORMAT_NOT_SUPPORTED"),
+        (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNISED"),
+        (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNISED"),
+    ],
+)
+def test_everything_else_is_named_none_and_explained(head: bytes, reason: str) -> None:
+    assert sniff_format(head) is None
+    assert explain_refusal(head)[0] == reason
+
+
+def test_sniffing_loads_nothing_heavy() -> None:
+    heavy = {"numpy", "torch", "pydantic", "zipfile"}
+    program = f"import sys, regnf_core.importing.containers.sniff; sys.exit(bool({heavy!r} & set(sys.modules)))"
+    root = Path(__file__).resolve().parents[4]
+    assert subprocess.run([sys.executable, "-S", "-c", program], cwd=root, check=False).returncode == 0

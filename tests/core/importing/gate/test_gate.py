@@ -1,0 +1,249 @@
+"""The whole gate, child process and all. What the stages refuse in detail is tested beside them, without a process."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.safe_format import open_field
+from regnf_core.importing.gate import gate
+from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+from regnf_core.importing.gate.report import MIB
+from tests.core.importing.archives import assert_refused, saved, text, torch_zip
+from tests.core.importing.checkpoints import checkpoint, write_small_checkpoint
+from tests.core.importing.test_safetensors_upload import layout
+
+ROOT = Path(__file__).resolve().parents[4]
+SHORT = ImportLimits(wall_s=100)
+
+
+@pytest.fixture(scope="module")
+def upload(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("upload") / "step-000030000.ckpt"
+    write_small_checkpoint(path)
+    return path
+
+
+def in_child(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
+    """Let the child run ``program`` in place of the conversion."""
+    monkeypatch.setattr(gate, "_ENTRY", program)
+
+
+def assert_nothing_left(folder: Path) -> None:
+    assert list(folder.iterdir()) == []
+
+
+def test_a_checkpoint_becomes_a_field(upload: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fields" / "one"
+    report = import_field(
+        upload, out, {"label": "ball", "hash": {"base_resolution": 16, "top_resolution": 2048}}, SHORT
+    )
+    assert [path.name for path in out.iterdir()] == [FIELD_NAME]
+    assert report.family == "sdfstudio_neus_facto"
+    assert report.label == "ball"
+    assert report.bounds == ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    assert report.field_bytes == (out / FIELD_NAME).stat().st_size
+    assert report.parameters == 16 * 256 * 2 + 64 * 71 + 64 + 64 * 64 + 64 + 64 + 1
+    assert 10 * MIB < report.peak_memory_bytes < 2048 * MIB
+    assert report.plausibility["share_inside"] == pytest.approx(0.065, abs=0.03)
+    assert json.loads(json.dumps(report.to_dict()))["family"] == report.family
+    field = open_field(out / FIELD_NAME)
+    assert field.signed_distance(torch.zeros(1, 3)).item() < 0 < field.signed_distance(torch.ones(1, 3)).item()
+
+
+def test_an_import_after_a_refused_one_works(upload: Path, tmp_path: Path) -> None:
+    assert_refused(
+        lambda: import_field(saved(tmp_path, b"\x89PNG"), tmp_path / "out", None, SHORT), "FORMAT_NOT_RECOGNISED"
+    )
+    assert_nothing_left(tmp_path / "out")
+    import_field(upload, tmp_path / "out", None, SHORT)
+    assert (tmp_path / "out" / FIELD_NAME).is_file()
+
+
+def test_a_refused_import_leaves_what_was_there(tmp_path: Path) -> None:
+    saved(tmp_path, b"the field of another upload", FIELD_NAME)
+    bad = saved(tmp_path, torch_zip()[:-1], "bad")
+    assert_refused(lambda: import_field(bad, tmp_path, None, SHORT), "FILE_TRUNCATED")
+    assert (tmp_path / FIELD_NAME).read_bytes() == b"the field of another upload"
+    assert {path.name for path in tmp_path.iterdir()} == {FIELD_NAME, "bad"}
+
+
+def constant(values: dict[str, Any]) -> None:
+    """Nothing but the last bias reaches the output."""
+    for layer in (0, 1, 2):
+        values["pipeline"][f"_model.field.glin{layer}.weight_g"].zero_()
+
+
+def explosive(values: dict[str, Any]) -> None:
+    values["pipeline"]["_model.field.glin0.weight_g"].fill_(1e30)
+    values["pipeline"]["_model.field.glin1.weight_g"].fill_(1e30)
+
+
+@pytest.mark.parametrize(("change", "reason"), [(constant, "NO_ZERO_LEVEL"), (explosive, "FIELD_NOT_FINITE")])
+def test_a_field_that_is_none_leaves_nothing(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], reason: str
+) -> None:
+    write_small_checkpoint(tmp_path / "upload", change=change)
+    assert_refused(lambda: import_field(tmp_path / "upload", tmp_path / "out", None, SHORT), reason)
+    assert_nothing_left(tmp_path / "out")
+
+
+def test_a_pickle_that_calls_the_shell_calls_nothing(tmp_path: Path) -> None:
+    canary = tmp_path / "canary"
+    call = b"\x80\x02cposix\nsystem\n" + text(f"touch {canary}") + b"\x85R."
+    path = saved(tmp_path, torch_zip(call))
+    with pytest.raises(FieldFormatError, match=r"posix\.system") as caught:
+        import_field(path, tmp_path / "out", None, SHORT)
+    assert caught.value.reason == "UNSAFE_GLOBAL_IN_WEIGHTS"
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize("description", [{"label": object()}, {"label": "x" * 20_000}, {"label": float("nan")}])
+def test_descriptions_that_are_no_small_json_are_refused(upload: Path, tmp_path: Path, description: Any) -> None:
+    assert_refused(lambda: import_field(upload, tmp_path / "out", description, SHORT), "INVALID_DESCRIPTION")
+
+
+def test_a_missing_upload_is_the_callers_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        import_field(tmp_path / "none", tmp_path / "out", None, SHORT)
+
+
+def test_a_late_import_is_ended(upload: Path, tmp_path: Path) -> None:
+    assert_refused(lambda: import_field(upload, tmp_path, None, ImportLimits(wall_s=0.05)), "IMPORT_TIMEOUT")
+    assert_nothing_left(tmp_path)
+
+
+def test_a_hanging_import_with_closed_streams_is_ended(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_child(monkeypatch, "import os, time; os.close(1); os.close(2); time.sleep(600)")
+    assert_refused(lambda: import_field(upload, tmp_path, None, ImportLimits(wall_s=0.5)), "IMPORT_TIMEOUT")
+
+
+def test_endless_computing_is_ended(upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_child(monkeypatch, "import resource as r; r.setrlimit(r.RLIMIT_CPU, (1, 2))\nwhile True: pass")
+    assert_refused(lambda: import_field(upload, tmp_path, None, SHORT), "IMPORT_TIMEOUT")
+
+
+def test_too_little_memory_is_told_apart(upload: Path, tmp_path: Path) -> None:
+    limits = dataclasses.replace(SHORT, memory_bytes=400 * MIB)
+    assert_refused(lambda: import_field(upload, tmp_path, None, limits), "IMPORT_OUT_OF_MEMORY")
+    assert_nothing_left(tmp_path)
+
+
+def test_an_output_beyond_the_limit_is_refused(upload: Path, tmp_path: Path) -> None:
+    limits = dataclasses.replace(SHORT, file_bytes=10_000)
+    assert_refused(lambda: import_field(upload, tmp_path, None, limits), "IMPORT_OUTPUT_TOO_LARGE")
+    assert_nothing_left(tmp_path)
+
+
+def test_tensors_beyond_the_limit_are_refused(upload: Path, tmp_path: Path) -> None:
+    limits = dataclasses.replace(SHORT, tensor_bytes=10_000)
+    assert_refused(lambda: import_field(upload, tmp_path, None, limits), "TENSOR_TOO_LARGE")
+
+
+GOOD = {"family": "f", "why": [], "bounds": [[0, 0, 0], [1, 1, 1]], "parameters": 1, "plausibility": {}, "warnings": []}
+GOOD |= {"label": None, "isolation": {}, "peak_memory_bytes": 1}
+
+
+def claim(**values: Any) -> str:
+    """A child that leaves a sound file and says this of it."""
+    sound = layout({"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}, bytes(4))
+    return f"open('{FIELD_NAME}', 'wb').write({sound!r}); print({json.dumps(GOOD | values)!r})"
+
+
+def test_what_a_child_claims_is_taken_when_it_makes_sense(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the claims below would be refused for another reason."""
+    in_child(monkeypatch, claim())
+    assert import_field(upload, tmp_path, None, SHORT).parameters == 1
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        ("import ctypes; ctypes.string_at(0)", "IMPORT_CRASHED"),
+        ("import os; os.abort()", "IMPORT_CRASHED"),
+        ("raise SystemExit(3)", "IMPORT_CRASHED"),
+        ("", "IMPORT_CRASHED"),
+        ("print('hello')", "IMPORT_CRASHED"),
+        ("print('[' * 50_000)", "IMPORT_CRASHED"),
+        ("while True: print('x' * 1000)", "IMPORT_CRASHED"),
+        ('print(\'{"reason": "drop table"}\')', "IMPORT_CRASHED"),
+        ("print('{\"reason\": 7}')", "IMPORT_CRASHED"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "IMPORT_OUT_OF_MEMORY"),
+        (f"print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),  # success claimed, no file
+        (f"open('{FIELD_NAME}', 'wb').write(b'x' * 100); print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),
+        (f"import os; os.symlink('/etc/passwd', '{FIELD_NAME}'); print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),
+        (f"import os; os.mkdir('{FIELD_NAME}'); print({json.dumps(GOOD)!r})", "IMPORT_CRASHED"),
+        ('print(\'{"family": "f"}\')', "IMPORT_CRASHED"),
+        (claim(plausibility={"gradient_median": float("nan")}), "IMPORT_CRASHED"),
+        (claim(bounds=[[0, 0, 0], [1, 1, float("inf")]]), "IMPORT_CRASHED"),
+        (claim(bounds=[[0, 0, 0], [1, 1, 10**400]]), "IMPORT_CRASHED"),
+        (claim(parameters=float("inf")), "IMPORT_CRASHED"),
+        (claim(isolation=[]), "IMPORT_CRASHED"),
+    ],
+)
+def test_whatever_the_child_does_the_gate_holds(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, reason: str
+) -> None:
+    in_child(monkeypatch, program)
+    assert_refused(lambda: import_field(upload, tmp_path, None, SHORT), reason)
+    assert_nothing_left(tmp_path)
+
+
+def test_a_full_disk_is_no_fault_of_the_file(upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_child(monkeypatch, 'print(\'{"reason": "STORAGE_FULL", "detail": "no space"}\')')
+    with pytest.raises(OSError, match="no space") as caught:
+        import_field(upload, tmp_path, None, SHORT)
+    assert caught.value.errno == errno.ENOSPC
+
+
+def test_the_details_of_a_refusal_are_short_and_printable(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    in_child(
+        monkeypatch, "import json; print(json.dumps({'reason': 'SOME_REASON', 'detail': '\\x1b[31m' + 'x' * 9000}))"
+    )
+    with pytest.raises(FieldFormatError) as caught:
+        import_field(upload, tmp_path, None, SHORT)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) <= 500
+
+
+def test_a_kernel_that_grants_no_isolation_is_warned_of() -> None:
+    assert [w.split(":")[0] for w in gate._isolation_warnings({"network_namespace": False})] == ["NOT_ISOLATED"]
+    assert gate._isolation_warnings({"network_namespace": False, "system_call_filter": True}) == []
+
+
+def test_the_outer_side_loads_neither_torch_nor_numpy() -> None:
+    program = "import sys, regnf_core.importing.gate.gate; sys.exit(bool({'torch', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0
+
+
+def test_every_reason_is_documented() -> None:
+    """Any quoted word of capitals in the gate's sources is a reason or a warning, and stands in its page."""
+    words: set[str] = set()
+    for source in (ROOT / "regnf_core" / "importing").rglob("*.py"):
+        words |= set(re.findall(r'"([A-Z]+(?:_[A-Z0-9]+)+)[":]', source.read_text()))
+    words -= {"OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "FIELD_NAME"}
+    page = (ROOT / "docs" / "import-gate.md").read_text()
+    assert len(words) > 50
+    assert sorted(word for word in words if f"`{word}`" not in page) == []
+
+
+def test_the_helper_for_others_builds_a_checkpoint_with_adams_state() -> None:
+    state = checkpoint()["optimizers"]["fields"]["state"]
+    assert state[1]["exp_avg"].shape == state[1]["exp_avg_sq"].shape

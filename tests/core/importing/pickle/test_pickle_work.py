@@ -1,0 +1,83 @@
+"""What a pickle may cost: every way to ask for more work than the file is long is counted."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from regnf_core.importing.pickle.pickle_reader import PickleLimits, read_pickle
+from tests.core.importing.archives import assert_refused, text
+
+PROTO = b"\x80\x02"
+
+
+def too_much(body: bytes) -> None:
+    """The body asks for more than a hundred opcodes' work, or for more than ten remembered values."""
+    limits = PickleLimits(opcodes=100, memo=10)
+    assert_refused(lambda: read_pickle(memoryview(PROTO + body + b"."), limits), "PICKLE_TOO_COMPLEX")
+
+
+def test_opcodes_and_remembered_values_are_counted() -> None:
+    too_much(b"N0" * 60 + b"N")
+    too_much(b"N" + b"".join(b"q" + bytes([i]) for i in range(20)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "call"),
+    [
+        (b"(" + b"NN\x86" * 15 + b"l", b"ccollections\nOrderedDict\nh\x00\x85R0"),
+        (b"(" + b"NN\x86" * 15 + b"l", b"ccollections\ndefaultdict\nNh\x00\x86R0"),
+        (b"(" + b"N" * 30 + b"t", b"ctorch\nSize\nh\x00R0"),
+        (b"(" + b"N" * 30 + b"t", b"cos\nsystem\nh\x00\x810"),
+    ],
+    ids=["pairs", "pairs of a defaultdict", "arguments", "arguments of a placeholder"],
+)
+def test_calls_cost_what_they_may_copy(arguments: bytes, call: bytes) -> None:
+    """Arguments that are remembered can be used again and again at the price of a few opcodes."""
+    too_much(arguments + b"q\x00" + call * 5)
+
+
+def test_persistent_ids_cost_their_length() -> None:
+    identifier = (
+        b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x01" + b"N" * 30 + b"t"
+    )
+    too_much(identifier + b"q\x00" + b"h\x00Q0" * 5)
+
+
+def keys_of_one_hash(count: int) -> list[tuple[int, int]]:
+    """Pairs of integers that Python gives the same hash: its mixing of a tuple's parts can be run backwards."""
+    first, second, start, modulus = 11400714785074694791, 14029467366897019727, 2870177450012600261, 1 << 64
+    inverse, target, keys = pow(second, -1, modulus), 12345678901234567, []
+    for lead in range(1, 1 << 20):
+        mixed = (start + lead * second) % modulus
+        mixed = ((mixed << 31) | (mixed >> 33)) * first % modulus
+        other = (target - mixed) * inverse % modulus
+        other -= modulus if other >> 63 else 0
+        if 1 < abs(other) < (1 << 61) - 1:
+            keys.append((lead, other))
+        if len(keys) == count:
+            break
+    return keys
+
+
+def test_keys_that_share_one_hash_cost_more_than_others() -> None:
+    """A dictionary of n such keys takes n^2 comparisons: a file of megabytes would take hours."""
+    keys = keys_of_one_hash(11_000)
+    assert len({hash(key) for key in keys}) == 1
+    pairs = [b"J" + struct.pack("<i", a) + b"\x8a\x08" + struct.pack("<q", b) + b"\x86" for a, b in keys]
+    as_items = b"}(" + b"".join(pair + b"N" for pair in pairs) + b"u."
+    assert_refused(lambda: read_pickle(memoryview(PROTO + as_items)), "PICKLE_TOO_COMPLEX")
+    as_argument = b"ccollections\nOrderedDict\n(" + b"".join(pair + b"N\x86" for pair in pairs) + b"l\x85R."
+    assert_refused(lambda: read_pickle(memoryview(PROTO + as_argument)), "PICKLE_TOO_COMPLEX")
+
+
+def test_some_tuples_as_keys_are_taken() -> None:
+    pairs = b"".join(b"K" + bytes([i]) + b"K\x07\x86N" for i in range(200))
+    assert len(read_pickle(memoryview(PROTO + b"}(" + pairs + b"u."))) == 200
+
+
+def test_tuples_of_tuples_of_tuples_as_keys_are_refused() -> None:
+    """Shared by reference they are short in the file and endless to hash."""
+    nested = b"K\x01" + (b"q\x000(" + b"h\x00" * 16 + b"t") * 4
+    assert_refused(lambda: read_pickle(memoryview(PROTO + b"}" + nested + b"Ns.")), "PICKLE_MALFORMED")

@@ -1,0 +1,232 @@
+"""The result document and the artifacts, read back with other tools than wrote them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import Candidate
+from regnf_core.options import RegistrationOptions
+from regnf_core.result import Alternative, ObjectSymmetry
+from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.viewing import ranking_document, result_document, write_artifacts
+from regnf_core.viewing.preview import _up_axis, residual_colours
+from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
+from tests.core.conftest import ChairRun
+
+NAMES = [
+    "scene_points.ply",
+    "object_points.ply",
+    "aligned.ply",
+    "residuals.npz",
+    "trace.json",
+    "transform.npy",
+    "preview.png",
+    "result.json",
+    "context_points.ply",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(chair_run: ChairRun, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("artifacts")
+    assert write_artifacts(chair_run.result, path, truth=chair_run.truth) == NAMES
+    return path
+
+
+def test_exactly_the_named_files_are_written(folder: Path) -> None:
+    assert sorted(path.name for path in folder.iterdir()) == sorted(NAMES)
+
+
+def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
+    document = json.loads(json.dumps(result_document(chair_run.result, chair_run.truth), allow_nan=False))
+    assert set(document) == {
+        "verdict",
+        "verdict_reason",
+        "verdict_detail",
+        "T_object_scene",
+        "T_scene_object",
+        "T_object_scene_initial",
+        "alternatives",
+        "covariance",
+        "covariance_ordering",
+        "uncertainty",
+        "symmetry",
+        "metrics",
+        "object",
+        "candidates",
+        "seed",
+        "options",
+        "engine",
+    }
+    forth, back = (np.array(document[name]["matrix"]) for name in ("T_object_scene", "T_scene_object"))
+    np.testing.assert_allclose(forth @ back, np.eye(4), atol=1e-9)
+    assert document["metrics"]["rotation_error_rad"] < 0.02
+    assert document["verdict_detail"] == VERDICT_REASONS["SURFACES_AGREE"]
+    assert [document[name] for name in ("covariance", "covariance_ordering", "uncertainty", "symmetry")] == [None] * 4
+    assert document["engine"]["name"] == "regnf"
+    assert "rotation_error_rad" not in result_document(chair_run.result)["metrics"]
+
+
+def test_numbers_that_json_lacks_become_null(chair_run: ChairRun) -> None:
+    other = Alternative(Sim3.identity(), 0.5, "180 degrees about z")
+    odd = replace(
+        chair_run.result, metrics={"residual_rms": float("nan")}, alternatives=[other], covariance=torch.eye(7)
+    )
+    document = result_document(odd)
+    assert document["metrics"] == {"residual_rms": None}
+    assert document["alternatives"][0]["relation"] == "180 degrees about z"
+    assert len(document["covariance"]) == 7
+    json.dumps(document, allow_nan=False)
+
+
+def test_uncertainty_is_the_covariance_in_units_of_people(chair_run: ChairRun) -> None:
+    degree, unit, percent = math.radians(1.0), 0.25, 0.01
+    variances = [degree**2, (2 * degree) ** 2, (3 * degree) ** 2, unit**2, 4 * unit**2, 0.0, percent**2]
+    document = result_document(replace(chair_run.result, covariance=torch.tensor(variances).double().diag()))
+    assert document["covariance_ordering"] == ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
+    assert document["uncertainty"]["rotation_deg"] == pytest.approx([1.0, 2.0, 3.0])
+    assert document["uncertainty"]["translation"] == pytest.approx([0.25, 0.5, 0.0])
+    assert document["uncertainty"]["scale_percent"] == pytest.approx(1.0)
+
+
+def test_what_is_no_variance_has_no_deviation(chair_run: ChairRun) -> None:
+    odd = torch.diag(torch.tensor([-1.0, math.nan, 1.0, math.inf, 1.0, 1.0, -1e-9]).double())
+    document = json.loads(json.dumps(result_document(replace(chair_run.result, covariance=odd)), allow_nan=False))
+    assert document["uncertainty"]["rotation_deg"][:2] == [None, None]
+    assert document["uncertainty"]["translation"] == [None, 1.0, 1.0]
+    assert document["uncertainty"]["scale_percent"] is None
+    assert document["covariance"][1][1] is None
+
+
+def test_a_ranking_is_told_with_what_is_unusable_last() -> None:
+    ranking = [
+        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity()),
+        Candidate("stool", "coarse", math.inf),
+    ]
+    chair, stool, air = json.loads(json.dumps(ranking_document(ranking, {"air": "NO_SURFACE_IN_OBJECT"})))
+    assert chair["T_object_scene"]["matrix"] == np.eye(4).tolist()
+    assert (chair["object"], chair["verdict"], chair["verdict_reason"]) == ("chair", "registered", "SURFACES_AGREE")
+    assert stool == {
+        "object": "stool", "stage": "coarse", "score": None, "verdict": None, "verdict_reason": None,
+        "T_object_scene": None,
+    }  # fmt: skip
+    assert (air["object"], air["stage"], air["verdict_reason"]) == ("air", "unusable", "NO_SURFACE_IN_OBJECT")
+    assert set(air) == set(stool)
+
+
+def test_the_objects_symmetry_is_told(chair_run: ChairRun) -> None:
+    round_one = replace(chair_run.result, symmetry=ObjectSymmetry(2, (0.0, 0.0, 1.0), True))
+    document = json.loads(json.dumps(result_document(round_one)))
+    assert document["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": True}
+
+
+def test_clouds_come_back_through_another_reader(chair_run: ChairRun, folder: Path) -> None:
+    result = chair_run.result
+    scene = trimesh.load(folder / "scene_points.ply")
+    np.testing.assert_allclose(scene.vertices, result.scene_samples.points.numpy(), atol=1e-6)
+    assert scene.colors.shape[0] == len(scene.vertices)
+    aligned = trimesh.load(folder / "aligned.ply")
+    count = len(result.scene_samples.points)
+    assert len(aligned.vertices) == count + len(result.object_samples.points)
+    assert len(np.unique(aligned.colors[:, :3], axis=0)) == 2
+    placed = result.T_object_scene.inverse().apply(result.object_samples.points.double()).numpy()
+    np.testing.assert_allclose(aligned.vertices[count:], placed, atol=1e-6)
+    header = (folder / "object_points.ply").read_bytes().split(b"end_header\n")[0]
+    assert b"format binary_little_endian 1.0" in header
+    assert all(f"property float {name}".encode() in header for name in ("nx", "ny", "nz"))
+
+
+def test_residuals_trace_and_transform_come_back(chair_run: ChairRun, folder: Path) -> None:
+    result = chair_run.result
+    with np.load(folder / "residuals.npz") as arrays:
+        assert set(arrays) == {"scene_points", "scene_residuals", "object_points", "object_residuals"}
+        assert arrays["scene_points"].shape == (len(arrays["scene_residuals"]), 3)
+    np.testing.assert_allclose(np.load(folder / "transform.npy"), result.T_object_scene.matrix().numpy())
+    trace = json.loads((folder / "trace.json").read_text())
+    assert len(trace) == len(result.trace)
+    assert np.array(trace[-1]["T_object_scene"]["matrix"]).shape == (4, 4)
+    assert {"iteration", "loss", "residual_scene", "residual_object", "kernel_shape"} <= set(trace[0])
+    assert json.loads((folder / "result.json").read_text())["verdict"] == result.verdict
+
+
+def test_the_picture_shows_both_surfaces_and_small_residuals(folder: Path) -> None:
+    with Image.open(folder / "preview.png") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert pixels.shape[1] == 3 * 480
+    after, residual = pixels[60:, 480:960], pixels[60:, 960:]
+    bluish = (after[..., 2] - after[..., 0] > 30).sum()
+    orange = (after[..., 0] - after[..., 2] > 30).sum()
+    assert min(bluish, orange) > 2000
+    yellow = (residual[..., 0] > 180) & (residual[..., 2] < 100)
+    assert yellow.sum() < 0.02 * (residual.sum(-1) < 600).sum()
+
+
+def test_the_nearer_disc_hides_the_farther_one() -> None:
+    red, green = [1.0, 0, 0], [0, 1.0, 0]
+    facing = np.array([[0.0, 0, 1], [0.0, 0, 1]])
+    cloud = Surfels(np.array([[0.0, 0, 0.5], [0.0, 0, -0.5]]), facing, np.array([red, green]))
+    view = View(np.eye(3), np.zeros(3), 10.0)
+    picture = render(cloud, view, 21, 0.5, np.ones(3))
+    assert picture[10, 10, 0] > 0.5
+    assert picture[10, 10, 1] == 0.0
+    np.testing.assert_array_equal(picture[0, 0], np.ones(3))
+
+
+def test_every_pixel_shows_the_disc_nearest_to_the_viewer() -> None:
+    generator = np.random.default_rng(3)
+    points, normals = generator.uniform(-1.3, 1.3, (40, 3)), generator.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    size, pixels_per_unit, radius = 48, 20.0, 0.35
+    cloud = Surfels(points, normals, np.zeros((40, 3)))
+    nearest = nearest_surfels(cloud, View(np.eye(3), np.zeros(3), pixels_per_unit), size, radius)
+    middle = (np.arange(size) + 0.5 - size / 2) / pixels_per_unit
+    expected = np.full((size, size), -1)
+    for i, j in np.ndindex(size, size):
+        x, y = middle[j], -middle[i]
+        lean = normals[:, :2] * np.sign(normals[:, 2:]) / np.maximum(np.abs(normals[:, 2:]), 0.12)
+        away = np.stack([x - points[:, 0], y - points[:, 1]], axis=1)
+        height = -(lean * away).sum(1)
+        covered = (away**2).sum(1) + height**2 <= radius**2
+        if covered.any():
+            expected[i, j] = np.where(covered, points[:, 2] + height, -np.inf).argmax()
+    assert (nearest == expected).mean() > 0.998  # a disc's very edge falls to either side
+    assert (expected >= 0).mean() > 0.3
+
+
+def test_a_disc_seen_from_the_side_is_narrow() -> None:
+    tilted = Surfels(np.zeros((1, 3)), np.array([[np.sqrt(0.75), 0.0, 0.5]]), np.array([[0.0, 0, 0]]))
+    picture = render(tilted, View(np.eye(3), np.zeros(3), 20.0), 101, 1.0, np.ones(3))
+    drawn = picture.sum(-1) < 3.0
+    # Radius 20 pixels, tilted by 60 degrees about the vertical: half as wide as it is high.
+    assert drawn.any(1).sum() == pytest.approx(40, abs=2)
+    assert drawn.any(0).sum() == pytest.approx(20, abs=2)
+
+
+def test_the_ramp_runs_from_dark_to_yellow_and_clips() -> None:
+    colours = residual_colours(np.array([0.0, 1.0, 7.0]))
+    np.testing.assert_allclose(colours[0], [0.18, 0.20, 0.46])
+    np.testing.assert_allclose(colours[1], [0.98, 0.88, 0.18])
+    np.testing.assert_allclose(colours[2], colours[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "up"),
+    [
+        ({}, "z"),
+        ({"robust": {"up_axis": "y"}}, "y"),
+        ({"sampling": {"up_axis": "x"}}, "x"),
+        ({"preset": "paper", "sampling": {"up_axis": "x"}, "robust": {"up_axis": "y"}}, "x"),
+    ],
+)
+def test_the_picture_stands_on_the_axis_that_the_preset_was_told(options: dict[str, object], up: str) -> None:
+    assert _up_axis(RegistrationOptions.from_dict(options).to_dict()) == up

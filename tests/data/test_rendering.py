@@ -1,0 +1,116 @@
+"""Rendered images against projections worked out by hand, and against exact distances."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from benchmarks.simple_meshes import revolved
+from regnf_core.fields.mesh import MeshField
+from regnf_data.mesh_scene import MeshScene, PaintedMesh, Thing, box_thing
+from regnf_data.paint import TexturePaint, TilePaint, VertexPaint, paint_of, to_linear, to_srgb
+from regnf_data.rendering import Shading, intrinsics_of, render
+from regnf_data.trajectories import look_at
+
+SIZE = (120, 160)
+WHITE = TilePaint((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), 1.0)
+ALONG_Y = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, -3.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""A level camera 3 m before the origin, looking along y."""
+
+
+def cube() -> MeshScene:
+    """A box of 1 x 2 x 1 m about the origin: its front is 2 m before the camera."""
+    return MeshScene([box_thing([-0.5, -1.0, -0.5], [0.5, 1.0, 0.5], WHITE)])
+
+
+def test_depth_and_corners_of_a_box() -> None:
+    # Focal length 80 / tan 30 degrees = 138.564: the front's corner (.5, -1, .5) falls on (114.641, 25.359).
+    view = render(cube(), SIZE, intrinsics_of(SIZE, 60.0), ALONG_Y)
+    assert view.depth[25:95, 45:115].shape == (70, 70)
+    np.testing.assert_allclose(view.depth[25:95, 45:115], 2.0, atol=1e-6)
+    assert (view.thing[25:95, 45:115] == 0).all()
+    outside = np.ones(SIZE, dtype=bool)
+    outside[25:95, 45:115] = False
+    assert (view.depth[outside] == 0.0).all()
+    assert (view.thing[outside] == -1).all()
+    # The middle of pixel (60, 80) is off the axis by half a pixel both ways.
+    assert view.cosine[60, 80] == pytest.approx(138.5641 / np.sqrt(138.5641**2 + 0.5), abs=1e-6)
+
+
+def test_depth_is_along_the_axis_and_not_the_ray() -> None:
+    wall = MeshScene([box_thing([-9.0, 1.0, -9.0], [9.0, 2.0, 9.0], WHITE)])
+    view = render(wall, SIZE, intrinsics_of(SIZE, 90.0), ALONG_Y)
+    np.testing.assert_allclose(view.depth, 4.0, atol=1e-6)
+    # 90 degrees across: the ray of the outermost column in the middle row goes 79.5 sideways for 80 ahead.
+    assert view.cosine[60, 0] == pytest.approx(80.0 / np.sqrt(80.0**2 + 79.5**2 + 0.5**2), abs=1e-6)
+
+
+def test_depth_carried_back_lies_on_the_surface() -> None:
+    vase = revolved([(0.0, -0.3), (0.25, -0.3), (0.1, 0.0), (0.3, 0.3), (0.0, 0.3)])
+    paint = VertexPaint(np.ones((len(vase.vertices), 3)))
+    scene = MeshScene([Thing((PaintedMesh(vase.vertices, vase.faces, paint),), vase, "vase")])
+    intrinsics = intrinsics_of(SIZE, 50.0)
+    for position in ([1.0, 0.4, 0.5], [-0.3, -0.9, -0.4]):
+        pose = look_at(np.array([position]), np.zeros((1, 3)))[0]
+        view = render(scene, SIZE, intrinsics, pose)
+        rows, columns = np.nonzero(view.depth)
+        assert len(rows) > 3000
+        pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+        points = (np.linalg.inv(intrinsics) @ pixels * view.depth[rows, columns]).T @ pose[:3, :3].T + pose[:3, 3]
+        assert vase.signed_distance(torch.from_numpy(points)).abs().max() < 1e-6
+
+
+def test_light_follows_lamberts_law() -> None:
+    shading = Shading(to_lamp=(0.0, 0.0, 2.0), lamp=0.6, ambient=0.4)
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [np.sqrt(0.75), 0.0, 0.5]])
+    np.testing.assert_allclose(shading.light(normals), [0.6 + 0.4, 0.4 * 0.6, 0.3 + 0.4 * 0.9])
+    view = render(cube(), SIZE, intrinsics_of(SIZE, 60.0), ALONG_Y, Shading((0.0, -1.0, 0.0), 0.5, 0.25))
+    assert (view.colours[60, 80] == to_srgb(np.array([0.5 + 0.25 * 0.8]))).all()
+    assert (view.colours[0, 0] == 255).all()
+
+
+def test_colours_are_the_mean_of_a_pixels_rays() -> None:
+    # The upper edge falls on row 25.359: of three rows of rays at 25.167, .5 and .833 two meet the box.
+    black = TilePaint((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0)
+    scene = MeshScene([box_thing([-0.5, -1.0, -0.5], [0.5, 1.0, 0.5], black)])
+    view = render(scene, SIZE, intrinsics_of(SIZE, 60.0), ALONG_Y)
+    assert (view.colours[25, 80] == to_srgb(np.array([1.0 / 3.0]))).all()
+
+
+def test_a_texture_lies_the_right_way_up() -> None:
+    picture = Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8))
+    mesh = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv, material=trimesh.visual.material.PBRMaterial(baseColorTexture=picture)
+    )
+    loaded = trimesh.load_mesh(trimesh.util.wrap_as_stream(mesh.export(file_type="glb")), file_type="glb")
+    for each in (mesh, loaded):
+        paint = paint_of(each)
+        assert isinstance(paint, TexturePaint)
+        solid = MeshField(each.vertices, each.faces)
+        scene = MeshScene([Thing((PaintedMesh(solid.vertices, solid.faces, paint),), solid)])
+        origins = np.array([[x, y, 1.0] for y, x in product((0.75, 0.25), (0.25, 0.75))])
+        hits = scene.cast(origins, np.tile([0.0, 0.0, -1.0], (4, 1)))
+        np.testing.assert_array_equal(hits.colour, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+
+
+def test_vertex_colours_are_mixed() -> None:
+    colours = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    solid = MeshField([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    scene = MeshScene([Thing((PaintedMesh(solid.vertices, solid.faces, VertexPaint(colours)),), solid)])
+    hits = scene.cast(np.array([[0.2, 0.3, 1.0], [2.0, 2.0, 1.0]]), np.array([[0.0, 0.0, -2.0]] * 2))
+    np.testing.assert_allclose(hits.colour, [[0.5, 0.2, 0.3], [0.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(hits.distance, [0.5, np.inf])
+    np.testing.assert_array_equal(hits.thing, [0, -1])
+
+
+def test_srgb_there_and_back() -> None:
+    every = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(to_srgb(to_linear(every)), every)
+    assert to_linear(np.array([188]))[0] == pytest.approx(0.503, abs=1e-3)  # the well-known middle grey of light

@@ -1,0 +1,270 @@
+"""Folders in the sdfstudio data format: what is written is read again, and other people's folders are read too."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from regnf_core.errors import DatasetError
+from regnf_core.geometry.box import OrientedBox
+from regnf_data.posed_images import PosedImages
+from regnf_data.sdfstudio import METADATA, load_dataset, write_dataset
+from tests.data.small import two_images
+
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_dataset(two_images(), tmp_path / "data")
+    return tmp_path / "data"
+
+
+def change(folder: Path, mend: Change) -> None:
+    metadata = json.loads((folder / METADATA).read_text())
+    mend(metadata)
+    (folder / METADATA).write_text(json.dumps(metadata))
+
+
+def assert_same(read: PosedImages, written: PosedImages) -> None:
+    for name in ("colours", "intrinsics", "T_world_camera", "bounds", "depths", "masks", "T_metric_world"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name), err_msg=name)
+        if getattr(written, name) is not None:
+            assert getattr(read, name).dtype == getattr(written, name).dtype, name
+    assert len(read.instances) == len(written.instances)
+    for one, other in zip(read.instances, written.instances, strict=True):
+        assert one.label == other.label == one.box.label
+        for name in ("centre", "size", "rotation"):
+            np.testing.assert_array_equal(getattr(one.box, name), getattr(other.box, name))
+        for name in ("T_object_world", "world_pose", "gt_pose"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+
+
+def test_everything_comes_back_exactly(folder: Path) -> None:
+    assert_same(load_dataset(folder), two_images())
+
+
+def test_what_is_absent_comes_back_absent(tmp_path: Path) -> None:
+    bare = replace(two_images(), depths=None, masks=None, instances=(), T_metric_world=None)
+    (tmp_path / "data").mkdir()  # empty: taken
+    write_dataset(bare, tmp_path / "data")
+    assert_same(load_dataset(tmp_path / "data"), bare)
+
+
+def test_a_folder_in_use_is_refused_and_left_alone(folder: Path) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    with pytest.raises(DatasetError) as refused:
+        write_dataset(two_images(), folder)
+    assert refused.value.reason == "DATASET_FOLDER_NOT_EMPTY"
+    assert sorted(path.name for path in folder.iterdir()) == before
+    assert [path.name for path in folder.parent.iterdir()] == ["data"]
+
+
+def test_a_write_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "no space left on device")
+
+    monkeypatch.setattr(np, "save", full)
+    with pytest.raises(OSError, match="no space"):
+        write_dataset(two_images(), tmp_path / "data")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_least_that_a_dataset_may_say(folder: Path) -> None:
+    def spare(metadata: dict[str, Any]) -> None:
+        for frame in metadata["frames"]:
+            del frame["sensor_depth_path"], frame["foreground_mask"]
+        metadata["frames"][1].pop("intrinsics")
+        metadata["intrinsics"] = metadata["frames"][0].pop("intrinsics")
+        metadata["frames"][0]["camtoworld"].pop()
+        frames = metadata.pop("frames")
+        intrinsics = metadata["intrinsics"]
+        metadata.clear()
+        metadata.update(frames=frames, intrinsics=intrinsics)
+
+    change(folder, spare)
+    read = load_dataset(folder)
+    written = two_images()
+    assert read.size == (4, 6)
+    assert read.depths is read.masks is read.T_metric_world is None
+    assert read.instances == ()
+    np.testing.assert_array_equal(read.bounds, [[-1, -1, -1], [1, 1, 1]])
+    np.testing.assert_array_equal(read.intrinsics, written.intrinsics)
+    np.testing.assert_array_equal(read.T_world_camera, written.T_world_camera)
+
+
+def test_a_frame_without_depth_or_mask(folder: Path) -> None:
+    def spare(metadata: dict[str, Any]) -> None:
+        del metadata["frames"][1]["sensor_depth_path"], metadata["frames"][0]["foreground_mask"]
+
+    change(folder, spare)
+    read = load_dataset(folder)
+    assert read.depths is not None
+    assert read.masks is not None
+    np.testing.assert_array_equal(read.depths[0], two_images().depths[0])  # type: ignore[index]
+    assert (read.depths[1] == 0.0).all()
+    assert read.masks[0].all()
+    assert not read.masks[1].all()
+
+
+def test_depth_as_a_16_bit_image(folder: Path) -> None:
+    millimetres = np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000
+    Image.fromarray(millimetres).save(folder / "depth.png")
+
+    def use(metadata: dict[str, Any]) -> None:
+        metadata["depth_unit_scale_factor"] = 0.0005
+        for frame in metadata["frames"]:
+            frame["sensor_depth_path"] = "depth.png"
+
+    change(folder, use)
+    read = load_dataset(folder)
+    assert read.depths is not None
+    np.testing.assert_allclose(read.depths[1], np.arange(24).reshape(4, 6) * 0.5, rtol=1e-7)
+
+
+def test_depths_that_are_none(folder: Path) -> None:
+    depth = np.full((4, 6, 1), 2.0)
+    depth[0, :4, 0] = np.nan, np.inf, -1.0, 1e300
+    np.save(folder / "000000_depth.npy", depth)
+    read = load_dataset(folder)
+    assert read.depths is not None
+    np.testing.assert_array_equal(read.depths[0, 0], [0, 0, 0, 0, 2, 2])
+
+
+def test_masks_of_ones(folder: Path) -> None:
+    Image.fromarray(two_images().masks[0].astype(np.uint8)).save(folder / "000000_mask.png")  # type: ignore[index]
+    read = load_dataset(folder)
+    np.testing.assert_array_equal(read.masks, two_images().masks)
+
+
+def test_instances_as_other_files_tell_them(folder: Path) -> None:
+    chair = two_images().instances[0].box
+    corners = chair.corners()[[3, 7, 0, 6, 1, 5, 2, 4]]
+
+    def use(metadata: dict[str, Any]) -> None:
+        del metadata["worldtogt"]
+        metadata["instances"] = {
+            "c": {"box_corners": corners.tolist(), "worldtogt": np.diag([3.0, 3.0, 3.0, 1.0]).tolist()},
+            "7": {"name": "e\nt", "box_min": [0, 0, 0], "box_max": [1, 2, 3]},
+            "t": {"box_corners": OrientedBox.from_corners([0, 0, 0], [1, 2, 3]).corners().tolist()},
+        }
+
+    change(folder, use)
+    read = load_dataset(folder)
+    assert [instance.label for instance in read.instances] == ["c", "e?t", "t"]
+    for point in corners:  # the same box, whatever its axes are called
+        assert (read.instances[0].box.corners() - point).norm(dim=1).min() < 1e-12
+    for instance in read.instances[1:]:
+        np.testing.assert_array_equal(instance.box.size, [1, 2, 3])
+        np.testing.assert_array_equal(instance.box.rotation, np.eye(3))
+    np.testing.assert_array_equal(read.T_metric_world, np.diag([3.0, 3.0, 3.0, 1.0]))
+
+
+def set_frame(**values: Any) -> Change:
+    return lambda metadata: metadata["frames"][1].update(values)
+
+
+def set_top(**values: Any) -> Change:
+    return lambda metadata: metadata.update(values)
+
+
+SHEARED = [[1, 0.1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
+CUBE_BUT_ONE = [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [1, 0, 0], [1, 0, 1], [1, 1, 0], [1, 1, 5]]
+
+
+@pytest.mark.parametrize(
+    ("mend", "reason"),
+    [
+        (set_top(camera_model="OPENCV_FISHEYE"), "DATASET_CAMERA_UNSUPPORTED"),
+        (set_top(k1=0.1), "DATASET_CAMERA_UNSUPPORTED"),
+        (set_top(frames=[]), "DATASET_NO_FRAMES"),
+        (lambda metadata: metadata.pop("frames"), "DATASET_NO_FRAMES"),
+        (set_top(frames=[7]), "DATASET_METADATA_INVALID"),
+        (set_top(height=5), "DATASET_SIZES_DIFFER"),
+        (set_top(height="tall"), "DATASET_METADATA_INVALID"),
+        (set_top(height=float("inf")), "DATASET_METADATA_INVALID"),
+        (set_top(width=-6), "DATASET_METADATA_INVALID"),
+        (set_top(width=10**9, height=10**9), "DATASET_TOO_LARGE"),
+        (set_top(scene_box=[1]), "DATASET_METADATA_INVALID"),
+        (set_top(scene_box={"aabb": [[1, 1, 1], [0, 0, 0]]}), "DATASET_METADATA_INVALID"),
+        (set_top(scene_box={"aabb": [[1, 1], [2, 2]]}), "DATASET_METADATA_INVALID"),
+        (set_top(worldtogt=SHEARED), "DATASET_METADATA_INVALID"),
+        (set_top(instances="chair"), "DATASET_INSTANCE_INVALID"),
+        (set_top(instances=["chair"]), "DATASET_INSTANCE_INVALID"),
+        (set_top(instances=[{"label": "chair"}]), "DATASET_INSTANCE_INVALID"),
+        (set_top(instances=[{"box_min": [0, 0, 0], "box_max": [1, 1, 0]}]), "DATASET_INSTANCE_INVALID"),
+        (set_top(instances=[{"box_corners": CUBE_BUT_ONE}]), "DATASET_INSTANCE_INVALID"),
+        (
+            set_top(instances=[{"box_min": [0, 0, 0], "box_max": [1, 1, 1], "T_object_world": SHEARED}]),
+            "DATASET_INSTANCE_INVALID",
+        ),
+        (set_frame(camtoworld=SHEARED), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=MIRRORED), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=np.diag([2.0, 2.0, 2.0, 1.0]).tolist()), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=[[float("nan")] * 4] * 4), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=np.diag([1e200, 1.0, 1.0, 1.0]).tolist()), "DATASET_POSE_NOT_RIGID"),
+        (set_frame(camtoworld=None), "DATASET_METADATA_INVALID"),
+        (set_frame(intrinsics=None), "DATASET_INTRINSICS_INVALID"),
+        (set_frame(intrinsics=np.diag([-1.0, 1.0, 1.0, 1.0]).tolist()), "DATASET_INTRINSICS_INVALID"),
+        (set_frame(intrinsics={"fx": 1}), "DATASET_INTRINSICS_INVALID"),
+        (set_frame(rgb_path="absent.png"), "DATASET_IMAGE_MISSING"),
+        (set_frame(rgb_path="."), "DATASET_IMAGE_MISSING"),
+        (set_frame(rgb_path="x" * 5000), "DATASET_METADATA_INVALID"),
+        (set_frame(rgb_path=7), "DATASET_METADATA_INVALID"),
+        (set_frame(rgb_path="\ud800"), "DATASET_METADATA_INVALID"),
+        (set_frame(rgb_path="a\0b"), "DATASET_METADATA_INVALID"),
+        (set_frame(rgb_path="../secret.png"), "DATASET_PATH_OUTSIDE"),
+        (set_frame(rgb_path="/etc/hostname"), "DATASET_PATH_OUTSIDE"),
+        (set_frame(rgb_path="link.png"), "DATASET_PATH_OUTSIDE"),
+        (set_frame(rgb_path="000000_depth.npy"), "DATASET_IMAGE_INVALID"),
+        (set_frame(rgb_path="large.png"), "DATASET_SIZES_DIFFER"),
+        (set_frame(rgb_path="cut.png"), "DATASET_IMAGE_INVALID"),
+        (set_frame(sensor_depth_path="000000_rgb.png"), "DATASET_DEPTH_UNIT_MISSING"),
+        (set_frame(sensor_depth_path="pickle.npy"), "DATASET_IMAGE_INVALID"),
+        (set_frame(sensor_depth_path="header.npy"), "DATASET_IMAGE_INVALID"),
+        (set_frame(sensor_depth_path="text.npy"), "DATASET_IMAGE_INVALID"),
+        (set_frame(sensor_depth_path="flat.npy"), "DATASET_SIZES_DIFFER"),
+        (set_frame(foreground_mask="large.png"), "DATASET_SIZES_DIFFER"),
+        (set_frame(foreground_mask="absent.png"), "DATASET_IMAGE_MISSING"),
+    ],
+)
+def test_refused(mend: Change, reason: str, folder: Path) -> None:
+    Image.new("RGB", (40, 30)).save(folder / "large.png")
+    Image.new("RGB", (6, 4)).save(folder.parent / "secret.png")
+    (folder / "link.png").symlink_to(folder.parent / "secret.png")
+    (folder / "cut.png").write_bytes((folder / "000000_rgb.png").read_bytes()[:60])
+    np.save(folder / "pickle.npy", np.array([{}]), allow_pickle=True)
+    (folder / "header.npy").write_bytes((folder / "000000_depth.npy").read_bytes().replace(b"(4, 6)", b"\xb74, 6)"))
+    np.save(folder / "text.npy", np.full((4, 6), "x"))
+    np.save(folder / "flat.npy", np.zeros(24))
+    change(folder, mend)
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(folder)
+    assert refused.value.reason == reason, refused.value
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "DATASET_NO_METADATA"),
+        (b"", "DATASET_METADATA_INVALID"),
+        (b"[]", "DATASET_METADATA_INVALID"),
+        (b"\xff\xfe{}", "DATASET_METADATA_INVALID"),
+        (b"[" * 100_000, "DATASET_METADATA_INVALID"),
+        (b"{}", "DATASET_NO_FRAMES"),
+    ],
+)
+def test_refused_metadata(content: bytes | None, reason: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / METADATA).write_bytes(content)
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(tmp_path)
+    assert refused.value.reason == reason

@@ -1,0 +1,45 @@
+"""The loss's gradient by the parameters against finite differences."""
+
+import numpy as np
+import torch
+
+from regnf_fit.images.color_terms import render_rays, samples_about_depth
+from regnf_fit.images.network import RadianceField, StartShape
+from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.rays import rays_of_pixels
+from tests.fit.images import scenes
+
+OPTIONS = ReconstructionOptions(hidden_width=8, feature_width=4)
+
+
+def loss_and_parameter():
+    images = scenes.images(count=2, height=12, width=16)
+    rays = rays_of_pixels(images, np.flatnonzero(images.depths.ravel() > 0.0)[:12], None)
+    generator = torch.Generator().manual_seed(0)
+    field = RadianceField(OPTIONS, StartShape(torch.zeros(3), 0.3, False), generator)
+    depths = samples_about_depth(rays, torch.full((len(rays),), 0.05), generator)
+
+    def loss():
+        rendered = render_rays(field, rays, depths, torch.tensor(15.0), torch.zeros(3))
+        points = rays.at(depths).flatten(0, 1)
+        _, gradient = field.function().value_and_gradient(points)
+        eikonal = (gradient.norm(dim=1) - 1.0).square().mean()
+        return rendered.opacity.mean() + rendered.depths.mean() + 0.1 * eikonal
+
+    return field, loss
+
+
+def test_the_loss_falls_as_its_gradient_says():
+    field, loss = loss_and_parameter()
+    loss().backward()
+    for parameter in (field.table, field.weights[0], field.weights[1], field.biases[2]):
+        direction = parameter.grad / parameter.grad.norm()
+        expected = float(parameter.grad.norm())
+        step = 2e-3 if parameter is not field.table else 1e-3
+        with torch.no_grad():
+            parameter.add_(step * direction)
+            above = float(loss())
+            parameter.sub_(2.0 * step * direction)
+            below = float(loss())
+            parameter.add_(step * direction)
+        np.testing.assert_allclose((above - below) / (2.0 * step), expected, rtol=0.03)

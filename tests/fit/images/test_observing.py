@@ -1,0 +1,107 @@
+"""What images have seen of a volume, against the true distance and a slow ray by ray march."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from regnf_core.fields.observation import observation_of
+from regnf_core.fields.safe_format import open_field
+from regnf_core.schema.kinds.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.observing import observe
+from regnf_fit.images.options import ReconstructionOptions
+from tests.fit.images.scenes import BOUNDS, distance, images
+
+VOXELS = 48
+
+
+SIZE = {"height": 72, "width": 96}
+"""Pixels narrower than the voxels are wide."""
+
+
+def centres(shape: tuple[int, ...], voxel: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return (np.stack(np.indices(shape), axis=-1) + 0.5) * voxel + BOUNDS[0]
+
+
+def test_states_agree_with_the_true_distance() -> None:
+    seen = observe(images(count=16, **SIZE), VOXELS)
+    assert seen is not None
+    states, voxel = seen.states.numpy(), seen.voxel
+    assert voxel == 1.2 / VOXELS
+    assert states.shape == (48, 32, 32)
+    true = distance(centres(states.shape, voxel).reshape(-1, 3)).reshape(states.shape)
+    half_diagonal = 0.5 * 3.0**0.5 * voxel
+    assert (true[states == FREE] > -voxel).all()
+    # A few rays graze an edge, where tracing stops short.
+    assert (np.abs(true[states == SURFACE]) <= half_diagonal + 1e-6).mean() > 0.998
+    assert (states[true < -2.0 * voxel] == UNSEEN).all()
+    # Seen from all round: hardly any of the outside is left, and most of the surface was met.
+    assert (states[true > 2.0 * voxel] == FREE).mean() > 0.9
+    assert (states[np.abs(true) < 0.2 * voxel] == SURFACE).mean() > 0.8
+
+
+def test_one_view_leaves_its_shadow_unseen() -> None:
+    whole = images(**SIZE)
+    one = replace(
+        whole,
+        colours=whole.colours[:1],
+        intrinsics=whole.intrinsics[:1],
+        T_world_camera=whole.T_world_camera[:1],
+        depths=None if whole.depths is None else whole.depths[:1],
+    )
+    assert one.depths is not None
+    seen = observe(one, VOXELS)
+    assert seen is not None
+    # March along every fourth pixel's ray: free up to a voxel before its end, unseen from a voxel behind it on.
+    rows, columns = np.nonzero(one.depths[0] > 0.0)
+    rows, columns = rows[::4], columns[::4]
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], -1) @ np.linalg.inv(one.intrinsics[0]).T
+    pose = one.T_world_camera[0]
+    ends = one.depths[0][rows, columns].astype(np.float64)
+    diagonal = 3.0**0.5 * seen.voxel
+    for step in (-6.0, -3.0, 3.0, 6.0):
+        z = ends + step * diagonal
+        points = torch.from_numpy((z[:, None] * pixels) @ pose[:3, :3].T + pose[:3, 3])
+        inside = ((points > torch.from_numpy(BOUNDS[0])) & (points < torch.from_numpy(BOUNDS[1]))).all(-1)
+        states = seen.at(points[inside])
+        wanted = FREE if step < 0 else UNSEEN
+        assert len(states) > 20
+        assert float((states == wanted).float().mean()) > 0.85, step
+
+
+def test_background_is_looked_through_and_colours_alone_tell_nothing() -> None:
+    some = images(count=1)
+    assert some.depths is not None
+    nothing_there = replace(some, depths=np.zeros_like(some.depths), masks=np.zeros(some.depths.shape, bool))
+    seen = observe(nothing_there, VOXELS)
+    assert seen is not None
+    assert (seen.states == FREE).float().mean() > 0.5
+    assert not (seen.states == SURFACE).any()
+    assert observe(replace(some, depths=None), VOXELS) is None
+    assert observe(some, 0) is None
+
+
+def test_a_fit_writes_what_was_seen(tmp_path: Path) -> None:
+    options = ReconstructionOptions(iterations=3, observation_voxels=24)
+    reconstruct(images(), FitFiles(tmp_path / "field.safetensors"), options, device="cpu")
+    written, made = observation_of(open_field(tmp_path / "field.safetensors")), observe(images(), 24)
+    assert written is not None
+    assert made is not None
+    torch.testing.assert_close(written.states, made.states)
+    reconstruct(images(), FitFiles(tmp_path / "plain.safetensors"), replace(options, observation_voxels=0))
+    assert observation_of(open_field(tmp_path / "plain.safetensors")) is None
+
+
+def test_voxels_are_no_narrower_than_pixels() -> None:
+    some = images()
+    assert some.depths is not None
+    # On the median surface a pixel is depth / focal length wide.
+    pixel = float(np.median(some.depths[some.depths > 0.0])) / some.intrinsics[0, 0, 0]
+    seen = observe(some, 400)
+    assert seen is not None
+    assert 400 * pixel > 1.2
+    assert abs(seen.voxel / pixel - 1.2) < 1e-6

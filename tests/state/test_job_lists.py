@@ -1,0 +1,180 @@
+"""Jobs' records: caps, order, events and expiry, kept alike by the store in memory and the one in Redis."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from regnf_state.memory import InMemoryRecordStore
+from regnf_state.records import QueueFullError, RecordStore, StaleAttemptError
+from regnf_state.redis.client import connect
+from regnf_state.redis.jobs import RedisRecordStore
+from tests.state.record_makers import field, finished, job, started
+
+# jobs: how many, which, in what order
+
+
+def test_the_cap_counts_active_jobs_only(store: RecordStore) -> None:
+    store.create_job(job(store, "a"), 2)
+    started(store, "b")
+    with pytest.raises(QueueFullError):
+        store.create_job(job(store, "c"), 2)
+    assert store.get_job("c") is None
+    assert store.create_job(job(store, "a"), 2)[1] is False
+    store.update_job("b", 1, status="failed")
+    store.create_job(job(store, "c"), 2)
+    with pytest.raises(QueueFullError):
+        store.create_job(job(store, "b"), 2)
+    assert sorted(record.id for record in store.active_jobs()) == ["a", "c"]
+
+
+def test_the_cap_holds_under_concurrent_requests(store: RecordStore) -> None:
+    def create(number: int) -> bool:
+        try:
+            return store.create_job(job(store, f"j{number}"), 5)[1]
+        except QueueFullError:
+            return False
+
+    with ThreadPoolExecutor(8) as pool:
+        assert sum(pool.map(create, range(20))) == 5
+    assert len(store.active_jobs()) == 5
+
+
+def test_queue_positions_follow_acceptance(store: RecordStore) -> None:
+    for name in ("a", "b", "c"):
+        store.create_job(job(store, name), 10)
+    assert [store.queue_position(name) for name in "abc"] == [1, 2, 3]
+    store.update_job("a", 1, status="running")
+    assert [store.queue_position(name) for name in "abc"] == [None, 1, 2]
+    store.requeue_job("a", 1)
+    assert [store.queue_position(name) for name in "abc"] == [3, 1, 2]
+
+
+def test_listing_pages_through_every_job_once(store: RecordStore) -> None:
+    times = [5.0, 5.0, 7.0, 5.0, 6.0]
+    for number, created in enumerate(times):
+        store.create_job(job(store, f"j{number}", created), 10)
+    expected = ["j2", "j4", "j3", "j1", "j0"]
+    assert [record.id for record in store.list_jobs(None, 10, None)] == expected
+    seen: list[str] = []
+    before = None
+    while page := store.list_jobs(None, 2, before):
+        seen += [record.id for record in page]
+        before = (page[-1].created, page[-1].id)
+    assert seen == expected
+    store.update_job("j4", 1, status="running")
+    assert [record.id for record in store.list_jobs("running", 10, None)] == ["j4"]
+    assert len(store.list_jobs("accepted", 10, None)) == 4
+
+
+def test_long_listings_with_equal_times(store: RecordStore) -> None:
+    for number in range(230):
+        store.create_field(field(store, f"{number:064d}", created=1.0 if number < 215 else float(number)))
+    listed = [record.sha256 for record in store.list_fields(None, 1000, None)]
+    assert listed == [f"{number:064d}" for number in reversed(range(230))]
+
+
+# jobs: events
+
+
+def test_events_tell_every_change_that_shows(store: RecordStore) -> None:
+    started(store)
+    store.update_job("j1", 1, phase="sampling")
+    store.update_job("j1", 1, progress=0.5)
+    store.update_job("j1", 1, engine={"version": "1"})
+    store.heartbeat("j1", 1)
+    store.update_job("j1", 1, status="failed", error={"reason": "NO_SURFACE_IN_OBJECT"})
+    events = store.events("j1", None, 0)
+    assert [event.name for event in events] == ["status", "status", "progress", "progress", "status"]
+    assert [event.data["phase"] for event in events] == [None, "loading", "sampling", "sampling", "sampling"]
+    assert events[3].data["progress"] == 0.5
+    assert events[-1].data["error"] == {"reason": "NO_SURFACE_IN_OBJECT"}
+    assert store.events("j1", events[1].id, 0) == events[2:]
+    assert store.events("j1", events[-1].id, 0) == []
+
+
+def test_waiting_for_events(store: RecordStore) -> None:
+    started(store)
+    last = store.events("j1", None, 0)[-1].id
+    assert store.events("j1", last, 0.05) == []
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(store.events, "j1", last, 30)
+        store.update_job("j1", 1, progress=0.5)
+        assert [event.data["progress"] for event in waiting.result()] == [0.5]
+
+
+@pytest.mark.parametrize("after", ["", "x", "1-x", "-1", "1-2-3", "9" * 30, "1 ", "²"])
+def test_odd_event_ids_are_refused(store: RecordStore, after: str) -> None:
+    started(store)
+    with pytest.raises(ValueError):
+        store.events("j1", after, 0)
+
+
+# jobs: the end
+
+
+def test_deleting(store: RecordStore) -> None:
+    started(store)
+    with pytest.raises(StaleAttemptError):
+        store.delete_job("j1")
+    store.update_job("j1", 1, status="failed")
+    assert store.delete_job("j1")
+    assert store.get_job("j1") is None
+    assert store.events("j1", None, 0) == []
+    assert store.list_jobs(None, 10, None) == []
+    assert not store.job_expired("j1")
+    assert store.create_job(job(store), 10)[0].attempt == 1
+
+
+def test_finished_jobs_expire_and_are_remembered_as_gone_in_memory() -> None:
+    time = [1000.0]
+    store = InMemoryRecordStore(retention_s=60, clock=lambda: time[0])
+    _assert_expiry(store, lambda: time.__setitem__(0, time[0] + 61))
+
+
+def test_finished_jobs_expire_and_are_remembered_as_gone_in_redis(redis_url: str) -> None:
+    with connect(redis_url) as redis:
+        redis.flushall()
+        store = RedisRecordStore(redis, retention_s=2)
+
+        def wait() -> None:
+            gone = threading.Event()
+            while store.get_job("done") is not None:
+                gone.wait(0.05)
+
+        _assert_expiry(store, wait)
+        assert set(redis.keys()) - {b"regnf:job:waiting", b"regnf:job:waiting:events"} == {
+            b"regnf:job:done:gone",
+            b"regnf:jobs:created",
+            b"regnf:jobs:created:anonymous",
+            b"regnf:owner:anonymous:active",
+            b"regnf:figures",
+            b"regnf:jobs:active",
+            b"regnf:jobs:waiting",
+        }
+
+
+def _assert_expiry(store: RecordStore, wait) -> None:  # type: ignore[no-untyped-def]
+    finished(store, "successful", "done")
+    store.create_job(job(store, "waiting"), 10)
+    assert store.expire_jobs() == []
+    assert not store.job_expired("done")
+    wait()
+    assert store.get_job("done") is None
+    assert store.job_expired("done"), "even before anybody cleaned up"
+    assert store.expire_jobs() == ["done"]
+    assert store.expire_jobs() == []
+    assert store.job_expired("done")
+    assert store.get_job("waiting") is not None
+    assert not store.job_expired("waiting")
+    assert [record.id for record in store.list_jobs(None, 10, None)] == ["waiting"]
+
+
+def test_an_expired_job_can_be_asked_for_again() -> None:
+    time = [1000.0]
+    store = InMemoryRecordStore(retention_s=60, clock=lambda: time[0])
+    finished(store, "successful")
+    time[0] += 61
+    assert store.create_job(job(store), 10)[1]
+    assert store.expire_jobs() == []
+    assert not store.job_expired("j1")

@@ -1,0 +1,102 @@
+"""The queue over RQ: ids only, each attempt once, nothing left behind."""
+
+import json
+import zlib
+
+import pytest
+from redis import Redis
+from rq.executions import Execution
+from rq.job import Job
+from rq.serializers import JSONSerializer
+
+from regnf_state.redis.queue import RqJobQueue, attempt_of, import_id, registration_id
+from tests.worker.bench import eventually
+
+SHA = "a" * 64
+
+
+@pytest.fixture
+def queue(redis: Redis) -> RqJobQueue:
+    return RqJobQueue(redis)
+
+
+def test_names_tell_job_and_attempt() -> None:
+    assert registration_id("j-1", 3) == "j-1-3"
+    assert import_id(SHA, 12) == f"import-{SHA}-12"
+    assert [attempt_of(name) for name in ("j-1-3", f"import-{SHA}-12")] == [3, 12]
+
+
+def test_a_job_is_one_id_as_json(redis: Redis, queue: RqJobQueue) -> None:
+    queue.enqueue_registration("j1", 2)
+    queue.enqueue_import(SHA)
+    assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j1-2"]
+    assert redis.lrange("rq:queue:regnf-import", 0, -1) == [f"import-{SHA}-1".encode()]
+    for key, function, argument in (
+        ("rq:job:j1-2", "regnf_worker.jobs.run_registration", "j1"),
+        (f"rq:job:import-{SHA}-1", "regnf_worker.jobs.run_import", SHA),
+    ):
+        data = redis.hget(key, "data")
+        assert data is not None
+        assert json.loads(zlib.decompress(bytes(data))) == [function, None, [argument], {}]
+
+
+def test_every_attempt_is_queued_once(redis: Redis, queue: RqJobQueue) -> None:
+    for _ in range(3):
+        queue.enqueue_registration("j1", 1)
+        queue.enqueue_import(SHA, 2)
+    queue.enqueue_registration("j1", 2)
+    assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j1-1", b"j1-2"]
+    assert redis.llen("rq:queue:regnf-import") == 1
+
+
+def test_what_the_transport_holds(queue: RqJobQueue) -> None:
+    assert not queue.holds_registration("j1", 1)
+    assert not queue.holds_import(SHA, 1)
+    queue.enqueue_registration("j1", 1)
+    queue.enqueue_import(SHA)
+    assert queue.holds_registration("j1", 1)
+    assert not queue.holds_registration("j1", 11)
+    assert queue.holds_import(SHA, 1)
+
+
+def test_work_in_progress_is_held_while_its_worker_reports(redis: Redis, queue: RqJobQueue) -> None:
+    for job_id in ("j1-1", "j2-1"):
+        queue.enqueue_registration(job_id[:2], 1)
+        redis.delete("rq:queue:regnf")
+        with redis.pipeline() as pipeline:
+            job = Job.fetch(job_id, connection=redis, serializer=JSONSerializer)
+            Execution.create(job, 60, pipeline, worker_name="w")
+            pipeline.execute()
+    redis.zadd("rq:wip:regnf", dict.fromkeys(redis.zrange("rq:wip:regnf", 0, -1), 1.0))
+    assert queue.holds_registration("j1", 1), "whatever its worker's clock says"
+    (key,) = redis.keys("rq:execution:j2-1:*")
+    redis.pexpire(key, 1)
+    eventually(lambda: not redis.exists(key))
+    assert not queue.holds_registration("j2", 1), "its worker fell silent"
+    assert queue.holds_registration("j1", 1)
+
+
+def test_an_id_that_fell_between_two_lists_is_queued_anew(redis: Redis, queue: RqJobQueue) -> None:
+    """A worker that dies right after taking an id leaves the job's hash, and the id in no list."""
+    queue.enqueue_registration("j1", 1)
+    redis.delete("rq:queue:regnf")
+    assert not queue.holds_registration("j1", 1)
+    queue.enqueue_registration("j1", 1)
+    assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j1-1"]
+
+
+def test_stopping_a_waiting_job_leaves_nothing_of_it(redis: Redis, queue: RqJobQueue) -> None:
+    queue.enqueue_registration("j1", 1)
+    queue.enqueue_registration("j2", 1)
+    queue.stop("j1", 1)
+    queue.stop("j9", 1)
+    assert redis.lrange("rq:queue:regnf", 0, -1) == [b"j2-1"]
+    assert not redis.exists("rq:job:j1-1")
+
+
+def test_live_workers_are_those_that_reported_lately(redis: Redis, queue: RqJobQueue) -> None:
+    assert queue.live_workers() == 0
+    redis.sadd("rq:workers:regnf", "rq:worker:a", "rq:worker:b", "rq:worker:c")
+    redis.hset("rq:worker:a", "pid", "1")
+    redis.hset("rq:worker:b", mapping={"pid": "2", "death": "2026-01-01"})
+    assert queue.live_workers() == 1

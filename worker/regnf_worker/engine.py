@@ -1,0 +1,158 @@
+"""Where the worker meets regnf_core: files in, files out. torch is loaded by the methods, in a job's own process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from regnf_core import __version__
+from regnf_core.importing.gate.gate import ImportLimits, import_field
+from regnf_core.options import RegistrationOptions
+
+Report = Callable[[str, float], None]
+Importer = Callable[[Path, Path, dict[str, Any]], dict[str, Any]]
+"""(upload, folder, description) -> report; writes folder/field.safetensors, and folder/preview.png if it can.
+
+Raises FieldFormatError."""
+
+
+Model = Any
+"""An object's model, of whatever kind the engine makes: only the engine looks inside."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One object of a search: its field's SHA-256, what opens the safe field file, and its model.
+
+    An object without a model is unusable, for ``fault``, a reason.
+    """
+
+    sha256: str
+    open: Callable[[], Path]
+    model: Model | None
+    fault: str | None = None
+
+
+class RegistrationEngine(Protocol):
+    """Registers safe field files. Everything may raise RegnfError."""
+
+    def describe(self) -> dict[str, Any]:
+        """Version and device, for the job's record."""
+        ...
+
+    def register(
+        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        """Do what a canonical request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
+        ...
+
+    def search(
+        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        """The same for a request with candidates."""
+        ...
+
+    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+        """Write the model of a safe field as an object."""
+        ...
+
+    def read_model(self, path: Path) -> Model:
+        """A model that ``make_model`` wrote."""
+        ...
+
+    def symmetry(self, model: Model) -> dict[str, Any]:
+        """The object's symmetry as the contract shows it."""
+        ...
+
+
+@dataclass(frozen=True)
+class CoreEngine:
+    """The engine of regnf_core on one device."""
+
+    device: str
+
+    @classmethod
+    def on(cls, choice: Literal["auto", "cpu", "cuda"]) -> CoreEngine:
+        """``auto``: the GPU if torch can use one, else the CPU."""
+        import torch
+
+        return cls(("cuda" if torch.cuda.is_available() else "cpu") if choice == "auto" else choice)
+
+    def describe(self) -> dict[str, Any]:
+        return {"version": __version__, "device": self.device}
+
+    def register(
+        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        from regnf_core.fields.safe_format import open_field
+        from regnf_core.geometry.box import OrientedBox
+        from regnf_core.geometry.sim3 import Sim3
+        from regnf_core.registration import register
+        from regnf_core.viewing import write_artifacts
+
+        start, truth = request.get("initial_transform"), request.get("ground_truth")
+        result = register(
+            open_field(scene, self.device),
+            open_field(object_, self.device),
+            OrientedBox.from_quaternion(**request["detection"]),
+            RegistrationOptions.from_dict(request["options"]),
+            request["seed"],
+            report,
+            Sim3.from_matrix(start) if start else None,
+            model,
+        )
+        report("exporting", 0.95)
+        T_true = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
+        names: list[str] = write_artifacts(result, folder, truth=T_true, object_name=request["object"])
+        return names
+
+    def search(
+        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+    ) -> list[str]:
+        from regnf_core.fields.safe_format import open_field
+        from regnf_core.geometry.box import OrientedBox
+        from regnf_core.library import LibraryObject, search_library
+        from regnf_core.viewing import ranking_document, write_artifacts
+
+        def opener(one: Candidate) -> Callable[[], Any]:
+            return lambda: open_field(one.open(), self.device)
+
+        unusable = {one.sha256: one.fault for one in candidates if one.fault is not None}
+        found = search_library(
+            open_field(scene, self.device),
+            OrientedBox.from_quaternion(**request["detection"]),
+            [LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None],
+            RegistrationOptions.from_dict(request["options"]),
+            request["seed"],
+            report,
+        )
+        report("exporting", 0.95)
+        winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
+        names: list[str] = write_artifacts(found.result, folder, object_name=winner, candidates=ranking)
+        return names
+
+    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+        from regnf_core.fields.safe_format import open_field
+        from regnf_core.library import model_object, write_object_model
+
+        robust = RegistrationOptions.from_dict(options).robust
+        write_object_model(target, model_object(open_field(field, self.device), robust))
+
+    def read_model(self, path: Path) -> Model:
+        from regnf_core.library import read_object_model
+
+        return read_object_model(path)
+
+    def symmetry(self, model: Model) -> dict[str, Any]:
+        return asdict(model.symmetry.group())
+
+
+def core_importer(limits: ImportLimits) -> Importer:
+    """The import gate of regnf_core within ``limits``."""
+
+    def run(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+        return import_field(upload, folder, description or None, limits, picture=True).to_dict()
+
+    return run

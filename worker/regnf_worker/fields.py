@@ -1,0 +1,59 @@
+"""The fields that a job reads: waited for until their import has ended, then files for as long as the job runs."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from regnf_core.errors import InvalidInputError
+from regnf_state.ownership import sha256_of
+from regnf_state.records import FieldRecord
+from regnf_worker.context import Context
+from regnf_worker.pulse import Pulse
+
+_POLL_S = 0.2
+_WAIT_BEFORE_GIVING_BACK_S = 20.0
+
+
+class FieldsNotReadyError(Exception):
+    """A field is still being imported; whoever waits longer should let somebody else use the worker."""
+
+
+class Fields:
+    """Fields of one job. Whatever is opened stays open until ``stack`` closes."""
+
+    def __init__(self, context: Context, pulse: Pulse, stack: ExitStack) -> None:
+        self._context = context
+        self._pulse = pulse
+        self._stack = stack
+        self._deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
+
+    def ready(self, sha256: str) -> FieldRecord:
+        """The field's record, once its import has ended.
+
+        Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
+        """
+        while (field := self._usable(sha256)).state == "validating":
+            self._pulse.check()
+            if time.monotonic() > self._deadline:
+                raise FieldsNotReadyError(sha256)
+            time.sleep(_POLL_S)
+        return field
+
+    def file(self, sha256: str) -> Path:
+        """The safe field file of a field that is ready."""
+        return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
+
+    def _usable(self, sha256: str) -> FieldRecord:
+        field, name = self._context.records.get_field(sha256), sha256_of(sha256)
+        if field is None:
+            raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
+        if field.state == "rejected":
+            why = (field.error or {}).get("reason", "unknown")
+            raise InvalidInputError(f"field {name} was rejected: {why}", reason="FIELD_REJECTED")
+        settings = self._context.settings
+        longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
+        if field.state == "validating" and self._context.records.now() - field.updated > longest:
+            raise InvalidInputError(f"field {name} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
+        return field

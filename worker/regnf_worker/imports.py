@@ -1,0 +1,137 @@
+"""One attempt at importing an upload: a safe field and a report, or a reason why not."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from redis.exceptions import RedisError
+from rq.timeouts import JobTimeoutException
+
+from regnf_core.errors import RegnfError
+from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.records import FieldRecord, StaleAttemptError
+from regnf_worker.context import Context
+from regnf_worker.engine import Importer
+from regnf_worker.patience import patiently
+from regnf_worker.problems import are_files_away, fault, new_incident, problem
+
+_CLAIM_KEPT_S = 24 * 3600
+logger = logging.getLogger(__name__)
+
+
+def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bool:
+    """Whether this attempt at the import is this worker's: of several that ask, the first one's."""
+    return context.records.remember(f"import:{sha256}:{attempt}", worker, _CLAIM_KEPT_S) == worker
+
+
+def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
+    """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
+
+    The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
+    record, or one that has ended and an original of their own. Writes that Redis refuses for a while are waited for,
+    until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down, and
+    OSError when a volume is away.
+    """
+    field = context.records.get_field(sha256)
+    if field is None or field.attempt != attempt or field.state != "validating":
+        logger.info("import %s attempt %d is not run", sha256, attempt)
+        return
+    if not patiently(f"the record of import {sha256}", lambda: claim_import(context, sha256, attempt, worker)):
+        logger.info("import %s attempt %d is somebody else's", sha256, attempt)
+        return
+    try:
+        report = _standing_report(context, field) or _work(context, field, importer)
+    except (RedisError, StorageUnavailableError):
+        raise
+    except RegnfError as error:
+        _refuse(context, sha256, attempt, problem(error.reason, str(error)))
+    except StaleAttemptError as error:
+        _retire(context, sha256, attempt, error)
+    except JobTimeoutException:
+        _refuse(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
+    except Exception as error:
+        if are_files_away(error):
+            raise
+        incident = new_incident()
+        logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
+        _refuse(context, sha256, attempt, fault(error, incident))
+    else:
+        context.blobs.delete(_original(sha256))
+        patiently(
+            f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=report)
+        )
+
+
+def _refuse(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
+    patiently(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error))
+
+
+def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
+    """Drop everything the upload left and say why. Does nothing to a field that has moved on."""
+    field = context.records.get_field(sha256)
+    if field is not None and field.attempt == attempt and field.state == "validating":
+        context.blobs.delete_prefix(f"fields/{sha256}")
+        _end(context, sha256, attempt, state="rejected", error=error)
+
+
+def _original(sha256: str) -> str:
+    return f"fields/{sha256}/original"
+
+
+def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
+    try:
+        context.records.update_field(sha256, attempt=attempt, **changes)
+    except StaleAttemptError as error:
+        _retire(context, sha256, attempt, error)
+    else:
+        logger.info("import %s attempt %d ended: %s", sha256, attempt, changes["state"])
+
+
+def _retire(context: Context, sha256: str, attempt: int, error: StaleAttemptError) -> None:
+    logger.info("import %s attempt %d has no say any more: %s", sha256, attempt, error)
+    if context.records.get_field(sha256) is None:
+        context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
+
+
+def _standing_report(context: Context, field: FieldRecord) -> dict[str, Any] | None:
+    """What an earlier attempt found that died before it could say so, if it took the file for the same function."""
+    try:
+        with context.blobs.open(_report(field.sha256)) as file:
+            standing: dict[str, Any] = json.load(file)
+    except FileNotFoundError:
+        return None
+    report: dict[str, Any] = standing["report"]
+    return report if standing["description"] == field.description else None
+
+
+def _report(sha256: str) -> str:
+    return f"fields/{sha256}/report.json"
+
+
+def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str, Any]:
+    """Import the upload. Raises StaleAttemptError, nothing stored, when the field was deleted meanwhile."""
+    sha256, description = field.sha256, field.description
+    with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(_original(sha256)) as upload:
+        folder = Path(temporary)
+        report: dict[str, Any] = importer(upload, folder, description)
+        _require_current(context, field)
+        if (folder / PICTURE_NAME).exists():
+            context.blobs.put(f"fields/{sha256}/{PICTURE_NAME}", (folder / PICTURE_NAME).read_bytes())
+        with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
+            while chunk := source.read(1 << 20):
+                writer.write(chunk)
+            writer.commit(f"fields/{sha256}/field.safetensors")
+    context.blobs.put(_report(sha256), json.dumps({"description": description, "report": report}).encode())
+    return report
+
+
+def _require_current(context: Context, field: FieldRecord) -> None:
+    """Somebody may have deleted the field, and uploaded it anew: what lies there now is no longer ours to touch."""
+    now = context.records.get_field(field.sha256)
+    if now is None or now.attempt != field.attempt or now.state != "validating":
+        raise StaleAttemptError("the field was deleted or is imported anew")

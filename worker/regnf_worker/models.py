@@ -1,0 +1,87 @@
+"""What registrations know of an object beforehand: its model, made by the first of them and kept beside its field."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from redis.exceptions import RedisError
+
+from regnf_core.errors import RegnfError
+from regnf_core.options import RegistrationOptions
+from regnf_state.records import FieldRecord, StaleAttemptError
+from regnf_worker.context import Context
+from regnf_worker.engine import Model, RegistrationEngine
+
+logger = logging.getLogger(__name__)
+
+
+def model_key(sha256: str) -> str:
+    """Where an object's model lies."""
+    return f"fields/{sha256}/object-model-1.safetensors"
+
+
+class ObjectModels:
+    """Models for one request's options. A kept file that does not read is made again; nothing else is believed of it.
+
+    Only models by the default options are kept: others are made for the job alone, in ``folder``.
+    """
+
+    def __init__(self, context: Context, engine: RegistrationEngine, options: dict[str, Any], folder: Path) -> None:
+        self._context = context
+        self._engine = engine
+        self._options = options
+        self._folder = folder
+        self._kept = kept_by_default(options)
+
+    def of(self, field: FieldRecord, open_field: Callable[[], Path]) -> Model:
+        """The model of a field; ``open_field`` is called if it must be made. Raises RegnfError when it cannot be."""
+        model = self._read(field) if self._kept else None
+        if model is None:
+            model = self._make(field, open_field())
+        if self._kept and field.symmetry is None:
+            self._tell_symmetry(field, model)
+        return model
+
+    def _read(self, field: FieldRecord) -> Model | None:
+        with suppress(FileNotFoundError), self._context.blobs.local_copy(model_key(field.sha256)) as path:
+            try:
+                return self._engine.read_model(path)
+            except RegnfError as error:
+                logger.warning("the model of %s is made again: %s", field.sha256, error)
+                self._context.blobs.delete(model_key(field.sha256))
+        return None
+
+    def _make(self, field: FieldRecord, path: Path) -> Model:
+        """Written and read back: the first job must find what all others will."""
+        made = self._folder / f"model-{field.sha256}.safetensors"
+        self._engine.make_model(path, self._options, made)
+        model = self._engine.read_model(made)
+        if self._kept:
+            self._keep(field, made.read_bytes())
+        made.unlink()
+        return model
+
+    def _keep(self, field: FieldRecord, data: bytes) -> None:
+        now = self._context.records.get_field(field.sha256)
+        if now is None or now.attempt != field.attempt:
+            return  # deleted while the job was at it, and perhaps uploaded as another function
+        self._context.blobs.put_if_absent(model_key(field.sha256), data)
+
+    def _tell_symmetry(self, field: FieldRecord, model: Model) -> None:
+        symmetry = self._engine.symmetry(model)
+        try:
+            self._context.records.update_field(field.sha256, attempt=field.attempt, symmetry=symmetry)
+        except StaleAttemptError:
+            logger.info("field %s is gone: nobody to tell its symmetry", field.sha256)
+        except RedisError as error:
+            logger.warning("the symmetry of %s goes untold: %s", field.sha256, error)
+
+
+def kept_by_default(options: dict[str, Any]) -> bool:
+    """Whether the options ask for the model that is kept: the number of its samples is all they have a say in."""
+    asked: int = options["robust"]["object_samples"]
+    return asked == RegistrationOptions().robust.object_samples

@@ -1,0 +1,159 @@
+"""The worker process: takes ids from the queue and forks a child for each, which it outlives, limits and settles.
+
+RQ's forking worker, with what it lacks: children die with it, time limits hold against native code, a Redis that is
+full or away does not end it, and a child's death never leaves a record that says it runs. It never loads torch itself:
+a parent that has run a torch operation hangs its forked children.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+from redis.exceptions import RedisError
+from rq.exceptions import StopRequested
+from rq.serializers import JSONSerializer
+
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import attempt_of
+from regnf_worker import kernel
+from regnf_worker.bookkeeping import PatientWorker
+from regnf_worker.context import Context
+from regnf_worker.scratch import Scratch
+from regnf_worker.settle import HorseEnd, settle_import, settle_registration
+
+_IDLE_REPORT_S = 30
+_LATE_GRACE_S = 10.0
+"""After its time limit a job has this long to write down that it was too slow; then it is killed."""
+_IMPORT_MARGIN_S = 30
+
+
+class RegnfWorker(PatientWorker):
+    """One worker of the service. ``monitor_s`` is how often it looks after the child it runs."""
+
+    def __init__(self, context: Context, scratch: Scratch, monitor_s: int = 1) -> None:
+        assert context.settings.redis_url is not None
+        super().__init__(
+            [IMPORT_QUEUE_NAME, QUEUE_NAME],
+            connection=connect(context.settings.redis_url, retries=20),
+            serializer=JSONSerializer,
+            worker_ttl=_IDLE_REPORT_S,
+            job_monitoring_interval=monitor_s,
+            log_job_description=False,
+        )
+        self._context = context
+        self._scratch = scratch
+        self._settlers: dict[str, Callable[[Context, str, int, str, HorseEnd], None]] = {
+            IMPORT_QUEUE_NAME: settle_import,
+            QUEUE_NAME: settle_registration,
+        }
+        self._limits = {
+            IMPORT_QUEUE_NAME: context.settings.import_timeout_s + _IMPORT_MARGIN_S,
+            QUEUE_NAME: context.settings.job_timeout_s,
+        }
+        self._started = 0.0
+        self._limit_s = 0.0
+        self._begun = False
+        self._exit_status: int | None = None
+        self._late = False
+        self._give_back_at: float | None = None
+        self._given_back = False
+
+    def serve(self) -> None:
+        """Work until told to stop, be it while starting."""
+        signal.signal(signal.SIGINT, self.request_stop)
+        signal.signal(signal.SIGTERM, self.request_stop)
+        try:
+            self.work(logging_level=None)
+        except StopRequested:
+            self.teardown()
+
+    # one job
+
+    def execute_job(self, job: Any, queue: Any) -> None:
+        job.timeout = self._limit_s = self._limits[queue.name]
+        self._started, self._exit_status = time.monotonic(), None
+        self._begun = self._late = self._given_back = False
+        oom_kills = kernel.oom_kills()
+        try:
+            super().execute_job(job, queue)
+        finally:
+            self._scratch.empty()
+            if self._begun and self._horse_pid == 0:
+                self._settle(job, queue, kernel.oom_kills() > oom_kills)
+            # one that was taken and not begun is in no queue any more: the reaper puts it back
+
+    def _settle(self, job: Any, queue: Any, out_of_memory: bool) -> None:
+        status = self._exit_status
+        killed = status is not None and os.WIFSIGNALED(status)
+        end = HorseEnd(
+            signal=os.WTERMSIG(status) if killed and status is not None else None,
+            late=self._late or time.monotonic() - self._started >= self._limit_s,
+            out_of_memory=out_of_memory,
+            given_back=self._given_back,
+        )
+        settle = self._settlers[queue.name]
+
+        def write_down() -> None:
+            try:
+                self._patiently(
+                    f"settling job {job.id}",
+                    lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
+                )
+            except (RedisError, OSError) as error:
+                self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
+
+        if self._context.settings.storage_url is None:
+            write_down()
+        elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
+            self.log.error("job %s could not be settled: the process that should have has died", job.id)
+
+    def fork_work_horse(self, job: Any, queue: Any) -> None:
+        parent = os.getpid()
+        child = os.fork()
+        if child == 0:
+            os.setpgrp()
+            kernel.die_with_parent(parent)
+            kernel.offer_to_the_oom_killer()
+            self._scratch.use()
+            self.main_work_horse(job, queue)
+            os._exit(0)
+        self._horse_pid, self._begun = child, True
+
+    def monitor_work_horse(self, job: Any, queue: Any) -> None:
+        """The limit is kept here, by a clock that nobody steps: RQ would count by the wall clock, and kill by it."""
+        job.timeout = -1
+        super().monitor_work_horse(job, queue)
+
+    def wait_for_horse(self) -> tuple[int | None, int | None, Any]:
+        pid, status, usage = super().wait_for_horse()
+        if pid:
+            self._exit_status = status
+        return pid, status, usage
+
+    def maintain_heartbeats(self, job: Any) -> None:
+        """Called every ``monitor_s`` while the child runs."""
+        now = time.monotonic()
+        if now - self._started > self._limit_s + _LATE_GRACE_S:
+            self._late = True
+            self.kill_horse()
+        elif self._give_back_at is not None and now >= self._give_back_at:
+            self._given_back = True
+            self.kill_horse()
+        super().maintain_heartbeats(job)
+
+    # the worker itself
+
+    def request_stop(self, signum: int, frame: FrameType | None) -> None:
+        """Told to stop: a running job has ``shutdown_grace_s`` to end, then goes back to the queue."""
+        self._give_back_at = time.monotonic() + self._context.settings.shutdown_grace_s
+        super().request_stop(signum, frame)  # type: ignore[no-untyped-call]
+
+    def request_force_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
+        """Told to stop again: at once."""
+        self._give_back_at = time.monotonic()

@@ -1,0 +1,165 @@
+"""One attempt at a registration job, from its claim to its end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from redis.exceptions import RedisError
+
+from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
+from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.logs import log_context
+from regnf_state.ownership import sha256_of
+from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
+from regnf_worker.artifacts import (
+    Manifest,
+    discard,
+    discard_others,
+    publish,
+    read_manifest,
+    store_artifacts,
+    verdict_of,
+)
+from regnf_worker.context import Context
+from regnf_worker.engine import Candidate, RegistrationEngine
+from regnf_worker.fields import Fields, FieldsNotReadyError
+from regnf_worker.models import ObjectModels
+from regnf_worker.patience import patiently
+from regnf_worker.problems import are_files_away, fault, new_incident, problem
+from regnf_worker.pulse import Pulse
+
+logger = logging.getLogger(__name__)
+
+
+def run_attempt(
+    context: Context, job_id: str, attempt: int, worker: str, make_engine: Callable[[], RegistrationEngine]
+) -> None:
+    """Claim the attempt, do its work with the engine, write down how it ended.
+
+    Does nothing when the attempt is not to be had: claimed already, cancelled, or an older one. Writes that Redis
+    refuses for a while are waited for, until the job's time is over. Raises RedisError, StorageUnavailableError and
+    OSError when the end cannot be written down, or a volume is away; the worker's parent process then sees to it.
+    """
+    try:
+        record = _update(context, job_id, attempt, status="running", phase="loading", worker=worker)
+    except StaleAttemptError as error:
+        logger.info("job %s attempt %d is not run: %s", job_id, attempt, error)
+        return
+    with log_context(job_id=job_id, attempt=attempt, caller=record.owner):
+        _run(context, record, make_engine)
+
+
+def _run(context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine]) -> None:
+    job_id, attempt = record.id, record.attempt
+    logger.info("job %s attempt %d runs", job_id, attempt)
+    with Pulse(context.records, job_id, attempt, context.settings.heartbeat_s) as pulse:
+        try:
+            manifest = read_manifest(context.blobs, job_id) or _work(context, record, make_engine, pulse)
+        except (CancelledError, StaleAttemptError):
+            discard(context.blobs, job_id, attempt)
+            _end(context, job_id, attempt, status="dismissed")
+        except FieldsNotReadyError:
+            _give_back(context, job_id, attempt)
+        except (RedisError, StorageUnavailableError):
+            raise
+        except RegnfError as error:
+            _fail(context, job_id, attempt, problem(error.reason, str(error)))
+        except Exception as error:
+            if are_files_away(error):
+                raise
+            incident = new_incident()
+            logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
+            _fail(context, job_id, attempt, fault(error, incident))
+        else:
+            _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, job_id, manifest))
+            discard_others(context.blobs, job_id, manifest)
+
+
+def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+    return patiently(f"the record of job {job_id}", lambda: context.records.update_job(job_id, attempt, **changes))
+
+
+def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
+    try:
+        _update(context, job_id, attempt, **changes)
+    except StaleAttemptError as error:
+        logger.info("job %s attempt %d has no say any more: %s", job_id, attempt, error)
+    else:
+        logger.info("job %s attempt %d ended: %s", job_id, attempt, changes["status"])
+
+
+def _fail(context: Context, job_id: str, attempt: int, error: dict[str, Any]) -> None:
+    discard(context.blobs, job_id, attempt)
+    _end(context, job_id, attempt, status="failed", error=error)
+
+
+def _give_back(context: Context, job_id: str, attempt: int) -> None:
+    with suppress(StaleAttemptError):
+        again = patiently(
+            f"the record of job {job_id}", lambda: context.records.requeue_job(job_id, attempt, lost=False)
+        )
+        context.queue.enqueue_registration(job_id, again.attempt)
+        logger.info("job %s attempt %d given back: its fields are still being imported", job_id, attempt)
+
+
+def _work(context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine], pulse: Pulse) -> Manifest:
+    """The job's result, standing. Raises whatever kept it from standing."""
+    request = record.request
+    with ExitStack() as stack:
+        fields = Fields(context, pulse, stack)
+        scene = fields.ready(request["scene"])
+        objects = [fields.ready(sha256) for sha256 in request.get("candidates") or [request["object"]]]
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
+        engine = make_engine()
+        _update(context, record.id, record.attempt, engine=engine.describe())
+        names = _register(context, engine, request, fields, scene, objects, pulse, folder)
+        pulse.confirm()
+        manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)
+    pulse.confirm()
+    if publish(context.blobs, record.id, manifest):
+        return manifest
+    standing = read_manifest(context.blobs, record.id)
+    assert standing is not None, "a manifest is never taken back while its job runs"
+    return standing
+
+
+def _register(
+    context: Context,
+    engine: RegistrationEngine,
+    request: dict[str, Any],
+    fields: Fields,
+    scene: FieldRecord,
+    objects: Sequence[FieldRecord],
+    pulse: Pulse,
+    folder: Path,
+) -> list[str]:
+    """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
+    options, scene_file = request["options"], fields.file(scene.sha256)
+    if request.get("candidates"):
+        models = ObjectModels(context, engine, options, folder)
+        candidates = [_candidate(models, one, fields, pulse) for one in objects]
+        if all(one.model is None for one in candidates):
+            raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+        return engine.search(scene_file, candidates, request, pulse.report, folder)
+    (one,) = objects
+    object_file, model = fields.file(one.sha256), None
+    if options.get("preset") == "robust":
+        model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
+    asked = request | {"object": sha256_of(one.sha256)}
+    return engine.register(scene_file, object_file, model, asked, pulse.report, folder)
+
+
+def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, pulse: Pulse) -> Candidate:
+    """One candidate with its model; one that is no object is unusable, not the end of the search."""
+    pulse.report("loading", 0.0)
+    sha256 = field.sha256
+    try:
+        model = models.of(field, lambda: fields.file(sha256))
+    except (NoSurfaceError, InvalidInputError) as error:
+        return Candidate(sha256_of(sha256), lambda: fields.file(sha256), None, error.reason)
+    return Candidate(sha256_of(sha256), lambda: fields.file(sha256), model)

@@ -1,0 +1,111 @@
+"""What becomes of a record whose process has ended without writing down how: decided by the worker that outlived it."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_state.records import ACTIVE, JobRecord, StaleAttemptError
+from regnf_worker.artifacts import discard, read_manifest, verdict_of
+from regnf_worker.context import Context
+from regnf_worker.imports import claim_import, reject
+from regnf_worker.problems import problem
+
+logger = logging.getLogger(__name__)
+_FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
+"""What a process does not do to itself; other signals, a segmentation fault say, would come again."""
+_DETAILS = {
+    "WORKER_LOST": "The process that did the work was killed. Send the request again.",
+    "INTERNAL": "A fault of ours: the process that did the work ended without a word. The log has more under its id.",
+}
+
+
+@dataclass(frozen=True)
+class HorseEnd:
+    """How a job's process ended: by which signal, if by one, and what the worker knows about why."""
+
+    signal: int | None = None
+    late: bool = False
+    out_of_memory: bool = False
+    given_back: bool = False
+    """The worker itself was told to stop and took its job down with it."""
+
+    @property
+    def worth_another_try(self) -> bool:
+        """It ended for want of Redis or storage, as a rule, or was killed from outside; not too slow, not too large."""
+        return not self.late and (self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory))
+
+    def reason(self) -> str:
+        if self.late:
+            return "JOB_TIMEOUT"
+        if self.out_of_memory and self.signal == signal.SIGKILL:
+            return "OUT_OF_MEMORY"
+        return "WORKER_LOST" if self.signal is not None else "INTERNAL"
+
+
+def settle_registration(context: Context, job_id: str, attempt: int, worker: str, end: HorseEnd) -> None:
+    """See that the record of a job whose process is gone does not go on saying it runs.
+
+    A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
+    that was killed, or ended by itself for want of Redis or storage, is granted one more attempt; everything else has
+    failed.
+    """
+    record = context.records.get_job(job_id)
+    if record is None or record.attempt != attempt or record.status not in ACTIVE:
+        return
+    try:
+        if record.status == "accepted":  # it died before it could claim its job
+            record = context.records.update_job(job_id, attempt, status="running", worker=worker)
+        if record.worker != worker:
+            return  # handed out twice, and the other one has it
+        _settle(context, record, end)
+    except StaleAttemptError as error:
+        logger.info("job %s attempt %d: somebody else has settled it: %s", job_id, attempt, error)
+
+
+def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
+    job_id, attempt = record.id, record.attempt
+    manifest = read_manifest(context.blobs, job_id)
+    if manifest is not None:
+        verdict = verdict_of(context.blobs, job_id, manifest)
+        context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
+        return
+    discard(context.blobs, job_id, attempt)
+    changes: dict[str, Any]
+    if record.cancel_requested:
+        changes = {"status": "dismissed"}
+    elif end.given_back or (end.worth_another_try and record.requeues == 0):
+        again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
+        context.queue.enqueue_registration(job_id, again.attempt)
+        logger.warning("job %s attempt %d is to be run again", job_id, attempt)
+        return
+    else:
+        changes = {"status": "failed", "error": _problem(end)}
+    context.records.update_job(job_id, attempt, **changes)
+    logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
+
+
+def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: HorseEnd) -> None:
+    """The same for an import: one that was given back, killed, or ended by itself starts anew; others are rejected."""
+    field = context.records.get_field(sha256)
+    if field is None or field.attempt != attempt or field.state != "validating":
+        return
+    if not claim_import(context, sha256, attempt, worker):
+        return
+    if end.given_back or (end.worth_another_try and field.requeues == 0):
+        try:
+            again = context.records.retry_import(sha256, attempt, lost=not end.given_back)
+        except StaleAttemptError:
+            return
+        context.queue.enqueue_import(sha256, again.attempt)
+        return
+    logger.warning("import %s attempt %d: its process is gone (%s)", sha256, attempt, end)
+    reason = end.reason()
+    reject(context, sha256, attempt, problem("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
+
+
+def _problem(end: HorseEnd) -> dict[str, Any]:
+    reason = end.reason()
+    return problem(reason, _DETAILS.get(reason))
