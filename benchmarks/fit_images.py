@@ -45,7 +45,7 @@ _NEAR_SEEN_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Figures:
-    """Lengths in millimetres. errors: of the field's surface where it was seen, of the seen surface to the field's, and
+    """Lengths in millimeters. errors: of the field's surface where it was seen, of the seen surface to the field's, and
     of the depths that it was fitted to."""
 
     diameter: float
@@ -68,7 +68,7 @@ def measure(images: PosedImages, scene: MeshScene, path: Path) -> Figures:
     rng = np.random.default_rng(0)
     T = images.T_metric_world
     T_world_metric: Floats = np.linalg.inv(T).astype(np.float64)
-    millimetres = 1000.0 * float(np.cbrt(np.linalg.det(T[:3, :3])))
+    millimeters = 1000.0 * float(np.cbrt(np.linalg.det(T[:3, :3])))
     field = open_field(path)
     seen, free, read = _seen(images, scene, rng)
     near = min(_NEAR_SEEN_M, _NEAR_SEEN_SHARE * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])))
@@ -78,7 +78,7 @@ def measure(images: PosedImages, scene: MeshScene, path: Path) -> Figures:
     beside = sampled[cKDTree(seen).query(sampled)[0] < near][:_POINTS]
     chosen = seen[rng.permutation(len(seen))[:_POINTS]]
     out = 1000.0 * np.abs(scene.signed_distance(beside))
-    back = millimetres * distances_to(mesh, moved(chosen, T_world_metric))
+    back = millimeters * distances_to(mesh, moved(chosen, T_world_metric))
     distance = field.signed_distance(torch.from_numpy(moved(free, T_world_metric)).float()).numpy()
     return Figures(
         diameter=1000.0 * float(np.linalg.norm(scene.bounds[1] - scene.bounds[0])),
@@ -87,7 +87,7 @@ def measure(images: PosedImages, scene: MeshScene, path: Path) -> Figures:
         to_field=_mean(back),
         to_field_p95=_p95(back),
         depths=float(1000.0 * np.abs(scene.signed_distance(read)).mean()),
-        free_distance=float(np.abs(millimetres * distance - 1000.0 * scene.signed_distance(free)).mean()),
+        free_distance=float(np.abs(millimeters * distance - 1000.0 * scene.signed_distance(free)).mean()),
         false_matter=float((distance < 0.0).mean()),
         pieces=measure_pieces(images, scene, field, seen) if len(scene.things) > 1 else (),
     )
@@ -172,7 +172,7 @@ def _table(rows: list[tuple[str, int, dict[str, Any], Figures]]) -> str:
         f"{platform.system()} {platform.machine()}, {threads} of {cpu_count()} cores,",
         f"Python {platform.python_version()}",
         "",
-        "Errors in millimetres, mean and 95th percentile, where the surface was seen; of objects in per cent of the",
+        "Errors in millimeters, mean and 95th percentile, where the surface was seen; of objects in per cent of the",
         "diameter too. Depths: mean error of the depths fitted to. Free: mean error of the distance at points seen to",
         "be free, and the share of them that the field takes for matter. PSNR: on held-out pixels.",
         "",
@@ -196,7 +196,7 @@ def _piece_lines(rooms: dict[str, tuple[Piece, ...]]) -> list[str]:
         return []
     lines = [
         "",
-        "Of the furniture alone, in millimetres. Beyond: the share of the field's surface more than 5 cm from the true",
+        "Of the furniture alone, in millimeters. Beyond: the share of the field's surface more than 5 cm from the true",
         "scene, left out of the mean. Missing: the share of the seen surface more than 5 cm from the field's.",
         "",
         "| room | piece | from the field | to the field | beyond | missing |",

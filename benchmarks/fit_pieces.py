@@ -1,6 +1,6 @@
 """How well a room's fitted field follows each piece of furniture in it.
 
-A piece is what lies in an instance's box, 2 cm above the floor and up. Lengths are millimetres. A field has a surface
+A piece is what lies in an instance's box, 2 cm above the floor and up. Lengths are millimeters. A field has a surface
 round what no camera saw as well, under a seat for instance: what lies more than 5 cm from the true scene is counted on
 its own, and left out of the mean.
 """

@@ -36,7 +36,7 @@ from tests.worker.bench import children_of
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HERE = Path(__file__).resolve().parent
-_ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
+_ENDLESS = {"preset": "paper", "optimization": {"iterations": 10_000, "stop_residual": 0.0}}
 _SPARE_FIELDS = 4
 SETTINGS: dict[str, object] = {
     "threads": 1,

@@ -30,7 +30,7 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
         {
             "FIELD_NOT_FOUND",  # which fields there are
             "FIELD_REJECTED",
-            "FIELD_NOT_RECOGNISED",  # what a file's bytes say
+            "FIELD_NOT_RECOGNIZED",  # what a file's bytes say
             "FIELD_DESCRIPTION_DIFFERS",
             "INVALID_DETECTION",  # min below max, a quaternion that is not zero
             "DETECTION_OUTSIDE_SCENE",
@@ -44,9 +44,9 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
         }
     ),
     "POST /fields": frozenset(
-        {"FIELD_NOT_RECOGNISED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"}
+        {"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"}
     ),
-    "PUT /fields/{sha256}": frozenset({"FIELD_NOT_RECOGNISED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS"}),
+    "PUT /fields/{sha256}": frozenset({"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS"}),
     "GET /fields": frozenset({"INVALID_PAGE_TOKEN"}),
     "GET /jobs": frozenset({"INVALID_PAGE_TOKEN"}),
 }

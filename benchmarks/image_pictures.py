@@ -25,14 +25,14 @@ from regnf_core.geometry.nearest_neighbors import gaps
 from regnf_core.robust.samples import sample_scene_surface
 from regnf_core.robust.working_frame import WorkingFrame
 from regnf_core.schema.kinds.observation_grid import SURFACE
-from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR
+from regnf_core.viewing.preview import OBJECT_COLOR, SCENE_COLOR
 from regnf_core.viewing.splats import Surfels, render, view_from
 
 Floats = NDArray[np.float64]
 
 _INVENTED = np.array([0.85, 0.30, 0.22])
 _GROUND = np.array([0.975, 0.975, 0.97])
-_INK, _GREY = (52, 56, 62), (120, 124, 130)
+_INK, _GRAY = (52, 56, 62), (120, 124, 130)
 _PANEL, _CAPTION, _SUPERSAMPLING, _SAMPLES = 360, 50, 2, 60_000
 _FROM = np.array([0.9, -1.2, 0.8])
 
@@ -62,8 +62,8 @@ def row(pair: Pair, title: str) -> Image.Image:
     surface, frame = _surface(pair)
     measured = _measured(pair, surface)
     placed = _placed(result, result.T_object_scene if result.verdict != "rejected" else case.truth, frame)
-    seen = _cloud(surface, measured, SCENE_COLOUR)
-    framed = Surfels.join(_cloud(surface, np.ones_like(measured), SCENE_COLOUR), placed)
+    seen = _cloud(surface, measured, SCENE_COLOR)
+    framed = Surfels.join(_cloud(surface, np.ones_like(measured), SCENE_COLOR), placed)
     everything = Surfels.join(seen, _cloud(surface, ~measured, _INVENTED))
     error = errors_against_truth(result.T_object_scene, case.truth, result.object_samples.points, case.symmetries)
     found = f"{result.verdict}, off by {100 * error['mssd_share']:.1f} % at most"
@@ -88,7 +88,7 @@ def _surface(pair: Pair) -> tuple[Floats, WorkingFrame]:
 def _measured(pair: Pair, surface: Floats) -> NDArray[np.bool_]:
     seen = observation_of(pair.case().scene)
     assert seen is not None
-    frame = WorkingFrame(pair.detection.centre.double(), pair.detection.diagonal)
+    frame = WorkingFrame(pair.detection.center.double(), pair.detection.diagonal)
     states = seen.seen_in(frame.to_field()).at(torch.from_numpy(surface[:, :3]))
     measured: NDArray[np.bool_] = (states == SURFACE).numpy()
     return measured
@@ -99,12 +99,12 @@ def _placed(result: RegistrationResult, T_object_scene: Sim3, frame: WorkingFram
     T = frame.to_field().inverse() @ T_object_scene.inverse()
     obj = result.object_samples
     points, normals = T.apply(obj.points.double()), obj.normals.double() @ T.rotation.mT
-    return Surfels(points.numpy(), normals.numpy(), np.broadcast_to(np.array(OBJECT_COLOUR), points.shape))
+    return Surfels(points.numpy(), normals.numpy(), np.broadcast_to(np.array(OBJECT_COLOR), points.shape))
 
 
-def _cloud(surface: Floats, chosen: NDArray[np.bool_], colour: Floats | tuple[float, ...]) -> Surfels:
+def _cloud(surface: Floats, chosen: NDArray[np.bool_], color: Floats | tuple[float, ...]) -> Surfels:
     points = surface[chosen.astype(bool)]
-    return Surfels(points[:, :3], points[:, 3:], np.broadcast_to(np.array(colour), (len(points), 3)))
+    return Surfels(points[:, :3], points[:, 3:], np.broadcast_to(np.array(color), (len(points), 3)))
 
 
 def _panel(discs: Surfels, framed: Surfels) -> Image.Image:
@@ -119,7 +119,7 @@ def _panel(discs: Surfels, framed: Surfels) -> Image.Image:
 def _caption(sheet: Image.Image, number: int, heading: str, note: str) -> None:
     draw = ImageDraw.Draw(sheet)
     draw.text((number * _PANEL + 14, 8), heading, fill=_INK, font=ImageFont.load_default(size=17))
-    draw.text((number * _PANEL + 14, 29), note, fill=_GREY, font=ImageFont.load_default(size=12))
+    draw.text((number * _PANEL + 14, 29), note, fill=_GRAY, font=ImageFont.load_default(size=12))
 
 
 def main() -> None:

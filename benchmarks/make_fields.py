@@ -2,7 +2,7 @@
 
     python -m benchmarks.make_fields MESHES ROOMS OUT [--only SET ...]
 
-MESHES holds the meshes (glb, metres, z up), ROOMS the layouts ac-room.json, atbl-room.json and mix-room.json; the
+MESHES holds the meshes (glb, meters, z up), ROOMS the layouts ac-room.json, atbl-room.json and mix-room.json; the
 held-out scenes are laid out in benchmarks/layouts. Writes a safe field a scene and an object, the scene's exact surface
 beside its field (NAME.surface.npz), and for each set a list of detections with their true transforms. What exists
 already is kept. On one core: main 20 minutes, held-out 15, under-trained 25, full-size 15.
@@ -26,13 +26,13 @@ from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.mesh.options import FitOptions
 from scripts import make_demo_fields as demo
 
-UNITS_PER_METRE = {
+UNITS_PER_METER = {
     "c": 0.9, "dc": 0.8, "fc": 0.625, "fc-nop": 0.7, "mc": 0.5, "et": 1.8, "t": 0.6, "wt": 1.3,
     "schoolchair_01": 0.75, "plastic_monobloc_chair_01": 0.55, "outdoor_folding_chair": 0.95,
     "round_wooden_table_02": 0.8, "boombox": 1.1, "ceramic_vase_01": 2.4, "vintage_electric_kettle": 1.6,
     "concrete_cat_statue": 3.0, "ycb_002_master_chef_can": 4.5, "ycb_004_sugar_box": 5.0,
 }  # fmt: skip
-"""Object units a metre, by the instance's name; rooms have 0.5, the table top 1.8: true scales from 0.6 to 3.6."""
+"""Object units a meter, by the instance's name; rooms have 0.5, the table top 1.8: true scales from 0.6 to 3.6."""
 YCB = "YCB object set, https://www.ycbbenchmarks.com, CC BY 4.0"
 LAYOUTS = Path(__file__).parent / "layouts"
 ROOM_OPTIONS = replace(demo.ROOM_OPTIONS, iterations=2500, near_points=600_000, volume_points=150_000)
@@ -87,11 +87,11 @@ def make(fields: FieldSet, meshes: Path, out: Path) -> None:
         fit_room(meshes, room, out / f"{name}.safetensors", fields.room_options)
         for instance in room["instances"]:
             identifier = instance["id"]
-            if identifier not in UNITS_PER_METRE or instance["class"] == "clutter":
+            if identifier not in UNITS_PER_METER or instance["class"] == "clutter":
                 continue
             if fields.only not in (None, identifier):
                 continue
-            units = UNITS_PER_METRE[identifier]
+            units = UNITS_PER_METER[identifier]
             mesh = demo.load_instance(meshes, instance)
             path = out / f"{identifier}{fields.suffix}.safetensors"
             fit_object(mesh, units, path, fields.object_options, instance)

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.make_fields import UNITS_PER_METRE
+from benchmarks.make_fields import UNITS_PER_METER
 from regnf_data.composing import RenderOptions, render_object, render_room
 from regnf_data.layouts import Layout, read_layout
 from regnf_data.posed_images import PosedImages
@@ -72,24 +72,24 @@ def datasets(meshes: Path, rooms: Path, base: RenderOptions) -> list[Dataset]:
 
 
 def _object(name: str, mesh: Path, options: RenderOptions) -> Dataset:
-    units = UNITS_PER_METRE[name]
+    units = UNITS_PER_METER[name]
     return Dataset(
         "objects",
         name,
         [mesh],
-        {"options": asdict(options), "units_per_metre": units},
-        lambda: render_object(mesh, options, units_per_metre=units),
+        {"options": asdict(options), "units_per_meter": units},
+        lambda: render_object(mesh, options, units_per_meter=units),
     )
 
 
 def _room(kind: str, layout: Layout, rooms: Path, options: RenderOptions, instance: str | None) -> Dataset:
-    units = {piece.name: UNITS_PER_METRE[piece.name] for piece in layout.furnishings}
+    units = {piece.name: UNITS_PER_METER[piece.name] for piece in layout.furnishings}
     return Dataset(
         kind,
         f"{layout.name}-{options.trajectory}" + ("" if instance is None else f"-{instance}"),
         [rooms / f"{layout.name}.json", *sorted({piece.mesh for piece in layout.furnishings})],
-        {"options": asdict(options), "object_units_per_metre": units, "instance": instance},
-        lambda: render_room(layout, options, object_units_per_metre=units, instance=instance),
+        {"options": asdict(options), "object_units_per_meter": units, "instance": instance},
+        lambda: render_room(layout, options, object_units_per_meter=units, instance=instance),
     )
 
 

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.make_fields import UNITS_PER_METRE, surface
+from benchmarks.make_fields import UNITS_PER_METER, surface
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
@@ -44,12 +44,12 @@ ROOM_OPTIONS = replace(
     iterations=5000,
     surface_rays=768,
     free_points=1536,
-    colour_rays=32,
+    color_rays=32,
     band=0.006,
     band_behind=0.002,
 )
 LONG_OPTIONS = replace(ROOM_OPTIONS, level_interval=0.1)
-"""Fine levels of the grid so late that none is half learnt after a tenth of the training."""
+"""Fine levels of the grid so late that none is half learned after a tenth of the training."""
 SINGLE_OPTIONS = replace(ROOM_OPTIONS, iterations=2000)
 
 
@@ -86,7 +86,7 @@ def fits(images: Path) -> Iterator[Fit]:
     """All of them, told from the datasets that there are."""
     names = sorted(path.name for path in images.iterdir() if (path / "meta_data.json").exists())
     for name in names:
-        if name in UNITS_PER_METRE:
+        if name in UNITS_PER_METER:
             yield Fit("objects", name, name, OBJECT_OPTIONS)
         elif "-single-" in name:
             yield Fit("single", name, name, SINGLE_OPTIONS)
@@ -121,7 +121,7 @@ def list_pairs(wanted: PairList, meshes: Path, rooms: Path, fields: Path) -> Non
         for instance in room["instances"]:
             name = instance["id"]
             scene = f"{stem}{wanted.suffix}" + (f"-{name}" if wanted.one else "")
-            if name in UNITS_PER_METRE and instance["class"] != "clutter" and _both(fields, scene, name):
+            if name in UNITS_PER_METER and instance["class"] != "clutter" and _both(fields, scene, name):
                 pairs.append(_pair(room, instance, scene, meshes))
     if pairs:
         (fields / wanted.file).write_text(json.dumps(pairs, indent=1) + "\n")
@@ -133,7 +133,7 @@ def _both(fields: Path, *names: str) -> bool:
 
 def _pair(room: dict[str, Any], instance: dict[str, Any], scene: str, meshes: Path) -> dict[str, Any]:
     frame, name = demo.SceneFrame.of(room), instance["id"]
-    truth = demo.truth(instance, demo.load_instance(meshes, instance), UNITS_PER_METRE[name], frame)
+    truth = demo.truth(instance, demo.load_instance(meshes, instance), UNITS_PER_METER[name], frame)
     detection = demo.detection(instance, frame)
     return {"room": scene, "object": name, "instance": name, "detection": detection, "truth": truth}
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.make_library MESHES FIELDS
 
-MESHES holds the given meshes (glb, metres, z up); FIELDS is the folder that benchmarks.make_fields wrote, whose fields
+MESHES holds the given meshes (glb, meters, z up); FIELDS is the folder that benchmarks.make_fields wrote, whose fields
 of the given objects are used. The others, which no detection shows, are written into FIELDS/library as exact distances
 to their meshes; library.json lists all 64 with their models (FIELDS/library/*.model). What exists is kept.
 """

@@ -115,7 +115,7 @@ def main() -> int:
             f"Bars: values within {VALUE_BAR:g} of their range, gradients within {GRADIENT_BAR:g}, at every point; the "
             "family named without a hint. DeepSDF is given its shape's code, which lies in another file.",
             "",
-            "| checkpoint | recognised as | largest value error, of the range | largest gradient error | "
+            "| checkpoint | recognized as | largest value error, of the range | largest gradient error | "
             "points beyond a bar | warnings | |",
             "|---|---|---|---|---|---|---|",
             *rows,

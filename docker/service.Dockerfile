@@ -9,6 +9,9 @@ WORKDIR /source
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY regnf_core regnf_core
 COPY regnf_cli regnf_cli
+COPY regnf_data regnf_data
+COPY regnf_fit regnf_fit
+COPY regnf_state regnf_state
 COPY service service
 COPY worker worker
 RUN pip install --constraint constraints.txt ".[service]"

@@ -14,7 +14,7 @@ box = json.loads((data / "detection.json").read_text())
 result = register(
     open_field(data / "mix-room.safetensors"),
     open_field(data / "armchair.safetensors"),
-    OrientedBox.from_quaternion(box["centre"], box["size"], box["rotation_quaternion_xyzw"]),
+    OrientedBox.from_quaternion(box["center"], box["size"], box["rotation_quaternion_xyzw"]),
 )
 print(result.verdict, result.verdict_reason)
 print(result.T_object_scene.matrix())

@@ -19,8 +19,8 @@ truth = Sim3.from_dict(json.loads((data / "truth.json").read_text())["T_object_s
 result = register(
     open_field(data / "mix-room.safetensors"),
     open_field(data / "armchair.safetensors"),
-    OrientedBox.from_quaternion(box["centre"], box["size"], box["rotation_quaternion_xyzw"]),
-    RegistrationOptions.from_dict({"preset": "paper", "optimisation": {"iterations": 150}}),
+    OrientedBox.from_quaternion(box["center"], box["size"], box["rotation_quaternion_xyzw"]),
+    RegistrationOptions.from_dict({"preset": "paper", "optimization": {"iterations": 150}}),
     seed=3,
     progress=lambda phase, share: print(f"\r{phase:>14} {share:4.0%}", end="", file=sys.stderr),
 )

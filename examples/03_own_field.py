@@ -21,7 +21,7 @@ SEAT, BACK, ARM = (
 
 @dataclass(frozen=True)
 class BoxesField:
-    """The union of axis-aligned boxes (centre, full size), seen from a frame that ``T_own_frame`` carries to theirs."""
+    """The union of axis-aligned boxes (center, full size), seen from a frame that ``T_own_frame`` carries to theirs."""
 
     T_own_frame: Sim3
     bounds: Tensor
@@ -34,8 +34,8 @@ class BoxesField:
     def signed_distance(self, points: Tensor) -> Tensor:
         own = self.T_own_frame.apply(points.double())
         distances = []
-        for centre, size in (SEAT, BACK, ARM):
-            gap = (own - torch.tensor(centre)).abs() - torch.tensor(size) / 2
+        for center, size in (SEAT, BACK, ARM):
+            gap = (own - torch.tensor(center)).abs() - torch.tensor(size) / 2
             distances.append(gap.clamp(min=0).norm(dim=-1) + gap.amax(dim=-1).clamp(max=0))
         return (torch.stack(distances).amin(dim=0) / self.T_own_frame.scale).float()
 

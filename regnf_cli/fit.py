@@ -47,7 +47,7 @@ def fit(
     extent: Annotated[
         float | None,
         typer.Option(
-            help="Meshes: centre it and scale its longest edge to this many units (up to 2 always fits). "
+            help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
             "Else its own frame."
         ),
     ] = None,
@@ -61,7 +61,7 @@ def fit(
     ] = None,
     sdfstudio: Annotated[
         Path | None,
-        typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colours included (.ckpt)."),
+        typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt)."),
     ] = None,
     pictures: Annotated[
         bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")

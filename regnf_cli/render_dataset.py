@@ -33,7 +33,7 @@ def render_dataset(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A mesh (glb, obj, ply, stl; metres, z up) or a layout (.json).", exists=True, dir_okay=False
+            help="A mesh (glb, obj, ply, stl; meters, z up) or a layout (.json).", exists=True, dir_okay=False
         ),
     ],
     output: Annotated[Path, typer.Argument(metavar="OUT", help="The folder to make, in the sdfstudio data format.")],
@@ -48,8 +48,8 @@ def render_dataset(
     width: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 160,
     height: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 120,
     noise: Annotated[bool, typer.Option(help="A depth camera's errors, or exact depths.")] = True,
-    units_per_metre: Annotated[
-        float | None, typer.Option(help="World units a metre; else the layout's, or 1 for a mesh.")
+    units_per_meter: Annotated[
+        float | None, typer.Option(help="World units a meter; else the layout's, or 1 for a mesh.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of the noise.")] = 0,
 ) -> None:
@@ -63,7 +63,7 @@ def render_dataset(
     from regnf_data.sensor import DepthSensor
 
     layout = source.suffix.lower() == ".json"
-    _check(layout, meshes, trajectory, instance, units_per_metre)
+    _check(layout, meshes, trajectory, instance, units_per_meter)
     check_target(output)
     options = RenderOptions(
         trajectory=trajectory.value,
@@ -72,7 +72,7 @@ def render_dataset(
         sensor=DepthSensor() if noise else None,
         seed=seed,
     )
-    images = _rendered(source, meshes, instance, units_per_metre, options)
+    images = _rendered(source, meshes, instance, units_per_meter, options)
     write_dataset(images, output)
     megabytes = sum(path.stat().st_size for path in output.iterdir()) / 1e6
     names = ", ".join(each.label for each in images.instances)
@@ -80,7 +80,7 @@ def render_dataset(
 
 
 def _check(
-    layout: bool, meshes: Path | None, trajectory: Trajectory, instance: str | None, units_per_metre: float | None
+    layout: bool, meshes: Path | None, trajectory: Trajectory, instance: str | None, units_per_meter: float | None
 ) -> None:
     if layout and meshes is None:
         raise InvalidOptionsError("a layout needs --meshes, the folder with its meshes")
@@ -88,12 +88,12 @@ def _check(
         raise InvalidOptionsError("--meshes and --instance go with a layout (.json)")
     if layout and (trajectory is Trajectory.SINGLE) != (instance is not None):
         raise InvalidOptionsError("a layout's single view needs --instance, and nothing else does")
-    if units_per_metre is not None and not 0.0 < units_per_metre < math.inf:
-        raise InvalidOptionsError("the units per metre must be positive")
+    if units_per_meter is not None and not 0.0 < units_per_meter < math.inf:
+        raise InvalidOptionsError("the units per meter must be positive")
 
 
 def _rendered(
-    source: Path, meshes: Path | None, instance: str | None, units_per_metre: float | None, options: RenderOptions
+    source: Path, meshes: Path | None, instance: str | None, units_per_meter: float | None, options: RenderOptions
 ) -> PosedImages:
     from regnf_data.composing import render_object, render_room
     from regnf_data.layouts import read_layout
@@ -106,6 +106,6 @@ def _rendered(
             bar.update(task, completed=done, total=total)
 
         if meshes is None:
-            return render_object(source, options, units_per_metre=units_per_metre or 1.0, progress=report)
+            return render_object(source, options, units_per_meter=units_per_meter or 1.0, progress=report)
         layout = read_layout(source, meshes)
-        return render_room(layout, options, units_per_metre=units_per_metre, instance=instance, progress=report)
+        return render_room(layout, options, units_per_meter=units_per_meter, instance=instance, progress=report)

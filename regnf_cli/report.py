@@ -10,7 +10,7 @@ from rich.table import Table
 from regnf_cli.console import EXIT_AMBIGUOUS, EXIT_NOT_REGISTERED, EXIT_REGISTERED, out
 
 _EXIT_CODES = {"registered": EXIT_REGISTERED, "ambiguous": EXIT_AMBIGUOUS}
-_COLOURS = {"registered": "green", "ambiguous": "yellow"}
+_COLORS = {"registered": "green", "ambiguous": "yellow"}
 
 
 def exit_code(document: dict[str, Any]) -> int:
@@ -22,7 +22,7 @@ def show_result(document: dict[str, Any]) -> None:
     """Print what a result document says. Documents of other versions may lack everything but verdict and transform."""
     verdict = escape(document["verdict"])
     out.print(
-        f"verdict      [bold {_COLOURS.get(verdict, 'red')}]{verdict}[/]  ({escape(document['verdict_reason'])})",
+        f"verdict      [bold {_COLORS.get(verdict, 'red')}]{verdict}[/]  ({escape(document['verdict_reason'])})",
         soft_wrap=True,
     )
     if detail := document.get("verdict_detail"):

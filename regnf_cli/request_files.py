@@ -58,17 +58,17 @@ def parse_detection(values: dict[str, Any]) -> OrientedBox:
     """A detection's JSON as a box. Raises InvalidDetectionError for what is missing, unknown or malformed."""
     from regnf_core.geometry.box import OrientedBox
 
-    known = {"min", "max", "centre", "size", "rotation_quaternion_xyzw", "label", "score"}
+    known = {"min", "max", "center", "size", "rotation_quaternion_xyzw", "label", "score"}
     if unknown := sorted(set(values) - known):
         raise InvalidDetectionError(f"detection holds unknown members: {', '.join(unknown)}")
     shared = {name: values[name] for name in ("label", "score") if values.get(name) is not None}
     try:
         if values.keys() & {"min", "max"}:
-            if extra := sorted(values.keys() & {"centre", "size", "rotation_quaternion_xyzw"}):
+            if extra := sorted(values.keys() & {"center", "size", "rotation_quaternion_xyzw"}):
                 raise InvalidDetectionError(f"detection holds corners and {', '.join(extra)}: either, not both")
             return OrientedBox.from_corners(values["min"], values["max"], **shared)
         quaternion = values.get("rotation_quaternion_xyzw") or (0.0, 0.0, 0.0, 1.0)
-        return OrientedBox.from_quaternion(values["centre"], values["size"], quaternion, **shared)
+        return OrientedBox.from_quaternion(values["center"], values["size"], quaternion, **shared)
     except KeyError as error:
         raise InvalidDetectionError(f"detection lacks {error}") from error
     except (OverflowError, RuntimeError, TypeError, ValueError) as error:

@@ -7,7 +7,7 @@
     │   ├── FieldFormatError         the bytes are no field we take: the reason says which stage refused them
     │   └── DatasetError             DATASET_...: a folder of posed images, or what one is rendered from, cannot be used
     ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
-    ├── InitialisationError          NO_INITIAL_TRANSFORM
+    ├── InitializationError          NO_INITIAL_TRANSFORM
     ├── FitDivergedError             FIT_DIVERGED
     └── CancelledError               CANCELLED
 
@@ -52,7 +52,7 @@ class InvalidDetectionError(InvalidInputError):
 class FieldFormatError(InvalidInputError):
     """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault."""
 
-    reason = "FIELD_NOT_RECOGNISED"
+    reason = "FIELD_NOT_RECOGNIZED"
 
 
 class DatasetError(InvalidInputError):
@@ -67,7 +67,7 @@ class NoSurfaceError(RegnfError):
     reason = "NO_SURFACE_IN_DETECTION"
 
 
-class InitialisationError(RegnfError):
+class InitializationError(RegnfError):
     """No initial transform could be estimated from the surface points."""
 
     reason = "NO_INITIAL_TRANSFORM"

@@ -91,10 +91,10 @@ def search_library(
     models = [one.model for one in library]
     with run.phase("sampling"):
         view = view_scene(scene, detection, options.robust, seed)
-    with run.phase("initialising"):
+    with run.phase("initializing"):
         nearest = by_signature(view, models)
         contenders = coarsely(view, models, [number for number, _ in nearest], options, seed)
-    with run.phase("optimising"):
+    with run.phase("optimizing"):
         finalists = _refine(scene, view, library, still_in(contenders), options, seed, run)
     with run.phase("verifying"):
         result = _register_first(scene, view, library[finalists[0].number], finalists[0], options, seed)
@@ -115,14 +115,14 @@ def _refine(
     run: Run,
 ) -> list[Finalist]:
     """The contenders refined on their fields, best first."""
-    span = (STARTS["verifying"] - STARTS["optimising"]) / len(contenders)
+    span = (STARTS["verifying"] - STARTS["optimizing"]) / len(contenders)
     finalists = []
     for taken, contender in enumerate(contenders):
-        done = STARTS["optimising"] + span * taken
+        done = STARTS["optimizing"] + span * taken
         one = library[contender.number]
 
         def on_step(done: float = done) -> None:
-            run.report("optimising", done)
+            run.report("optimizing", done)
 
         finalists.append(refine_contender(scene, view, one.field(), one.model, contender, options, seed, on_step))
     return sorted(finalists, key=lambda finalist: finalist.conclusion.rank)

@@ -1,6 +1,6 @@
 """Options of a registration, grouped by the stage they steer. Torch-free: the HTTP contract is derived from them.
 
-Every length is in normalised field units unless its name says otherwise, as in the paper.
+Every length is in normalized field units unless its name says otherwise, as in the paper.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class SamplingOptions:
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     views: Annotated[int, Ge(1), Le(64)] = 5
-    """Cameras round the box, all looking at its centre. More views cover hollow shapes better."""
+    """Cameras round the box, all looking at its center. More views cover hollow shapes better."""
     scene_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.9
-    """Distance of the scene's cameras from the box's centre, scene units."""
+    """Distance of the scene's cameras from the box's center, scene units."""
     object_camera_distance: Annotated[float, Gt(0), Le(100)] = 0.7
-    """Distance of the object's cameras from its centre, object units."""
+    """Distance of the object's cameras from its center, object units."""
     image_size: Annotated[int, Ge(8), Le(4096)] = 512
     """Edge of the virtual image, pixels."""
     pixel_stride: Annotated[int, Ge(1), Le(512)] = 8
@@ -41,7 +41,7 @@ class SamplingOptions:
 
 
 @dataclass(frozen=True)
-class InitialisationOptions:
+class InitializationOptions:
     """FPFH features, RANSAC and ICP (paper, section III-C.2)."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
@@ -61,8 +61,8 @@ class InitialisationOptions:
 
 
 @dataclass(frozen=True)
-class OptimisationOptions:
-    """The bidirectional loss and its minimisation (paper, sections III-D and III-E)."""
+class OptimizationOptions:
+    """The bidirectional loss and its minimization (paper, sections III-D and III-E)."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
@@ -71,8 +71,8 @@ class OptimisationOptions:
     rotation_rate: Annotated[float, Gt(0), Le(1)] = 0.02
     scale_rate: Annotated[float, Gt(0), Le(1)] = 0.01
     kernel_rate: Annotated[float, Gt(0), Le(1)] = 0.005
-    regulariser_weight: Annotated[float, Ge(0), Le(1000)] = 1.0
-    """w, the weight of the nearest-neighbour regulariser. The paper gives no value."""
+    regularizer_weight: Annotated[float, Ge(0), Le(1000)] = 1.0
+    """w, the weight of the nearest-neighbor regularizer. The paper gives no value."""
     stop_residual: Annotated[float, Ge(0), Le(1)] = 0.0005
     """Stop once the mean residuals of both directions are at most this."""
     samples_per_iteration: Annotated[int, Ge(16), Le(1_000_000)] = 2000
@@ -156,8 +156,8 @@ class RegistrationOptions:
     preset: Preset = "robust"
     """The engine: `robust` needs no starting guess, `paper` is the published method."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
-    initialisation: InitialisationOptions = field(default_factory=InitialisationOptions)
-    optimisation: OptimisationOptions = field(default_factory=OptimisationOptions)
+    initialization: InitializationOptions = field(default_factory=InitializationOptions)
+    optimization: OptimizationOptions = field(default_factory=OptimizationOptions)
     resampling: ResamplingOptions = field(default_factory=ResamplingOptions)
     robust: RobustOptions = field(default_factory=RobustOptions)
 

@@ -27,13 +27,13 @@ def register(
 ) -> RegistrationResult:
     """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
 
-    ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimising; it may
+    ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
     raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, anything else
-    is searched only if that fails; ``object_model`` is what :func:`regnf_core.robust.model.object_model.model_object` made of
-    ``obj`` earlier. Without ``clouds`` the result has the engine's own samples alone, and neither residuals nor
+    is searched only if that fails; ``object_model`` is what ``model_object`` made of ``obj``
+    earlier. Without ``clouds`` the result has the engine's own samples alone, and neither residuals nor
     surroundings: for who draws no pictures.
     Deterministic for a seed, on one machine and with the same number of threads.
-    Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
+    Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RegistrationOptions()
     run = Run(progress)

@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 
 Verdict = Literal["registered", "ambiguous", "rejected"]
-Phase = Literal["loading", "sampling", "initialising", "optimising", "verifying", "exporting"]
+Phase = Literal["loading", "sampling", "initializing", "optimizing", "verifying", "exporting"]
 
 ProgressCallback = Callable[[Phase, float], None]
 """Called with the phase and the overall progress 0..1. May raise CancelledError to stop the work."""
@@ -27,7 +27,7 @@ class SurfaceSamples:
 
 @dataclass(frozen=True)
 class IterationRecord:
-    """One iteration of the optimiser: everything that trace.json shows."""
+    """One iteration of the optimizer: everything that trace.json shows."""
 
     iteration: int
     loss: float
@@ -35,7 +35,7 @@ class IterationRecord:
     """Mean |r| over the scene's samples, object units."""
     residual_object: float
     """Mean |r| over the object's samples, scene units, as the paper has it."""
-    regulariser: float
+    regularizer: float
     kernel_shape: float
     kernel_scale: float
     scene_samples: int

@@ -10,8 +10,8 @@ from regnf_core.result import Phase, ProgressCallback
 
 STARTS: dict[Phase, float] = {
     "sampling": 0.0,
-    "initialising": 0.15,
-    "optimising": 0.2,
+    "initializing": 0.15,
+    "optimizing": 0.2,
     "verifying": 0.95,
     "exporting": 0.98,
 }

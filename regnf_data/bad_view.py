@@ -64,18 +64,18 @@ def half_view(size: Size, intrinsics: Array) -> float:
     return float(min(np.arctan(size[1] / 2.0 / intrinsics[0, 0]), np.arctan(size[0] / 2.0 / intrinsics[1, 1])))
 
 
-def _candidates(scene: MeshScene, centre: Array, distance: float, floor: float) -> Iterator[Array]:
+def _candidates(scene: MeshScene, center: Array, distance: float, floor: float) -> Iterator[Array]:
     low, high = scene.bounds
     alone = len(scene.things) == 1
     for height in _HEIGHTS_M:
-        rise = floor + height - centre[2]
+        rise = floor + height - center[2]
         level = distance**2 - rise**2
         if level <= 0.0:
             continue
         angles = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
         ring = np.sqrt(level) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        positions = centre + np.concatenate([ring, np.full((_AZIMUTHS, 1), rise)], axis=1)
+        positions = center + np.concatenate([ring, np.full((_AZIMUTHS, 1), rise)], axis=1)
         free = scene.signed_distance(positions) >= CLEARANCE_M
         # The far side of a wall is free too, but outside of the room.
         inside = alone | ((positions > low) & (positions < high))[:, :2].all(axis=1)
-        yield from look_at(positions[free & inside], np.tile(centre, (int((free & inside).sum()), 1)))
+        yield from look_at(positions[free & inside], np.tile(center, (int((free & inside).sum()), 1)))

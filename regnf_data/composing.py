@@ -64,21 +64,21 @@ def render_room(
     layout: Layout,
     options: RenderOptions,
     *,
-    units_per_metre: float | None = None,
-    object_units_per_metre: Mapping[str, float] | None = None,
+    units_per_meter: float | None = None,
+    object_units_per_meter: Mapping[str, float] | None = None,
     instance: str | None = None,
     progress: Progress | None = None,
 ) -> PosedImages:
     """Images of a furnished room, with every piece's box and true transform.
 
-    units_per_metre: of the world, instead of the layout's · object_units_per_metre: of the library objects that the
+    units_per_meter: of the world, instead of the layout's · object_units_per_meter: of the library objects that the
     truths lead to, by name, else 1; an object's origin is the middle of its mesh's bounding box · instance: the one
     that a single view shows; then the bounds are its own, with 40 cm round it, and no other instance is listed.
     Raises DatasetError (DATASET_NO_FREE_PATH, DATASET_NO_VIEW, DATASET_NO_INSTANCE, DATASET_FRAMES_INVALID),
     FieldFormatError (MESH_INVALID) and OSError.
     """
     count = options.count("room")
-    units = layout.units_per_metre if units_per_metre is None else units_per_metre
+    units = layout.units_per_meter if units_per_meter is None else units_per_meter
     T_world_metric = scale_and_shift(units, layout.origin_m)
     scene = room_scene(layout)
     pieces = list(zip(layout.furnishings, scene.things[-len(layout.furnishings) :], strict=True))
@@ -92,7 +92,7 @@ def render_room(
         boxes = [thing.solid.bounds.numpy() for _, thing in pieces]
         poses, bounds = walk(WalkingGround(scene, layout.floor), boxes, count), scene.bounds
     images = _taken(scene, poses, bounds, T_world_metric, options, progress)
-    of_object = object_units_per_metre or {}
+    of_object = object_units_per_meter or {}
     instances = [_instance(thing, piece, T_world_metric, of_object.get(piece.name, 1.0)) for piece, thing in pieces]
     return replace(images, instances=tuple(instances), masks=None)
 
@@ -101,7 +101,7 @@ def render_object(
     mesh: str | os.PathLike[str],
     options: RenderOptions,
     *,
-    units_per_metre: float = 1.0,
+    units_per_meter: float = 1.0,
     progress: Progress | None = None,
 ) -> PosedImages:
     """Images of one mesh alone, with masks; the world is the library object's frame, its origin the mesh's middle.
@@ -122,10 +122,10 @@ def render_object(
         circle = orbit if options.trajectory == "long" else pass_by
         poses = circle(bounds, count, half_view(options.size, options.intrinsics), floor)
     margin = _OBJECT_MARGIN * float((bounds[1] - bounds[0]).max())
-    T_world_metric = scale_and_shift(units_per_metre, bounds.mean(axis=0))
+    T_world_metric = scale_and_shift(units_per_meter, bounds.mean(axis=0))
     images = _taken(scene, poses, bounds + np.array([[-margin], [margin]]), T_world_metric, options, progress)
     whole = Furnishing(name, Path(mesh), np.eye(4), None)
-    return replace(images, instances=(_instance(thing, whole, T_world_metric, units_per_metre),))
+    return replace(images, instances=(_instance(thing, whole, T_world_metric, units_per_meter),))
 
 
 def room_scene(layout: Layout) -> MeshScene:
@@ -136,12 +136,12 @@ def room_scene(layout: Layout) -> MeshScene:
     return MeshScene([box_thing(layout.floor[0], layout.floor[1], _FLOOR), *walls, *pieces])
 
 
-def scale_and_shift(units_per_metre: float, origin_m: tuple[float, float, float] | Array) -> Array:
-    """(4, 4): metres less ``origin_m``, times ``units_per_metre``."""
-    if not 0.0 < units_per_metre < math.inf:
-        raise DatasetError("units per metre must be positive", reason="DATASET_SCALE_INVALID")
-    matrix = np.diag([units_per_metre] * 3 + [1.0])
-    matrix[:3, 3] = -units_per_metre * np.asarray(origin_m)
+def scale_and_shift(units_per_meter: float, origin_m: tuple[float, float, float] | Array) -> Array:
+    """(4, 4): meters less ``origin_m``, times ``units_per_meter``."""
+    if not 0.0 < units_per_meter < math.inf:
+        raise DatasetError("units per meter must be positive", reason="DATASET_SCALE_INVALID")
+    matrix = np.diag([units_per_meter] * 3 + [1.0])
+    matrix[:3, 3] = -units_per_meter * np.asarray(origin_m)
     return matrix
 
 
@@ -179,7 +179,7 @@ def _taken(
     T_world_camera = poses.copy()
     T_world_camera[:, :3, 3] = poses[:, :3, 3] @ T_world_metric[:3, :3].T + T_world_metric[:3, 3]
     return PosedImages(
-        colours=np.stack([view.colours for view in views]),
+        colors=np.stack([view.colors for view in views]),
         intrinsics=np.tile(options.intrinsics, (len(poses), 1, 1)),
         T_world_camera=T_world_camera,
         bounds=bounds @ T_world_metric[:3, :3].T + T_world_metric[:3, 3],

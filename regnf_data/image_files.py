@@ -1,4 +1,4 @@
-"""The image files of a dataset: colours, depths and masks, each checked against the size that is due."""
+"""The image files of a dataset: colors, depths and masks, each checked against the size that is due."""
 
 from __future__ import annotations
 
@@ -60,15 +60,15 @@ def image_size(path: Path) -> Size:
         raise _invalid(path, error) from error
 
 
-def read_colours(path: Path, size: Size) -> NDArray[np.uint8]:
+def read_colors(path: Path, size: Size) -> NDArray[np.uint8]:
     """(H, W, 3) uint8, sRGB; transparency is left out."""
     return np.asarray(_decoded(path, size, "RGB"), dtype=np.uint8)
 
 
 def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
     """(H, W): true where the picture is brighter than half; one of zeros and ones counts as such."""
-    grey = _decoded(path, size, "L")
-    return np.asarray(grey > (127 if grey.max() > 1 else 0))
+    gray = _decoded(path, size, "L")
+    return np.asarray(gray > (127 if gray.max() > 1 else 0))
 
 
 def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32]:

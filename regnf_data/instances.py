@@ -40,7 +40,7 @@ def write_instance(instance: Instance) -> dict[str, Any]:
         "box_max": corners.max(axis=0).tolist(),
         "box_corners": corners.tolist(),
         # The three above lose the last digits, and the box's own axes; this is what regnf reads back.
-        "box": {"centre": box.centre.tolist(), "size": box.size.tolist(), "rotation": box.rotation.tolist()},
+        "box": {"center": box.center.tolist(), "size": box.size.tolist(), "rotation": box.rotation.tolist()},
     }
     for name in ("T_object_world", "world_pose", "gt_pose"):
         matrix = getattr(instance, name)
@@ -50,7 +50,7 @@ def write_instance(instance: Instance) -> dict[str, Any]:
 
 
 def box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Centre (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order.
+    """Center (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order.
 
     Raises DatasetError (DATASET_INSTANCE_INVALID) if they are no box's.
     """
@@ -103,7 +103,7 @@ def _box(entry: dict[str, Any], label: str) -> OrientedBox:
     """What says most about the box comes first: box, box_corners, box_min with box_max."""
     try:
         if isinstance(entry.get("box"), dict):
-            shapes = {"centre": (3,), "size": (3,), "rotation": (3, 3)}
+            shapes = {"center": (3,), "size": (3,), "rotation": (3, 3)}
             parts = [array(entry["box"].get(k), (s,), f"box {k} of {label}", _REASON) for k, s in shapes.items()]
         elif entry.get("box_corners") is not None:
             corners = array(entry["box_corners"], ((8, 3),), f"box_corners of {label}", _REASON)
@@ -113,8 +113,8 @@ def _box(entry: dict[str, Any], label: str) -> OrientedBox:
         else:
             lower, upper = (array(entry.get(k), ((3,),), f"{k} of {label}", _REASON) for k in ("box_min", "box_max"))
             return _between(lower, upper, label)
-        centre, size, rotation = (torch.tensor(np.ascontiguousarray(part)) for part in parts)
-        return OrientedBox(centre, size, rotation, label)
+        center, size, rotation = (torch.tensor(np.ascontiguousarray(part)) for part in parts)
+        return OrientedBox(center, size, rotation, label)
     except InvalidDetectionError as error:
         raise DatasetError(f"the box of {label}: {error}", reason=_REASON) from error
 

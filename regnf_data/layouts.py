@@ -1,4 +1,4 @@
-"""A furnished room on paper: floor, walls, and which mesh stands where. Metres, z up."""
+"""A furnished room on paper: floor, walls, and which mesh stands where. Meters, z up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from regnf_data.json_values import array, rigid
 Array = NDArray[np.float64]
 
 _REASON = "DATASET_LAYOUT_INVALID"
-_USUAL_UNITS_PER_METRE = 0.5
+_USUAL_UNITS_PER_METER = 0.5
 _LONGEST_NAME = 200
 _USUAL_ORIGIN_M = (0.0, 0.0, 1.0)
 
@@ -34,13 +34,13 @@ class Furnishing:
 
 @dataclass(frozen=True)
 class Layout:
-    """floor, walls: (2, 3) each · units_per_metre, origin_m: of the world frame, the room's less origin times units."""
+    """floor, walls: (2, 3) each · units_per_meter, origin_m: of the world frame, the room's less origin times units."""
 
     name: str
     floor: Array
     walls: tuple[Array, ...]
     furnishings: tuple[Furnishing, ...]
-    units_per_metre: float = _USUAL_UNITS_PER_METRE
+    units_per_meter: float = _USUAL_UNITS_PER_METER
     origin_m: tuple[float, float, float] = _USUAL_ORIGIN_M
 
 
@@ -59,16 +59,16 @@ def read_layout(path: str | os.PathLike[str], meshes: str | os.PathLike[str]) ->
     instances = room.get("instances")
     if not isinstance(instances, list) or not instances:
         raise DatasetError(f"{source.name} lists no instances", reason=_REASON)
-    units = float(array(room.get("scene_units_per_metre", _USUAL_UNITS_PER_METRE), ((),), "scene units", _REASON))
+    units = float(array(room.get("scene_units_per_meter", _USUAL_UNITS_PER_METER), ((),), "scene units", _REASON))
     if units <= 0.0:
-        raise DatasetError("scene_units_per_metre is not positive", reason=_REASON)
+        raise DatasetError("scene_units_per_meter is not positive", reason=_REASON)
     x, y, z = array(room.get("scene_origin_m", _USUAL_ORIGIN_M), ((3,),), "scene_origin_m", _REASON).tolist()
     return Layout(
         name=source.stem,
         floor=_box(room.get("floor"), "floor"),
         walls=tuple(_box(wall, "a wall") for wall in room.get("walls", [])),
         furnishings=tuple(_furnishing(instance, Path(meshes)) for instance in instances),
-        units_per_metre=units,
+        units_per_meter=units,
         origin_m=(x, y, z),
     )
 

@@ -1,4 +1,4 @@
-"""A scene of painted meshes that rays can be cast at, in metres, z up."""
+"""A scene of painted meshes that rays can be cast at, in meters, z up."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SEEN_SHARE = 0.003
 
 @dataclass(frozen=True)
 class PaintedMesh:
-    """Triangles with their colour: vertices (V, 3), faces (F, 3)."""
+    """Triangles with their color: vertices (V, 3), faces (F, 3)."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -45,13 +45,13 @@ class Hits:
     """What R rays met first.
 
     distance: (R,), in lengths of the ray's direction, inf where nothing was met · thing: (R,) index, -1 for none ·
-    normal: (R, 3) unit, towards the ray's origin · colour: (R, 3) linear, zero where nothing was met.
+    normal: (R, 3) unit, towards the ray's origin · color: (R, 3) linear, zero where nothing was met.
     """
 
     distance: NDArray[np.float64]
     thing: NDArray[np.int64]
     normal: NDArray[np.float64]
-    colour: NDArray[np.float64]
+    color: NDArray[np.float64]
 
 
 def load_thing(path: str | os.PathLike[str], T_scene_mesh: ArrayLike | None = None, name: str | None = None) -> Thing:
@@ -106,19 +106,19 @@ class MeshScene:
         distance = answer["t_hit"].astype(np.float64)
         mesh_index = np.where(np.isfinite(distance), answer["geometry_ids"].astype(np.int64), -1)
         normal = np.zeros((len(distance), 3))
-        colour = np.zeros((len(distance), 3))
+        color = np.zeros((len(distance), 3))
         thing = np.full(len(distance), -1, dtype=np.int64)
         for index, (owner, mesh) in enumerate(self._meshes):
             chosen = mesh_index == index
             corners = mesh.faces[answer["primitive_ids"][chosen].astype(np.int64)]
             second, third = answer["primitive_uvs"][chosen].astype(np.float64).T
             points = origins[chosen] + distance[chosen, None] * directions[chosen]
-            colour[chosen] = mesh.paint.at(points, corners, np.stack([1.0 - second - third, second, third], axis=1))
+            color[chosen] = mesh.paint.at(points, corners, np.stack([1.0 - second - third, second, third], axis=1))
             normal[chosen] = answer["primitive_normals"][chosen]
             thing[chosen] = owner
         away = np.einsum("rc,rc->r", normal, directions) > 0.0
         normal[away] *= -1.0
-        return Hits(distance, thing, normal, colour)
+        return Hits(distance, thing, normal, color)
 
     def sees(self, position: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(N,): whether nothing lies between ``position`` (3,) and the surface points (N, 3)."""

@@ -1,4 +1,4 @@
-"""What colour a mesh has at a point of its surface. All colours are linear, not sRGB, from 0 to 1."""
+"""What color a mesh has at a point of its surface. All colors are linear, not sRGB, from 0 to 1."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-_GREY = (0.5, 0.5, 0.5)
+_GRAY = (0.5, 0.5, 0.5)
 
 
 class Paint(Protocol):
-    """Colours of surface points."""
+    """Colors of surface points."""
 
     def at(
         self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Colours (P, 3) at points (P, 3), each the mix by ``shares`` (P, 3) of a triangle's vertices (P, 3)."""
+        """Colors (P, 3) at points (P, 3), each the mix by ``shares`` (P, 3) of a triangle's vertices (P, 3)."""
         ...
 
 
 @dataclass(frozen=True)
 class VertexPaint:
-    """One colour a vertex, (V, 3), mixed over the triangle."""
+    """One color a vertex, (V, 3), mixed over the triangle."""
 
-    colours: NDArray[np.float64]
+    colors: NDArray[np.float64]
 
     def at(
         self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Colours (P, 3)."""
+        """Colors (P, 3)."""
         del points
-        mixed: NDArray[np.float64] = np.einsum("pk,pkc->pc", shares, self.colours[corners])
+        mixed: NDArray[np.float64] = np.einsum("pk,pkc->pc", shares, self.colors[corners])
         return mixed
 
 
@@ -46,7 +46,7 @@ class TexturePaint:
     def at(
         self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Colours (P, 3), of the nearest texel."""
+        """Colors (P, 3), of the nearest texel."""
         del points
         u, v = np.einsum("pk,pkc->cp", shares, self.coordinates[corners])
         height, width = self.picture.shape[:2]
@@ -58,7 +58,7 @@ class TexturePaint:
 
 @dataclass(frozen=True)
 class TilePaint:
-    """Cubes of two colours (3,) in turn, ``edge`` long: what floors and walls wear, so that images show them move."""
+    """Cubes of two colors (3,) in turn, ``edge`` long: what floors and walls wear, so that images show them move."""
 
     first: tuple[float, float, float]
     second: tuple[float, float, float]
@@ -67,16 +67,16 @@ class TilePaint:
     def at(
         self, points: NDArray[np.float64], corners: NDArray[np.int64], shares: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Colours (P, 3)."""
+        """Colors (P, 3)."""
         del corners, shares
-        # Off the faces by a part of a tile: rounding must not choose the colour.
+        # Off the faces by a part of a tile: rounding must not choose the color.
         odd = np.floor(points / self.edge + 0.3).sum(axis=1) % 2 == 1
-        colours: NDArray[np.float64] = np.where(odd[:, None], self.first, self.second)
-        return colours
+        colors: NDArray[np.float64] = np.where(odd[:, None], self.first, self.second)
+        return colors
 
 
 def paint_of(mesh: Any) -> Paint:
-    """The paint that a trimesh mesh comes with: its base texture, its vertices' or faces' colours, or else grey."""
+    """The paint that a trimesh mesh comes with: its base texture, its vertices' or faces' colors, or else gray."""
     visual = mesh.visual
     material = getattr(visual, "material", None)
     coordinates = getattr(visual, "uv", None)
@@ -89,9 +89,9 @@ def paint_of(mesh: Any) -> Paint:
     plain = visual.kind in (None, "texture")
     main = getattr(material, "main_color", None) if plain else None
     if plain and main is None:
-        return VertexPaint(np.tile(_GREY, (len(mesh.vertices), 1)))
-    colours = np.tile(main, (len(mesh.vertices), 1)) if main is not None else np.asarray(visual.vertex_colors)
-    return VertexPaint(to_linear(colours[:, :3]))
+        return VertexPaint(np.tile(_GRAY, (len(mesh.vertices), 1)))
+    colors = np.tile(main, (len(mesh.vertices), 1)) if main is not None else np.asarray(visual.vertex_colors)
+    return VertexPaint(to_linear(colors[:, :3]))
 
 
 def to_linear(srgb: NDArray[Any]) -> NDArray[np.float64]:

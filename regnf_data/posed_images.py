@@ -31,10 +31,10 @@ class PosedImages:
     """N images of H x W pixels of one scene that stands still.
 
     The world frame is the one the field is fitted in; its unit is the field's. Cameras look along +z, x to the right, y
-    down (OpenCV). A pixel's centre lies at (column + .5, row + .5).
+    down (OpenCV). A pixel's center lies at (column + .5, row + .5).
     """
 
-    colours: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
     """(N, H, W, 3), sRGB."""
     intrinsics: NDArray[np.float64]
     """(N, 3, 3), pixels."""
@@ -53,7 +53,7 @@ class PosedImages:
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""
-        return self.colours.shape[1], self.colours.shape[2]
+        return self.colors.shape[1], self.colors.shape[2]
 
     def __len__(self) -> int:
-        return len(self.colours)
+        return len(self.colors)

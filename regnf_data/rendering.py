@@ -37,12 +37,12 @@ class Shading:
 
 @dataclass(frozen=True)
 class View:
-    """One image. colours: (H, W, 3) uint8 sRGB · depth: (H, W) along the camera's z axis, 0 where nothing is ·
+    """One image. colors: (H, W, 3) uint8 sRGB · depth: (H, W) along the camera's z axis, 0 where nothing is ·
 
     cosine: (H, W) between the ray and the surface's normal · thing: (H, W) index of the thing seen, -1 for none.
     """
 
-    colours: NDArray[np.uint8]
+    colors: NDArray[np.uint8]
     depth: NDArray[np.float64]
     cosine: NDArray[np.float64]
     thing: NDArray[np.int64]
@@ -77,7 +77,7 @@ def render(
     shading: Shading | None = None,
     fine: int = 3,
 ) -> View:
-    """The scene from one camera, depth at the pixels' middles, colours the mean over ``fine`` x ``fine`` rays a pixel.
+    """The scene from one camera, depth at the pixels' middles, colors the mean over ``fine`` x ``fine`` rays a pixel.
 
     size: height and width · intrinsics: (3, 3) · T_scene_camera: (4, 4), a rotation and a translation, OpenCV's axes.
     ``fine`` must be odd: the ray in the middle gives the depth.
@@ -96,7 +96,7 @@ def render(
     cosine = -np.einsum("rc,rc->r", hits.normal, directions) / np.linalg.norm(directions, axis=1)
     depth = middles(hits.distance)
     return View(
-        colours=to_srgb(blocks.mean(axis=(1, 3))),
+        colors=to_srgb(blocks.mean(axis=(1, 3))),
         depth=np.where(np.isfinite(depth), depth, 0.0),
         cosine=middles(cosine),
         thing=hits.thing.reshape(height * fine, width * fine)[middle, middle],
@@ -104,6 +104,6 @@ def render(
 
 
 def _shaded(hits: Hits, shading: Shading) -> NDArray[np.float64]:
-    shaded: NDArray[np.float64] = hits.colour * shading.light(hits.normal)[:, None]
+    shaded: NDArray[np.float64] = hits.color * shading.light(hits.normal)[:, None]
     shaded[hits.thing < 0] = _BACKGROUND
     return shaded

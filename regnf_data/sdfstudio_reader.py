@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
-from regnf_data.image_files import Size, image_size, read_colours, read_depth, read_mask, resolve
+from regnf_data.image_files import Size, image_size, read_colors, read_depth, read_mask, resolve
 from regnf_data.instances import read_instances
 from regnf_data.json_values import array, rigid, similarity, whole_number
 from regnf_data.posed_images import PosedImages
@@ -47,7 +47,7 @@ def load_dataset(folder: str | os.PathLike[str]) -> PosedImages:
     bounds = _bounds(metadata)
     instances = read_instances(metadata.get("instances"))
     return PosedImages(
-        colours=_colours(root, frames, size),
+        colors=_colors(root, frames, size),
         intrinsics=intrinsics,
         T_world_camera=np.stack(poses),
         bounds=bounds,
@@ -139,9 +139,9 @@ def _metric_world(metadata: dict[str, Any]) -> NDArray[np.float64] | None:
     return None if given is None else similarity(given, "worldtogt", _INVALID)
 
 
-def _colours(folder: Path, frames: list[dict[str, Any]], size: Size) -> NDArray[np.uint8]:
+def _colors(folder: Path, frames: list[dict[str, Any]], size: Size) -> NDArray[np.uint8]:
     paths = [resolve(folder, frame.get("rgb_path"), f"rgb_path of frame {i}") for i, frame in enumerate(frames)]
-    return np.stack([read_colours(path, size) for path in paths])
+    return np.stack([read_colors(path, size) for path in paths])
 
 
 def _depths(

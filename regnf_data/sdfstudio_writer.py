@@ -18,7 +18,7 @@ from regnf_data.sdfstudio_reader import METADATA
 
 
 def write_dataset(images: PosedImages, folder: str | os.PathLike[str]) -> None:
-    """Write ``meta_data.json``, colours and masks as PNG, depths as ``.npy`` in world units.
+    """Write ``meta_data.json``, colors and masks as PNG, depths as ``.npy`` in world units.
 
     All of it or nothing: the folder appears when it is whole. It may exist if it is empty.
     Raises DatasetError (DATASET_FOLDER_NOT_EMPTY) and OSError.
@@ -50,7 +50,7 @@ def _write_frame(images: PosedImages, index: int, folder: Path) -> dict[str, Any
         "camtoworld": images.T_world_camera[index].tolist(),
         "intrinsics": intrinsics.tolist(),
     }
-    Image.fromarray(images.colours[index]).save(folder / frame["rgb_path"])
+    Image.fromarray(images.colors[index]).save(folder / frame["rgb_path"])
     if images.depths is not None:
         frame["sensor_depth_path"] = f"{name}_depth.npy"
         np.save(folder / frame["sensor_depth_path"], images.depths[index])

@@ -16,7 +16,7 @@ class DepthSensor:
     """Depth noise. Axial and lateral errors by Nguyen, Izadi and Lovell (2012) for the first Kinect.
 
     "Modeling Kinect sensor noise for improved 3D reconstruction and tracking", 3DIMPVT 2012: the axial deviation at
-    depth z is .0012 + .0019 (z - .4)^2 metres, the lateral one .8 pixels of an image 640 wide. Their further terms
+    depth z is .0012 + .0019 (z - .4)^2 meters, the lateral one .8 pixels of an image 640 wide. Their further terms
     for surfaces seen at more than 60 degrees are left out; beyond ``grazing_deg`` readings are lost instead.
     """
 
@@ -33,7 +33,7 @@ class DepthSensor:
     axial: bool = True
 
     def deviation_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Standard deviation of the axial error at depths in metres."""
+        """Standard deviation of the axial error at depths in meters."""
         deviation: NDArray[np.float64] = 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
         return deviation if self.axial else np.zeros_like(deviation)
 
@@ -42,24 +42,24 @@ class DepthSensor:
         depth: NDArray[np.float64],
         cosine: NDArray[np.float64],
         rng: np.random.Generator,
-        metres_per_unit: float = 1.0,
+        meters_per_unit: float = 1.0,
     ) -> NDArray[np.float64]:
         """What the sensor reads of an exact depth image (H, W), 0 where it reads nothing; the image's own units.
 
         cosine: (H, W), between the ray and the surface's normal.
         """
-        exact = depth * metres_per_unit
+        exact = depth * meters_per_unit
         lost = cosine < np.cos(np.radians(self.grazing_deg))
         lost |= jumps(exact, self.edge_jump_m) & (rng.random(exact.shape) < self.edge_dropout)
         seen = self._sideways(exact, rng)
         read = seen + self.deviation_m(seen) * rng.normal(size=exact.shape)
         read = np.round(read / self.step_m) * self.step_m
         lost |= (exact <= 0.0) | (seen <= 0.0) | (read < self.nearest_m) | (read > self.farthest_m)
-        readings: NDArray[np.float64] = np.where(lost, 0.0, read / metres_per_unit)
+        readings: NDArray[np.float64] = np.where(lost, 0.0, read / meters_per_unit)
         return readings
 
     def _sideways(self, depth: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-        """Every pixel's depth taken from a neighbour that lies as far as the lateral error says, mostly itself."""
+        """Every pixel's depth taken from a neighbor that lies as far as the lateral error says, mostly itself."""
         height, width = depth.shape
         shift = rng.normal(scale=self.lateral_pixels * width / _NGUYEN_WIDTH, size=(2, height, width))
         rows, columns = np.indices(depth.shape) + np.round(shift).astype(np.int64)
@@ -68,7 +68,7 @@ class DepthSensor:
 
 
 def jumps(depth: NDArray[np.float64], jump: float) -> NDArray[np.bool_]:
-    """(H, W): pixels whose depth (H, W) is off by ``jump`` or more from the plane through its neighbours on two sides.
+    """(H, W): pixels whose depth (H, W) is off by ``jump`` or more from the plane through its neighbors on two sides.
 
     On a plane, however slanted, 1 / z is linear in the pixels: only edges and the background (0) count.
     """

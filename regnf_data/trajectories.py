@@ -1,4 +1,4 @@
-"""Where cameras stand and what they look at: orbits of an object, walks through a room, one bad view. Metres, z up."""
+"""Where cameras stand and what they look at: orbits of an object, walks through a room, one bad view. Meters, z up."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ def framing_distance(bounds: Array, half_view: float) -> float:
 
 def orbit(bounds: Array, frames: int, half_view: float, floor: float) -> Array:
     """(frames, 4, 4): rings at four heights round bounds (2, 3), the lowest just above the floor."""
-    centre = bounds.mean(axis=0)
+    center = bounds.mean(axis=0)
     distance = framing_distance(bounds, half_view)
     counts = _shared_out(frames, _RING_SHARES)
     positions = []
-    for ring, (count, elevation) in enumerate(zip(counts, _elevations(centre, distance, floor), strict=True)):
+    for ring, (count, elevation) in enumerate(zip(counts, _elevations(center, distance, floor), strict=True)):
         azimuth = 2.0 * np.pi * (np.arange(count) + 0.5 * (ring % 2)) / max(count, 1)
-        positions.append(_on_sphere(centre, distance, azimuth, np.full(count, elevation)))
-    return _towards(np.concatenate(positions), centre)
+        positions.append(_on_sphere(center, distance, azimuth, np.full(count, elevation)))
+    return _towards(np.concatenate(positions), center)
 
 
 def pass_by(bounds: Array, frames: int, half_view: float, floor: float) -> Array:
     """(frames, 4, 4): an arc of 130 degrees about the direction +x of bounds (2, 3), at one height."""
-    centre = bounds.mean(axis=0)
+    center = bounds.mean(axis=0)
     distance = framing_distance(bounds, half_view)
     half = math.radians(_SHORT_ARC_DEG) / 2.0
-    elevation = _elevations(centre, distance, floor)[1]
-    return _towards(_on_sphere(centre, distance, np.linspace(-half, half, frames), np.full(frames, elevation)), centre)
+    elevation = _elevations(center, distance, floor)[1]
+    return _towards(_on_sphere(center, distance, np.linspace(-half, half, frames), np.full(frames, elevation)), center)
 
 
 def long_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Array:
@@ -86,9 +86,9 @@ def short_walk(ground: WalkingGround, boxes: Sequence[Array], frames: int) -> Ar
     The gaze lies between the middle of all boxes (2, 3) and the nearest one. What faces away is never seen.
     """
     path = max(ground.sides(), key=lambda side: float(ground.clearance_along(side).mean()))
-    centres = np.array([box.mean(axis=0) for box in boxes])
-    nearest = np.linalg.norm(path[:, None] - centres[None, :, :2], axis=2).argmin(axis=1)
-    gaze = (1.0 - _GAZE_AT_NEAREST) * centres.mean(axis=0) + _GAZE_AT_NEAREST * centres[nearest]
+    centers = np.array([box.mean(axis=0) for box in boxes])
+    nearest = np.linalg.norm(path[:, None] - centers[None, :, :2], axis=2).argmin(axis=1)
+    gaze = (1.0 - _GAZE_AT_NEAREST) * centers.mean(axis=0) + _GAZE_AT_NEAREST * centers[nearest]
     return _walked(path, gaze, frames, WALK_HEIGHTS_M[0])
 
 
@@ -110,10 +110,10 @@ def _tour(ground: WalkingGround, boxes: Sequence[Array]) -> tuple[Array, Array]:
 
 def _ring(ground: WalkingGround, box: Array, start: Array) -> Array:
     """Stops (S, 2) round a box, at the cells nearest to a ring; the first is where the walker comes from."""
-    centre, half = box.mean(axis=0)[:2], (box[1] - box[0])[:2] / 2.0
-    first = math.atan2(*(start - centre)[::-1])
+    center, half = box.mean(axis=0)[:2], (box[1] - box[0])[:2] / 2.0
+    first = math.atan2(*(start - center)[::-1])
     angles = first + 2.0 * np.pi * np.arange(_RING_STEPS + 1) / _RING_STEPS
-    ring = centre + (np.linalg.norm(half) + _RING_MARGIN_M) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    ring = center + (np.linalg.norm(half) + _RING_MARGIN_M) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return ground.nearest(ring)
 
 
@@ -129,21 +129,21 @@ def _walked(path: Array, watched: Array, frames: int, height: float) -> Array:
     return look_at(np.concatenate([positions, np.full((frames, 1), height)], axis=1), gaze)
 
 
-def _elevations(centre: Array, distance: float, floor: float) -> tuple[float, ...]:
+def _elevations(center: Array, distance: float, floor: float) -> tuple[float, ...]:
     """Of the rings, radians; the lowest as deep as the floor allows, at most 10 degrees below the middle."""
-    lowest = -min(math.asin(min(max((centre[2] - floor - CLEARANCE_M) / distance, -0.5), 0.5)), math.radians(10.0))
+    lowest = -min(math.asin(min(max((center[2] - floor - CLEARANCE_M) / distance, -0.5), 0.5)), math.radians(10.0))
     return (lowest, *np.radians(_ELEVATIONS_DEG).tolist())
 
 
-def _on_sphere(centre: Array, distance: float, azimuth: Array, elevation: Array) -> Array:
+def _on_sphere(center: Array, distance: float, azimuth: Array, elevation: Array) -> Array:
     level = np.cos(elevation)
     unit = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
-    around: Array = centre + distance * unit
+    around: Array = center + distance * unit
     return around
 
 
-def _towards(positions: Array, centre: Array) -> Array:
-    return look_at(positions, np.broadcast_to(centre, positions.shape))
+def _towards(positions: Array, center: Array) -> Array:
+    return look_at(positions, np.broadcast_to(center, positions.shape))
 
 
 def _shared_out(count: int, shares: Sequence[float]) -> list[int]:

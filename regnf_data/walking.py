@@ -19,14 +19,14 @@ _BODY_M = (0.3, 0.5, 0.75, 1.0, 1.25, 1.5, 1.7)
 """Heights above the floor at which the walker needs room."""
 _RADIUS_M = 0.2
 _LEAST_CELLS = 100
-_NEIGHBOURS = ((1, 0), (0, 1), (1, 1), (1, -1))
+_NEIGHBORS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
 class WalkingGround:
     """Cells of 10 cm that are free from 30 cm to 1.7 m above the floor, all connected.
 
     floor: (2, 3), lowest and highest corner of the floor's slab. Raises DatasetError (DATASET_NO_FREE_PATH) when less
-    than a square metre is free.
+    than a square meter is free.
     """
 
     def __init__(self, scene: MeshScene, floor: Array) -> None:
@@ -43,7 +43,7 @@ class WalkingGround:
             raise DatasetError("there is no room to walk between the furniture", reason="DATASET_NO_FREE_PATH")
         self._free = areas == largest
         self.cells: Array = grid[self._free]
-        """(C, 2), metres."""
+        """(C, 2), meters."""
         self.clearance: Array = clearance[self._free]
         """(C,): distance to the nearest matter at any of the walker's heights."""
 
@@ -81,7 +81,7 @@ class WalkingGround:
         number[self._free] = np.arange(len(self.cells))
         padded = np.pad(number, 1, constant_values=-1)
         links = []
-        for down, right in _NEIGHBOURS:
+        for down, right in _NEIGHBORS:
             other = padded[1 + down : 1 + down + number.shape[0], 1 + right : 1 + right + number.shape[1]]
             both = (number >= 0) & (other >= 0)
             links.append((number[both], other[both], np.full(int(both.sum()), _CELL_M * np.hypot(down, right))))

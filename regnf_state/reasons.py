@@ -52,7 +52,7 @@ REASONS: dict[str, Reason] = {
     "UPLOAD_INCOMPLETE": Reason(400, "Incomplete upload", "The body ended before its declared length."),
     "UPLOAD_STALLED": Reason(408, "Upload stalled", "The body sent nothing for too long. Nothing was kept."),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
-    "FIELD_NOT_RECOGNISED": Reason(
+    "FIELD_NOT_RECOGNIZED": Reason(
         415, "Not a field file", "By its first bytes, or inside, the file is none of the fields that the service knows."
     ),
     "TOO_MANY_UPLOADS": Reason(429, "Too many uploads at once", "Let one of yours end, then repeat."),

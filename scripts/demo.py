@@ -91,8 +91,8 @@ def show(result: dict[str, Any]) -> bool:
     )
     console.print("error against the truth")
     for name, value, bound, unit in errors:
-        colour = "green" if value <= bound else "red"
-        console.print(f"   {name:<12} [{colour}]{value:.4f}[/] {unit} (at most {bound:g})")
+        color = "green" if value <= bound else "red"
+        console.print(f"   {name:<12} [{color}]{value:.4f}[/] {unit} (at most {bound:g})")
     return result["verdict"] == "registered" and all(value <= bound for _, value, bound, _ in errors)
 
 

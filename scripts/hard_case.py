@@ -27,7 +27,7 @@ from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.nearest_neighbors import gaps
 from regnf_core.surface.cameras import Rays
 from regnf_core.surface.sphere_tracing import clip_to_region, first_hits
-from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR
+from regnf_core.viewing.preview import OBJECT_COLOR, SCENE_COLOR
 from regnf_core.viewing.splats import Surfels, render, view_from
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,7 +39,7 @@ EYE = np.array([0.30, -0.33, 0.27])
 PIXELS, REACH, FAR = 220, 0.27, 1.5
 _PANEL, _CAPTION, _SUPERSAMPLING = 420, 56, 2
 _GROUND = np.array([0.975, 0.975, 0.97])
-_INK, _GREY = (52, 56, 62), (120, 124, 130)
+_INK, _GRAY = (52, 56, 62), (120, 124, 130)
 
 Floats = NDArray[np.float64]
 
@@ -99,10 +99,10 @@ def depth_image(room: SdfField, position: Floats, target: Floats) -> DepthImage:
 
 def picture(case: Case, result: RegistrationResult) -> Image.Image:
     """Three panels: what the camera saw; all that is known, from behind; the library's chair laid onto it."""
-    seen = cloud(result.scene_samples.points, result.scene_samples.normals, SCENE_COLOUR)
+    seen = cloud(result.scene_samples.points, result.scene_samples.normals, SCENE_COLOR)
     back = result.T_object_scene.inverse()
     obj = result.object_samples
-    placed = cloud(back.apply(obj.points.double()), obj.normals.double() @ back.rotation.mT, OBJECT_COLOUR)
+    placed = cloud(back.apply(obj.points.double()), obj.normals.double() @ back.rotation.mT, OBJECT_COLOR)
     errors = errors_against_truth(result.T_object_scene, case.truth, obj.points)
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _GROUND))
     both = Surfels.join(seen, placed)
@@ -118,16 +118,16 @@ def picture(case: Case, result: RegistrationResult) -> Image.Image:
     return sheet
 
 
-def cloud(points: torch.Tensor, normals: torch.Tensor, colour: tuple[float, float, float]) -> Surfels:
-    """Points and normals (N, 3) as discs of one colour."""
+def cloud(points: torch.Tensor, normals: torch.Tensor, color: tuple[float, float, float]) -> Surfels:
+    """Points and normals (N, 3) as discs of one color."""
     array = points.double().numpy()
-    return Surfels(array, normals.double().numpy(), np.broadcast_to(np.array(colour), array.shape))
+    return Surfels(array, normals.double().numpy(), np.broadcast_to(np.array(color), array.shape))
 
 
 def panel(discs: Surfels, framed: Surfels, case: Case) -> Image.Image:
     """The discs from behind and above, so large that ``framed`` fills the panel."""
     up = np.array([0.0, 0.0, 1.0])
-    away = case.box.centre.numpy() - EYE
+    away = case.box.center.numpy() - EYE
     direction = np.array([away[0], 0.4 * away[1], 0.45 * np.linalg.norm(away)])
     edge = _PANEL * _SUPERSAMPLING
     view = view_from(direction / np.linalg.norm(direction), up, framed.points, edge)
@@ -145,15 +145,15 @@ def shaded_depth(image: DepthImage) -> Image.Image:
     towards = (image.position - points) / np.linalg.norm(image.position - points, axis=-1, keepdims=True)
     light = np.abs((normals * towards).sum(-1))
     near = np.clip(1.15 - image.depth / (2.0 * np.median(image.depth)), 0.2, 1.0)
-    grey = np.where(image.depth < FAR, 0.25 + 0.75 * light * near, 0.97)
-    picture = Image.fromarray((255 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)).convert("RGB")
+    gray = np.where(image.depth < FAR, 0.25 + 0.75 * light * near, 0.97)
+    picture = Image.fromarray((255 * np.clip(gray, 0.0, 1.0)).astype(np.uint8)).convert("RGB")
     return picture.resize((_PANEL, _PANEL), Image.Resampling.LANCZOS)
 
 
 def caption(sheet: Image.Image, number: int, heading: str, note: str) -> None:
     draw = ImageDraw.Draw(sheet)
     draw.text((number * _PANEL + 18, 10), heading, fill=_INK, font=ImageFont.load_default(size=19))
-    draw.text((number * _PANEL + 18, 34), note, fill=_GREY, font=ImageFont.load_default(size=13))
+    draw.text((number * _PANEL + 18, 34), note, fill=_GRAY, font=ImageFont.load_default(size=13))
 
 
 def main() -> None:

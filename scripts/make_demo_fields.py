@@ -25,7 +25,7 @@ from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.mesh.fit import fit_field
 from regnf_fit.mesh.options import FitOptions
 
-OBJECT_UNITS_PER_METRE = 0.625
+OBJECT_UNITS_PER_METER = 0.625
 """1.25 object units a scene unit: the scale that the registration has to find."""
 LIBRARY = {"armchair": ("fc", ""), "dining-chair": ("dc", "-dining-chair")}
 """Library objects: the room's instance that shows each, and how its detection and truth files end."""
@@ -34,9 +34,9 @@ ATTRIBUTION = "Poly Haven, https://polyhaven.com, CC0 1.0"
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """A scene's frame: metres in the room's frame, less ``origin_m``, times ``units_per_metre``."""
+    """A scene's frame: meters in the room's frame, less ``origin_m``, times ``units_per_meter``."""
 
-    units_per_metre: float = 0.5
+    units_per_meter: float = 0.5
     origin_m: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
     @classmethod
@@ -44,16 +44,16 @@ class SceneFrame:
         """The frame that a layout asks for, or the usual one."""
         usual = cls()
         origin = room.get("scene_origin_m", usual.origin_m)
-        return cls(room.get("scene_units_per_metre", usual.units_per_metre), tuple(origin))
+        return cls(room.get("scene_units_per_meter", usual.units_per_meter), tuple(origin))
 
     def from_room(self) -> NDArray[np.float64]:
-        """(4, 4): metres in the room's frame to scene units."""
-        return scale_and_shift(self.units_per_metre, -self.units_per_metre * np.array(self.origin_m))
+        """(4, 4): meters in the room's frame to scene units."""
+        return scale_and_shift(self.units_per_meter, -self.units_per_meter * np.array(self.origin_m))
 
-    def points(self, metres: NDArray[np.float64]) -> NDArray[np.float64]:
+    def points(self, meters: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (N, 3) of the room's frame in scene units."""
         matrix = self.from_room()
-        moved: NDArray[np.float64] = metres @ matrix[:3, :3].T + matrix[:3, 3]
+        moved: NDArray[np.float64] = meters @ matrix[:3, :3].T + matrix[:3, 3]
         return moved
 
 
@@ -87,13 +87,13 @@ def scale_and_shift(scale: float, shift: NDArray[np.float64]) -> NDArray[np.floa
     return matrix
 
 
-def object_from_mesh(mesh: MeshField, units_per_metre: float = OBJECT_UNITS_PER_METRE) -> NDArray[np.float64]:
-    """(4, 4): metres in the mesh's frame to object units, the bounding box's centre moved to the origin."""
-    return scale_and_shift(units_per_metre, -units_per_metre * mesh.bounds.mean(dim=0).numpy())
+def object_from_mesh(mesh: MeshField, units_per_meter: float = OBJECT_UNITS_PER_METER) -> NDArray[np.float64]:
+    """(4, 4): meters in the mesh's frame to object units, the bounding box's center moved to the origin."""
+    return scale_and_shift(units_per_meter, -units_per_meter * mesh.bounds.mean(dim=0).numpy())
 
 
 def load_instance(meshes: Path, instance: dict[str, Any]) -> MeshField:
-    """An instance's mesh in its own frame, metres."""
+    """An instance's mesh in its own frame, meters."""
     return MeshField.load(meshes / Path(instance["mesh"]).name)
 
 
@@ -120,7 +120,7 @@ def detection(instance: dict[str, Any], frame: SceneFrame = SCENE_FRAME) -> dict
     """The instance's axis-aligned box in scene units."""
     lower, upper = frame.points(np.array([instance["aabb_min"], instance["aabb_max"]]))
     return {
-        "centre": ((lower + upper) / 2.0).tolist(),
+        "center": ((lower + upper) / 2.0).tolist(),
         "size": (upper - lower).tolist(),
         "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
         "label": "chair",
@@ -131,16 +131,16 @@ def detection(instance: dict[str, Any], frame: SceneFrame = SCENE_FRAME) -> dict
 def truth(
     instance: dict[str, Any],
     mesh: MeshField,
-    units_per_metre: float = OBJECT_UNITS_PER_METRE,
+    units_per_meter: float = OBJECT_UNITS_PER_METER,
     frame: SceneFrame = SCENE_FRAME,
 ) -> dict[str, Any]:
     """The true transform from scene to object, and the object's diameter (largest distance of two vertices)."""
     T_room_mesh = np.array(instance["T_room_from_object"])
-    matrix = object_from_mesh(mesh, units_per_metre) @ np.linalg.inv(frame.from_room() @ T_room_mesh)
-    scale = units_per_metre / frame.units_per_metre
+    matrix = object_from_mesh(mesh, units_per_meter) @ np.linalg.inv(frame.from_room() @ T_room_mesh)
+    scale = units_per_meter / frame.units_per_meter
     rotation = Rotation.from_matrix(matrix[:3, :3] / scale)
     matrix[:3, :3] = scale * rotation.as_matrix()
-    vertices = mesh.vertices * units_per_metre
+    vertices = mesh.vertices * units_per_meter
     diameter = max(float(np.linalg.norm(vertices - vertex, axis=1).max()) for vertex in vertices)
     return {
         "T_object_scene": {

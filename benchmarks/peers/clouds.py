@@ -1,4 +1,4 @@
-"""Point clouds for the methods that know only points: normalised in size or as they are, and in open3d's form."""
+"""Point clouds for the methods that know only points: normalized in size or as they are, and in open3d's form."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core import Sim3
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 from regnf_core.result import SurfaceSamples
 
 VOXEL = 0.08
 """Edge of the voxels, in root mean square radii of the object's cloud: a fortieth of its diameter, about."""
-_FEATURE_RADIUS, _NEIGHBOURS = 5.0, 100  # voxels, points: what open3d's own tutorial uses
+_FEATURE_RADIUS, _NEIGHBORS = 5.0, 100  # voxels, points: what open3d's own tutorial uses
 _FEWEST = 10
 
 
@@ -37,21 +37,21 @@ class CloudPair:
     def to_object_scene(self, T_object_scene_work: NDArray[np.float64]) -> Sim3:
         """T_object_scene from the 4x4 matrix that carries the scene's working points onto the object's.
 
-        Raises InitialisationError when the matrix is no similarity.
+        Raises InitializationError when the matrix is no similarity.
         """
         return self.T_work_object.inverse() @ similarity(T_object_scene_work) @ self.T_work_scene
 
 
-def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalised: bool) -> CloudPair:
-    """Both clouds moved to their centroids; ``normalised``: each also scaled to a root mean square radius of one."""
-    T_scene, _ = _centring(scene, normalised)
-    T_object, object_radius = _centring(obj, normalised)
+def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalized: bool) -> CloudPair:
+    """Both clouds moved to their centroids; ``normalized``: each also scaled to a root mean square radius of one."""
+    T_scene, _ = _centering(scene, normalized)
+    T_object, object_radius = _centering(obj, normalized)
     return CloudPair(
         T_scene.apply(scene.points.double()).numpy(),
         scene.normals.double().numpy(),
         T_object.apply(obj.points.double()).numpy(),
         obj.normals.double().numpy(),
-        VOXEL * (1.0 if normalised else object_radius),
+        VOXEL * (1.0 if normalized else object_radius),
         T_scene,
         T_object,
     )
@@ -60,7 +60,7 @@ def cloud_pair(scene: SurfaceSamples, obj: SurfaceSamples, normalised: bool) -> 
 def described(points: NDArray[np.float64], normals: NDArray[np.float64], voxel: float) -> tuple[Any, Any]:
     """An open3d cloud with one point a voxel, and its FPFH descriptors. Loads open3d.
 
-    Raises InitialisationError when too few voxels are filled.
+    Raises InitializationError when too few voxels are filled.
     """
     import open3d
     from open3d.pipelines import registration
@@ -69,8 +69,8 @@ def described(points: NDArray[np.float64], normals: NDArray[np.float64], voxel: 
     cloud.normals = open3d.utility.Vector3dVector(normals)
     cloud = cloud.voxel_down_sample(voxel)
     if len(cloud.points) < _FEWEST:
-        raise InitialisationError(f"the surface fills only {len(cloud.points)} voxels: too few")
-    reach = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS * voxel, _NEIGHBOURS)
+        raise InitializationError(f"the surface fills only {len(cloud.points)} voxels: too few")
+    reach = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS * voxel, _NEIGHBORS)
     return cloud, registration.compute_fpfh_feature(cloud, reach)
 
 
@@ -78,21 +78,21 @@ def similarity(matrix: NDArray[np.float64]) -> Sim3:
     """A 4x4 matrix from another package as a similarity.
 
     Its linear part may be off by a rounding error: the nearest rotation is taken, and the cube root of its determinant
-    as the scale. Raises InitialisationError when it is not finite, mirrors space, or shrinks it to nothing.
+    as the scale. Raises InitializationError when it is not finite, mirrors space, or shrinks it to nothing.
     """
     M = torch.tensor(np.asarray(matrix).tolist(), dtype=torch.float64)
     if not bool(torch.isfinite(M).all()):
-        raise InitialisationError("the method gave a transform that is not finite")
+        raise InitializationError("the method gave a transform that is not finite")
     determinant = torch.linalg.det(M[:3, :3])
     if float(determinant) <= 1e-12:
-        raise InitialisationError("the method gave a transform that mirrors or flattens space")
+        raise InitializationError("the method gave a transform that mirrors or flattens space")
     U, _, Vh = torch.linalg.svd(M[:3, :3])
     return Sim3(determinant ** (1.0 / 3.0), U @ Vh, M[:3, 3].clone())
 
 
-def _centring(samples: SurfaceSamples, normalised: bool) -> tuple[Sim3, float]:
+def _centering(samples: SurfaceSamples, normalized: bool) -> tuple[Sim3, float]:
     points = samples.points.double()
-    centre = points.mean(0)
-    radius = (points - centre).square().sum(-1).mean().sqrt().clamp_min(1e-9)
-    scale = 1.0 / radius if normalised else torch.ones((), dtype=torch.float64)
-    return Sim3(scale, torch.eye(3, dtype=torch.float64), -scale * centre), float(radius)
+    center = points.mean(0)
+    radius = (points - center).square().sum(-1).mean().sqrt().clamp_min(1e-9)
+    scale = 1.0 / radius if normalized else torch.ones((), dtype=torch.float64)
+    return Sim3(scale, torch.eye(3, dtype=torch.float64), -scale * center), float(radius)

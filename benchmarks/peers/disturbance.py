@@ -18,9 +18,9 @@ def disturbed(truth: Sim3, about: Tensor, degrees: float, shift: float, seed: in
     """
     generator = torch.Generator().manual_seed(seed)
     axis, direction = (_unit(torch.randn(3, generator=generator, dtype=torch.float64)) for _ in range(2))
-    centre = about.double().cpu()
+    center = about.double().cpu()
     tangent = torch.cat([torch.zeros(3), math.radians(degrees) * axis, torch.zeros(1)]).double()
-    turn = Sim3.from_translation(centre) @ Sim3.exp(tangent) @ Sim3.from_translation(-centre)
+    turn = Sim3.from_translation(center) @ Sim3.exp(tangent) @ Sim3.from_translation(-center)
     return Sim3.from_translation(shift * direction) @ turn @ truth
 
 
@@ -45,12 +45,12 @@ def keypoints(points: Tensor, truth: Sim3, count: int, noise: float, seed: int) 
 
 def rigid_fit(source: Tensor, target: Tensor) -> Sim3:
     """The rotation and translation, no scale, that carry (N, 3) onto (N, 3) in least squares (Kabsch 1976)."""
-    source_centre, target_centre = source.mean(0), target.mean(0)
-    U, _, Vh = torch.linalg.svd((target - target_centre).T @ (source - source_centre))
+    source_center, target_center = source.mean(0), target.mean(0)
+    U, _, Vh = torch.linalg.svd((target - target_center).T @ (source - source_center))
     sign = torch.ones(3, dtype=source.dtype)
     sign[2] = torch.linalg.det(U) * torch.linalg.det(Vh)
     R = U @ torch.diag(sign) @ Vh
-    return Sim3(torch.ones((), dtype=source.dtype), R, target_centre - R @ source_centre)
+    return Sim3(torch.ones((), dtype=source.dtype), R, target_center - R @ source_center)
 
 
 def _unit(vector: Tensor) -> Tensor:

@@ -27,17 +27,17 @@ class SmallGicp:
     uses_samples: bool = True
 
     def register(self, case: PeerCase, seed: int) -> PeerResult:
-        """Raises InitialisationError for a transform that is none; MissingPackageError."""
+        """Raises InitializationError for a transform that is none; MissingPackageError."""
         try:
             import small_gicp
         except ImportError as error:
             raise MissingPackageError("small_gicp") from error
 
         begun = time.perf_counter()
-        centre = case.object_samples.points.double().mean(0)
-        T_start = disturbed(case.truth, centre, _DEGREES, _SHIFT * case.diameter, seed)
+        center = case.object_samples.points.double().mean(0)
+        T_start = disturbed(case.truth, center, _DEGREES, _SHIFT * case.diameter, seed)
         unit = torch.tensor(1.0 / case.diameter, dtype=torch.float64)
-        to_unit = Sim3(unit, torch.eye(3, dtype=torch.float64), -unit * centre.cpu())
+        to_unit = Sim3(unit, torch.eye(3, dtype=torch.float64), -unit * center.cpu())
         source = (to_unit @ T_start).apply(case.scene_samples.points.double())
         target = to_unit.apply(case.object_samples.points.double())
         found = small_gicp.align(

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.peers.clouds import cloud_pair
 from benchmarks.peers.interface import MissingPackageError, PeerCase, PeerResult
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 
 
 @dataclass(frozen=True)
@@ -19,31 +19,31 @@ class KissMatcher:
     Nothing refines the pose afterwards: the package stops there.
     """
 
-    normalised: bool
+    normalized: bool
     uses_samples: bool = True
 
     @property
     def name(self) -> str:
-        return "kiss_matcher normalised" if self.normalised else "kiss_matcher"
+        return "kiss_matcher normalized" if self.normalized else "kiss_matcher"
 
     @property
     def given(self) -> str:
-        return "both clouds scaled to the same root mean square radius" if self.normalised else ""
+        return "both clouds scaled to the same root mean square radius" if self.normalized else ""
 
     def register(self, case: PeerCase, seed: int) -> PeerResult:  # noqa: ARG002 (the package draws no random numbers)
-        """Raises InitialisationError when it finds its own solution invalid; MissingPackageError."""
+        """Raises InitializationError when it finds its own solution invalid; MissingPackageError."""
         try:
             import kiss_matcher
         except ImportError as error:
             raise MissingPackageError("kiss-matcher") from error
 
         begun = time.perf_counter()
-        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalised)
+        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized)
         matcher = kiss_matcher.KISSMatcher(kiss_matcher.KISSMatcherConfig(voxel_size=pair.voxel))
         found = matcher.estimate(list(pair.scene.astype(np.float32)), list(pair.object.astype(np.float32)))
         seconds = time.perf_counter() - begun
         if not found.valid:
-            raise InitialisationError("KISS-Matcher calls its own solution invalid")
+            raise InitializationError("KISS-Matcher calls its own solution invalid")
         matrix = np.eye(4)
         matrix[:3, :3] = np.asarray(found.rotation, dtype=np.float64)
         matrix[:3, 3] = np.asarray(found.translation, dtype=np.float64).ravel()

@@ -3,8 +3,8 @@
     L(T) = E_{x in A} kappa(S_b(T x) - S_a(x)) + lambda(k) mean_i |T p_i - q_i|^2
 
 T is rigid: the method assumes that both fields have one scale. A are samples of the scene a, (p_i, q_i) keypoints that
-a person marked in both fields, kappa Barron's adaptive robust kernel with learnt shape and scale, lambda cooled by half
-a cosine from one to nothing. Adam takes 10,000 steps over the six degrees of freedom.
+a person marked in both fields, kappa Barron's adaptive robust kernel with learned shape and scale, lambda cooled by
+half a cosine from one to nothing. Adam takes 10,000 steps over the six degrees of freedom.
 
 Adapted: the authors' surface field is the likelihood, drawn from a NeRF's density, that a point lies on a surface. Here
 S is the signed distance, as in the Reg-NF paper's own comparison, which gave nerf2nerf "the same surface fields from
@@ -84,13 +84,13 @@ class Nerf2nerf:
 
 
 class RigidMotion:
-    """T_object_scene without scale, as six numbers about a start: float64 leaves for the optimiser.
+    """T_object_scene without scale, as six numbers about a start: float64 leaves for the optimizer.
 
-    T x = exp(turn) (T_start x - centre) + centre + unit * shift; turn (3,) radians, shift (3,) in ``unit``s.
+    T x = exp(turn) (T_start x - center) + center + unit * shift; turn (3,) radians, shift (3,) in ``unit``s.
     """
 
-    def __init__(self, start: Sim3, centre: Tensor, unit: float) -> None:
-        self.start, self.centre, self.unit = start, centre.double(), unit
+    def __init__(self, start: Sim3, center: Tensor, unit: float) -> None:
+        self.start, self.center, self.unit = start, center.double(), unit
         self.turn = torch.zeros(3, dtype=torch.float64, requires_grad=True)
         self.shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
 
@@ -98,7 +98,7 @@ class RigidMotion:
         """The transform; differentiable in ``turn`` and ``shift``."""
         nothing = torch.zeros(3, dtype=torch.float64)
         _, R, _ = exp_parts(torch.cat([nothing, self.turn, nothing[:1]]))
-        offset = R @ (self.start.translation - self.centre) + self.centre + self.unit * self.shift
+        offset = R @ (self.start.translation - self.center) + self.center + self.unit * self.shift
         return Sim3(self.start.scale, R @ self.start.rotation, offset)
 
 
@@ -108,7 +108,7 @@ def one_way_residuals(points: Tensor, own_distance: Tensor, obj: SdfField, T_obj
 
 
 class _Run:
-    """One optimisation: the motion, the kernel, the samples, and Adam's state."""
+    """One optimization: the motion, the kernel, the samples, and Adam's state."""
 
     def __init__(self, case: PeerCase, seed: int) -> None:
         self.scene, self.obj = CountingField(case.scene), CountingField(case.obj)
@@ -116,8 +116,8 @@ class _Run:
         self.generator = torch.Generator().manual_seed(seed)
         noise = _KEYPOINT_NOISE * case.diameter
         self.marked = keypoints(case.scene_samples.points, case.truth, _KEYPOINTS, noise, seed)
-        centre = case.object_samples.points.double().mean(0)
-        self.motion = RigidMotion(rigid_fit(*self.marked), centre, case.diameter)
+        center = case.object_samples.points.double().mean(0)
+        self.motion = RigidMotion(rigid_fit(*self.marked), center, case.diameter)
         self.kernel = AdaptiveKernel()
         self.samples = thin_out(case.scene_samples, _SAMPLES, self.generator).points
         self.own_distance = self.scene.signed_distance(self.samples)

@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.peers.clouds import CloudPair, cloud_pair, described
 from benchmarks.peers.interface import PeerCase, PeerResult
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 
 _RANSAC_DISTANCE, _EDGE_RATIO, _RANSAC_POINTS = 1.5, 0.9, 4  # voxels; Reg-NF's values
 _RANSAC_ITERATIONS, _CONFIDENCE = 100_000, 0.999
@@ -18,25 +18,25 @@ _ICP_DISTANCES = (1.5, 0.4)  # voxels: coarse, then Reg-NF's
 
 @dataclass(frozen=True)
 class FastGlobalRegistration:
-    """FGR on FPFH features. It has no scale: ``normalised`` clouds lend it the ratio of their sizes."""
+    """FGR on FPFH features. It has no scale: ``normalized`` clouds lend it the ratio of their sizes."""
 
-    normalised: bool
+    normalized: bool
     uses_samples: bool = True
 
     @property
     def name(self) -> str:
-        return "fgr normalised" if self.normalised else "fgr"
+        return "fgr normalized" if self.normalized else "fgr"
 
     @property
     def given(self) -> str:
-        return "exact normals" + _SIZE * self.normalised
+        return "exact normals" + _SIZE * self.normalized
 
     def register(self, case: PeerCase, seed: int) -> PeerResult:
-        """Raises InitialisationError where the clouds are too small or no transform is found."""
+        """Raises InitializationError where the clouds are too small or no transform is found."""
         from open3d.pipelines import registration
 
         begun = time.perf_counter()
-        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalised)
+        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized)
         scene, obj = _features(pair, seed)
         found = registration.registration_fgr_based_on_feature_matching(
             scene[0],
@@ -57,28 +57,28 @@ class RansacIcp:
     no check of edge lengths, which would forbid a change of scale.
     """
 
-    normalised: bool
+    normalized: bool
     scaled: bool
     uses_samples: bool = True
 
     @property
     def name(self) -> str:
-        return "ransac_icp" + " normalised" * self.normalised + " scaled" * self.scaled
+        return "ransac_icp" + " normalized" * self.normalized + " scaled" * self.scaled
 
     @property
     def given(self) -> str:
-        return "exact normals" + _SIZE * self.normalised
+        return "exact normals" + _SIZE * self.normalized
 
     def register(self, case: PeerCase, seed: int) -> PeerResult:
-        """Raises InitialisationError where the clouds are too small or no match survives."""
+        """Raises InitializationError where the clouds are too small or no match survives."""
         from open3d.pipelines import registration
 
         begun = time.perf_counter()
-        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalised)
+        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized)
         scene, obj = _features(pair, seed)
         matched = self._ransac(scene, obj, pair.voxel)
         if len(matched.correspondence_set) == 0:
-            raise InitialisationError("feature matching found no transform between the two surfaces")
+            raise InitializationError("feature matching found no transform between the two surfaces")
         T = matched.transformation
         estimation = (
             registration.TransformationEstimationPointToPoint(with_scaling=True)

@@ -26,27 +26,27 @@ class Splatreg:
     """
 
     start: str
-    normalised: bool = False
+    normalized: bool = False
     uses_samples: bool = True
 
     @property
     def name(self) -> str:
-        return f"splatreg {self.start}" + " normalised" * self.normalised
+        return f"splatreg {self.start}" + " normalized" * self.normalized
 
     @property
     def given(self) -> str:
-        size = ", both clouds scaled to the same root mean square radius" if self.normalised else ""
+        size = ", both clouds scaled to the same root mean square radius" if self.normalized else ""
         return f"exact normals{size}"
 
     def register(self, case: PeerCase, seed: int) -> PeerResult:
-        """Raises InitialisationError for a transform that is none; MissingPackageError."""
+        """Raises InitializationError for a transform that is none; MissingPackageError."""
         try:
             import splatreg
         except ImportError as error:
             raise MissingPackageError("splatreg") from error
 
         begun = time.perf_counter()
-        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalised)
+        pair = cloud_pair(case.scene_samples, case.object_samples, self.normalized)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             scene, obj = _splats(splatreg, pair, "scene"), _splats(splatreg, pair, "object")

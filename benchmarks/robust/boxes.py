@@ -1,4 +1,4 @@
-"""Table 4: detection boxes that are off centre and of the wrong size, with the neighbours' matter in them."""
+"""Table 4: detection boxes that are off center and of the wrong size, with the neighbors' matter in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from regnf_core import OrientedBox
 
 NAME = "boxes"
 SHIFT, STRETCH = 0.2, 0.3
-"""Largest shift of the centre and change of an edge, shares of the edge."""
+"""Largest shift of the center and change of an edge, shares of the edge."""
 
 
 def table(context: Context) -> Table:
@@ -36,7 +36,7 @@ def table(context: Context) -> Table:
         ],
         [
             accuracy_section(
-                "Along every axis the centre is shifted by up to 20 % of the size and the size changed by up to 30 %, "
+                "Along every axis the center is shifted by up to 20 % of the size and the size changed by up to 30 %, "
                 "drawn evenly.",
                 "pair",
                 runs,
@@ -52,6 +52,6 @@ def noisy(pair: Pair, draw: int) -> Case:
     generator = torch.Generator().manual_seed(1000 + draw)
     shift, change = 2 * torch.rand(2, 3, generator=generator, dtype=torch.float64) - 1
     box = pair.detection
-    centre = box.centre + box.rotation @ (SHIFT * shift * box.size)
+    center = box.center + box.rotation @ (SHIFT * shift * box.size)
     size = box.size * (1 + STRETCH * change)
-    return replace(pair.case().in_box(OrientedBox(centre, size, box.rotation)), name=f"{pair.name} box {draw}")
+    return replace(pair.case().in_box(OrientedBox(center, size, box.rotation)), name=f"{pair.name} box {draw}")

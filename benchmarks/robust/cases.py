@@ -38,7 +38,7 @@ class Case:
         """The same with the scene and the object in new frames; the detection turns with the scene."""
         box = self.detection
         detection = OrientedBox(
-            T_new_scene.apply(box.centre[None])[0], box.size * T_new_scene.scale, T_new_scene.rotation @ box.rotation
+            T_new_scene.apply(box.center[None])[0], box.size * T_new_scene.scale, T_new_scene.rotation @ box.rotation
         )
         truth = None if self.truth is None else T_new_object @ self.truth @ T_new_scene.inverse()
         return Case(
@@ -112,7 +112,7 @@ def exact_surface(folder: Path, room: str) -> tuple[NDArray[np.float32], NDArray
 
 
 def _pair(folder: Path, values: dict[str, Any]) -> Pair:
-    box = OrientedBox.from_quaternion(values["detection"]["centre"], values["detection"]["size"])
+    box = OrientedBox.from_quaternion(values["detection"]["center"], values["detection"]["size"])
     truth = Sim3.from_dict(values["truth"]["T_object_scene"])
     names = (values["room"], values["object"], values["instance"])
     return Pair(folder, *names, box, truth, values["truth"]["object_diameter"])

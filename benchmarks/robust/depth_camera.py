@@ -34,7 +34,7 @@ class DepthCamera:
 
 
 def noisy(image: DepthImage, deviation: float, seed: int) -> DepthImage:
-    """The image with Gaussian errors of the depth, alike in neighbouring pixels. deviation: scene units."""
+    """The image with Gaussian errors of the depth, alike in neighboring pixels. deviation: scene units."""
     white = np.random.default_rng(seed).normal(size=image.depth.shape)
     smooth = ndimage.gaussian_filter(white, _NOISE_PIXELS, mode="wrap")
     depth = image.depth + deviation * smooth / smooth.std()

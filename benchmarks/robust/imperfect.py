@@ -1,4 +1,4 @@
-"""Table 13: fields fitted to posed images, and what is left when they saw little or learnt little.
+"""Table 13: fields fitted to posed images, and what is left when they saw little or learned little.
 
 FIELDS is the folder of benchmarks.make_image_fields.
 """

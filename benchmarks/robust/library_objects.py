@@ -70,7 +70,7 @@ REMOVALS = (
 
 
 def library_meshes(meshes: Path) -> list[tuple[str, MeshField]]:
-    """All 64, by name, in metres, z up; ``meshes`` is the folder of the given ones."""
+    """All 64, by name, in meters, z up; ``meshes`` is the folder of the given ones."""
     given = {name: MeshField.load(meshes / f"{name}.glb") for name in GIVEN}
     stretched = {
         f"{one.of} stretched {one.factor:g} along {'xyz'[one.axis]}": stretch(given[one.of], one.axis, one.factor)
@@ -104,7 +104,7 @@ def without(mesh: MeshField, removal: Removal) -> MeshField:
 
 
 def simple_furniture() -> dict[str, MeshField]:
-    """Seventeen pieces made of boxes and turned profiles, metres. Parts reach into each other, as real meshes' do."""
+    """Seventeen pieces made of boxes and turned profiles, meters. Parts reach into each other, as real meshes' do."""
     return {
         "square table": four_legs(0.9, 0.9, 0.74, 0.03, 0.06),
         "long table": four_legs(2.0, 0.8, 0.75, 0.04, 0.09),
@@ -138,19 +138,19 @@ def simple_furniture() -> dict[str, MeshField]:
 
 
 def posts(places: Sequence[float], y: float, width: float, depth: float, height: float) -> list[MeshField]:
-    """Upright boxes from z = 0, their lowest x at ``places``, metres."""
+    """Upright boxes from z = 0, their lowest x at ``places``, meters."""
     return [box((x, y, 0.0), (x + width, y + depth, height)) for x in places]
 
 
 def four_legs(width: float, depth: float, height: float, slab: float, leg: float) -> MeshField:
-    """A table: a slab on four square legs, metres."""
+    """A table: a slab on four square legs, meters."""
     x, y = width / 2, depth / 2
     legs = [post for front in (-y, y - leg) for post in posts((-x, x - leg), front, leg, leg, height - slab / 2)]
     return together(box((-x, -y, height - slab), (x, y, height)), *legs)
 
 
 def shelf(width: float, depth: float, height: float, boards: int) -> MeshField:
-    """Two sides and ``boards`` boards between them, the lowest and the highest at the ends, metres."""
+    """Two sides and ``boards`` boards between them, the lowest and the highest at the ends, meters."""
     x, y, thick = width / 2, depth / 2, 0.02
     heights = np.linspace(0.0, height - thick, boards)
     return together(

@@ -24,7 +24,7 @@ from scripts.make_demo_fields import SCENE_FRAME
 NAME = "one_view"
 AZIMUTHS = tuple(math.radians(20.0 + 72.0 * k) for k in range(5))
 EYE_M, DISTANCE_M, WALL_M, FAR_M, NOISE_M = 1.6, 2.2, -2.3, 8.0, 0.01
-"""Height of the camera, its distance along the floor, how near it comes to the two walls (x and y), metres."""
+"""Height of the camera, its distance along the floor, how near it comes to the two walls (x and y), meters."""
 _RIGHT_GROUPS = {False: "exact depth", True: "depth with 1 cm noise"}
 _HIDDEN = 0.015
 """Object diameters within matter from which a point counts as hidden."""
@@ -66,7 +66,7 @@ def table(context: Context) -> Table:
         notes=[
             f"The camera stands {EYE_M:g} m above the floor, {DISTANCE_M:g} m from the object or as far as the walls "
             "allow, and sees 60 degrees across in 400 pixels. Everything behind what it sees is solid: the exact "
-            "distance to the surface of triangles between neighbouring pixels. Noise is alike in neighbouring pixels. "
+            "distance to the surface of triangles between neighboring pixels. Noise is alike in neighboring pixels. "
             "The objects are fitted fields."
         ],
     )
@@ -117,17 +117,17 @@ def _jobs(context: Context) -> Iterator[Job]:
 def seen_once(pair: Pair, view: int, noise: bool, other: str | None = None) -> Case:
     """The pair, its scene known from one depth image; ``other`` is looked for instead of the right object."""
     case = pair.case() if other is None else pair.with_other(other)
-    middle = pair.detection.centre.numpy()
+    middle = pair.detection.center.numpy()
     image = _camera(pair.folder, pair.room).look(camera_position(middle, AZIMUTHS[view]), middle)
     if noise:
-        image = noisy(image, NOISE_M * SCENE_FRAME.units_per_metre, seed=view)
+        image = noisy(image, NOISE_M * SCENE_FRAME.units_per_meter, seed=view)
     scene = OneViewField(image, case.scene.bounds)
     return replace(case, name=f"{case.name} view {view}", scene=scene)
 
 
 def camera_position(middle: Array, azimuth: float) -> Array:
     """Where the camera stands, scene frame; ``middle`` (3,) is what it looks at."""
-    unit = SCENE_FRAME.units_per_metre
+    unit = SCENE_FRAME.units_per_meter
     direction = np.array([math.cos(azimuth), math.sin(azimuth)])
     limits = SCENE_FRAME.points(np.array([[WALL_M, WALL_M, EYE_M]]))[0]
     room = [(limits[k] - middle[k]) / direction[k] for k in range(2) if direction[k] < 0.0]
@@ -137,7 +137,7 @@ def camera_position(middle: Array, azimuth: float) -> Array:
 
 @cache
 def _camera(folder: Path, room: str) -> DepthCamera:
-    return DepthCamera(*exact_surface(folder, room), far=FAR_M * SCENE_FRAME.units_per_metre)
+    return DepthCamera(*exact_surface(folder, room), far=FAR_M * SCENE_FRAME.units_per_meter)
 
 
 def _hidden_share(case: Case, result: RegistrationResult) -> dict[str, Any]:

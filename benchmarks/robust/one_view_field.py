@@ -45,7 +45,7 @@ def directions(count: int, reach: float) -> Array:
 class OneViewField:
     """Exact signed distance to the border of the free space in front of a depth image; solid outside its view too.
 
-    The image is taken as a surface of triangles between neighbouring pixels' depths: where one lies far behind the
+    The image is taken as a surface of triangles between neighboring pixels' depths: where one lies far behind the
     other they form a wall along the line of sight, the border of a shadow. bounds: (2, 3), scene frame.
     """
 

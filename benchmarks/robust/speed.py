@@ -55,7 +55,7 @@ def table(context: Context) -> Table:
     )
 
 
-PHASES = ("sampling", "initialising", "optimising", "verifying", "exporting")
+PHASES = ("sampling", "initializing", "optimizing", "verifying", "exporting")
 
 
 def of_preset(runs: Sequence[Run], preset: str) -> list[Run]:

@@ -22,7 +22,7 @@ from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.contract.world import BOX, field_bytes
 
-_PHASES = ("loading", "sampling", "initialising", "optimising", "verifying", "exporting")
+_PHASES = ("loading", "sampling", "initializing", "optimizing", "verifying", "exporting")
 _RETENTION_S = 604800
 
 

@@ -41,7 +41,7 @@ def write_small_pair(folder: Path) -> SmallPair:
         values = _sampled(field, reach)
         np.savez(paths[-1], sdf=values, bounds=np.array([[-reach] * 3, [reach] * 3]))
     box = chair_box(truth)
-    low, high = (box.centre - box.size / 2).tolist(), (box.centre + box.size / 2).tolist()
+    low, high = (box.center - box.size / 2).tolist(), (box.center + box.size / 2).tolist()
     return SmallPair(*paths, {"min": low, "max": high}, truth.matrix().tolist())
 
 

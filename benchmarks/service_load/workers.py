@@ -63,7 +63,7 @@ def measure(folder: Path, jobs: int, rounds: int, preload: bool) -> tuple[dict[i
 def table(measured: dict[str, dict[int, list[float]]], jobs: int, rounds: int) -> list[str]:
     lines = [
         f"Registrations a minute, {rounds} batches of {jobs} in turn: median, least and most. The ratio is that of "
-        "neighbouring batches, its median, least and most.",
+        "neighboring batches, its median, least and most.",
         "",
         "| workers load the engine | one worker | two workers | ratio |",
         "|---|---|---|---|",

@@ -14,7 +14,7 @@ from regnf_core.errors import FieldFormatError
 _FARTHEST = 1 << 20
 """Cells lie less far from cell (0, 0, 0) along each axis, so that a cell of their box has a number below 2^63."""
 _TABLE_CELLS = 1 << 18
-_NEIGHBOURS = 4
+_NEIGHBORS = 4
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def _nearest_rows(cells: Tensor, low: Tensor, size: Tensor, step: int) -> Tensor
     """The table: for the middle of every ``step``^3 cells of the box the rows of the nearest of ``cells`` (N, 3)."""
     axes = [torch.arange(math.ceil(int(extent) / step), dtype=torch.float64) for extent in size]
     middles = low.cpu() + step * torch.cartesian_prod(*axes) + (step - 1) / 2.0
-    count = min(_NEIGHBOURS, cells.shape[0])
+    count = min(_NEIGHBORS, cells.shape[0])
     _, rows = cKDTree(cells.cpu().numpy()).query(middles.numpy(), k=range(1, count + 1))
     return torch.from_numpy(rows).view(*[len(axis) for axis in axes], count)
 

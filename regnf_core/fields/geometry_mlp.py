@@ -14,7 +14,7 @@ from regnf_core.fields.activations import ACTIVATIONS
 class GeometryMlp:
     """Linear layers with an activation between; where there are more than ``skip_at``, that one sees the input again.
 
-    weights[i]: (out_i, in_i), biases[i]: (out_i,), weight normalisation already folded in. Of the last layer only the
+    weights[i]: (out_i, in_i), biases[i]: (out_i,), weight normalization already folded in. Of the last layer only the
     first row is evaluated: the signed distance. The skip connection feeds [h, input] / sqrt 2; skip_at None: there is
     none. activation: "softplus" (of 100 a, over 100), "relu" or "sine".
     """

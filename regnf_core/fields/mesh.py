@@ -35,7 +35,7 @@ _FAULTS_OF_CONTENT = (
 
 
 class MeshField:
-    """Distance to a triangle mesh; the generalised winding number says what is inside (Jacobson et al. 2013).
+    """Distance to a triangle mesh; the generalized winding number says what is inside (Jacobson et al. 2013).
 
     The mesh need not be watertight. Computed in float64 on the CPU whatever device the points come from; several times
     slower than a small network, see docs/families.md.

@@ -21,8 +21,8 @@ class LayerNorm:
     weight: Tensor
     bias: Tensor
 
-    def normalise(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The result (N, width), and what :meth:`pull_back` needs: a standardised, and 1 / its deviation (N, 1)."""
+    def normalize(self, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The result (N, width), and what :meth:`pull_back` needs: a standardized, and 1 / its deviation (N, 1)."""
         variance, mean = torch.var_mean(a, dim=-1, keepdim=True, correction=0)
         scale = (variance + 1e-5).rsqrt()
         standard = (a - mean) * scale
@@ -41,7 +41,7 @@ class LayerNorm:
 
 @dataclass(frozen=True)
 class Layer:
-    """W [h, input] + b, then perhaps a layer normalisation. weight: (out, in), bias: (out,)."""
+    """W [h, input] + b, then perhaps a layer normalization. weight: (out, in), bias: (out,)."""
 
     weight: Tensor
     bias: Tensor
@@ -82,7 +82,7 @@ class MlpFunction:
         h = inputs
         for layer in self.layers[:-1]:
             a = _linear(layer, h, inputs)
-            h = activate(a if layer.norm is None else layer.norm.normalise(a)[0])
+            h = activate(a if layer.norm is None else layer.norm.normalize(a)[0])
         return self._squashed(_linear(self.layers[-1], h, inputs).squeeze(-1))[0]
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +93,7 @@ class MlpFunction:
         for layer in self.layers[:-1]:
             a = _linear(layer, h, inputs)
             if layer.norm is not None:
-                a, standard, scale = layer.norm.normalise(a)
+                a, standard, scale = layer.norm.normalize(a)
                 standards.append((standard, scale))
             slopes.append(activation.slope(a))
             h = activation.value(a)
@@ -144,7 +144,7 @@ def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> Fun
         if i == 0 or sees_input:
             weight = weight[:, : weight.shape[1] - description.input_width + live]
         norm = None
-        if i in description.normalised:
+        if i in description.normalized:
             norm = LayerNorm(tensors[f"norms.{i}.weight"].float(), tensors[f"norms.{i}.bias"].float())
         layers.append(Layer(weight, bias, sees_input, norm))
     function = MlpFunction(tuple(layers), description.activation, positional, description.output_tanh)

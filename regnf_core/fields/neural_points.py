@@ -82,7 +82,7 @@ class NeuralPointsFunction:
     cell_points: Tensor
     """(M,): for each row of ``cells`` a point in that cell."""
     mlp: GeometryMlp
-    neighbours: int
+    neighbors: int
     max_distance: float
     blend_first: bool
     """True: features are blended, then decoded; false: the other way round."""
@@ -122,7 +122,7 @@ class NeuralPointsFunction:
         squared = (points[:, None] - self.points[candidates]).square().sum(-1)
         there = there & (squared <= self.max_distance**2)
         squared = torch.where(there, squared, torch.inf)
-        count = min(self.neighbours, squared.shape[1])
+        count = min(self.neighbors, squared.shape[1])
         _, order = squared.topk(count, dim=-1, largest=False)
         return candidates.gather(1, order), there.gather(1, order)
 
@@ -188,7 +188,7 @@ def build_neural_points(
         cells=CellIndex.of(cells),
         cell_points=cell_points,
         mlp=GeometryMlp(weights, biases, skip_at=None, activation="relu"),
-        neighbours=description.neighbours,
+        neighbors=description.neighbors,
         max_distance=description.max_distance,
         blend_first=description.blend_first,
     )

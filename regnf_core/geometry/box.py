@@ -13,20 +13,20 @@ from regnf_core.errors import InvalidDetectionError
 
 @dataclass(frozen=True)
 class OrientedBox:
-    """A box with full edge lengths ``size`` about ``centre``, its axes the columns of ``rotation``.
+    """A box with full edge lengths ``size`` about ``center``, its axes the columns of ``rotation``.
 
-    centre: (3,) scene frame, scene units · size: (3,) scene units, all > 0 · rotation: (3, 3), box axes to scene axes.
+    center: (3,) scene frame, scene units · size: (3,) scene units, all > 0 · rotation: (3, 3), box axes to scene axes.
     All float64 on the CPU: a box is a handful of numbers, never a batch.
     """
 
-    centre: Tensor
+    center: Tensor
     size: Tensor
     rotation: Tensor
     label: str | None = None
     score: float | None = None
 
     def __post_init__(self) -> None:
-        for name, shape in (("centre", (3,)), ("size", (3,)), ("rotation", (3, 3))):
+        for name, shape in (("center", (3,)), ("size", (3,)), ("rotation", (3, 3))):
             value = torch.as_tensor(getattr(self, name), dtype=torch.float64, device="cpu")
             if tuple(value.shape) != shape:
                 raise InvalidDetectionError(f"box {name} has shape {tuple(value.shape)}, expected {shape}")
@@ -55,13 +55,13 @@ class OrientedBox:
     @classmethod
     def from_quaternion(
         cls,
-        centre: Sequence[float],
+        center: Sequence[float],
         size: Sequence[float],
         rotation_quaternion_xyzw: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
         label: str | None = None,
         score: float | None = None,
     ) -> OrientedBox:
-        """A box from centre (3,), full edge lengths (3,) and a quaternion (x, y, z, w) that need not be normalised."""
+        """A box from center (3,), full edge lengths (3,) and a quaternion (x, y, z, w) that need not be normalized."""
         q = torch.as_tensor(rotation_quaternion_xyzw, dtype=torch.float64)
         norm = q.norm()
         if q.shape != (4,) or not torch.isfinite(q).all() or norm < 1e-9:
@@ -76,7 +76,7 @@ class OrientedBox:
             dtype=torch.float64,
         )
         return cls(
-            torch.as_tensor(centre, dtype=torch.float64),
+            torch.as_tensor(center, dtype=torch.float64),
             torch.as_tensor(size, dtype=torch.float64),
             rotation,
             label,
@@ -91,12 +91,12 @@ class OrientedBox:
     def corners(self) -> Tensor:
         """The eight corners, (8, 3), scene frame."""
         signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)  # (8, 3)
-        return self.centre + (signs * self.size) @ self.rotation.T
+        return self.center + (signs * self.size) @ self.rotation.T
 
     def to_local(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the scene in the box's own frame: each coordinate within ±size/2 for points inside."""
         rotation = self.rotation.to(points)
-        return (points - self.centre.to(points)) @ rotation
+        return (points - self.center.to(points)) @ rotation
 
     def contains(self, points: Tensor, margin: float = 0.0) -> Tensor:
         """(N,) bool: which points (N, 3), scene frame, lie in the box grown by ``margin`` (a share of its size)."""

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.euler import euler_from_rotation
-from regnf_core.geometry.nearest_neighbors import NearestNeighbours
+from regnf_core.geometry.nearest_neighbors import NearestNeighbors
 from regnf_core.geometry.shape import diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
@@ -68,7 +68,7 @@ def mssd(estimate: Sim3, truth: Sim3, points: Tensor, symmetries: Symmetries | N
 def add_s(estimate: Sim3, truth: Sim3, points: Tensor) -> float:
     """ADD-S: mean distance from true to the nearest estimated surface point, object points (N, 3), object units."""
     placed = estimate.inverse().apply(points.double())
-    distance, _ = NearestNeighbours(placed).query(truth.inverse().apply(points.double()))
+    distance, _ = NearestNeighbors(placed).query(truth.inverse().apply(points.double()))
     return float(truth.scale) * float(distance.mean())
 
 

@@ -1,4 +1,4 @@
-"""Nearest neighbours among points, by a k-d tree on the CPU: exact, deterministic, fast enough for any device."""
+"""Nearest neighbors among points, by a k-d tree on the CPU: exact, deterministic, fast enough for any device."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 
-class NearestNeighbours:
+class NearestNeighbors:
     """A search structure over points (M, 3)."""
 
     def __init__(self, points: Tensor) -> None:
@@ -21,7 +21,7 @@ class NearestNeighbours:
 
 
 def gaps(points: Tensor) -> Tensor:
-    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbour: how sparse it is there."""
+    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbor: how sparse it is there."""
     array = points.detach().cpu().numpy()
     distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
     return torch.as_tensor(distance.reshape(len(array), -1)[:, -1]).to(points)

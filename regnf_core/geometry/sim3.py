@@ -82,7 +82,7 @@ class Sim3:
         rotation_quaternion_xyzw: Tensor | Sequence[float],
         translation: Tensor | Sequence[float],
     ) -> Sim3:
-        """From scale (...), quaternion (..., 4) as (x, y, z, w), normalised here, and translation (..., 3)."""
+        """From scale (...), quaternion (..., 4) as (x, y, z, w), normalized here, and translation (..., 3)."""
         s, q, t = _numbers(scale), _numbers(rotation_quaternion_xyzw), _numbers(translation)
         if q.shape[-1:] != (4,) or t.shape[-1:] != (3,):
             raise _invalid("a quaternion has four numbers and a translation three")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 TOLERANCE = 1e-4
-"""Largest Frobenius norm of M^T M / s^2 - I. Whatever passes here passes :meth:`regnf_core.geometry.sim3.Sim3.from_matrix`."""
+"""Largest Frobenius norm of M^T M / s^2 - I. ``Sim3.from_matrix`` accepts whatever passes here."""
 _LEAST_SCALE = 1e-6
 _LARGEST = 1e9
 

@@ -1,6 +1,6 @@
 """The initial transform from two point clouds: FPFH features, RANSAC, ICP (paper, section III-C.2).
 
-Both clouds are centred first. The transform found is rigid; its scale is 1, as published.
+Both clouds are centered first. The transform found is rigid; its scale is 1, as published.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import InitialisationOptions
+from regnf_core.options import InitializationOptions
 from regnf_core.result import SurfaceSamples
 
 if TYPE_CHECKING:
     import open3d
 
 _FEATURE_RADIUS_VOXELS = 5.0
-_FEATURE_NEIGHBOURS = 100
+_FEATURE_NEIGHBORS = 100
 _RANSAC_POINTS = 4
 _RANSAC_CONFIDENCE = 0.999
 _MIN_VOXELS = 10  # a cloud with fewer has no shape to speak of
-_SEED_STRIDE = 7919  # between the draws of one seed, so that neighbouring seeds share none
+_SEED_STRIDE = 7919  # between the draws of one seed, so that neighboring seeds share none
 
 
 def initial_transform(
     scene_samples: SurfaceSamples,
     object_samples: SurfaceSamples,
-    options: InitialisationOptions,
+    options: InitializationOptions,
     seed: int,
     disagreement: Callable[[Sim3], float] = lambda T_object_scene: 0.0,
 ) -> Sim3:
@@ -39,19 +39,19 @@ def initial_transform(
 
     Of ``options.draws`` RANSAC draws the one with the least ``disagreement`` is kept; one draw is the published method.
     Deterministic for a seed, whatever the number of threads.
-    Raises InitialisationError (NO_INITIAL_TRANSFORM) when the features give no transform.
+    Raises InitializationError (NO_INITIAL_TRANSFORM) when the features give no transform.
     """
-    scene_centre, object_centre = _centre(scene_samples), _centre(object_samples)
-    scene_cloud = _described(scene_samples, scene_centre, options.voxel_size)
-    object_cloud = _described(object_samples, object_centre, options.voxel_size)
+    scene_center, object_center = _center(scene_samples), _center(object_samples)
+    scene_cloud = _described(scene_samples, scene_center, options.voxel_size)
+    object_cloud = _described(object_samples, object_center, options.voxel_size)
     found: list[Sim3] = []
     with _quiet_open3d():
         for draw in range(options.draws):
-            T_centred = _ransac_and_icp(scene_cloud, object_cloud, options, seed + _SEED_STRIDE * draw)
-            if T_centred is not None:
-                found.append(Sim3.from_translation(object_centre) @ T_centred @ Sim3.from_translation(-scene_centre))
+            T_centered = _ransac_and_icp(scene_cloud, object_cloud, options, seed + _SEED_STRIDE * draw)
+            if T_centered is not None:
+                found.append(Sim3.from_translation(object_center) @ T_centered @ Sim3.from_translation(-scene_center))
     if not found:
-        raise InitialisationError("feature matching found no transform between the two surfaces")
+        raise InitializationError("feature matching found no transform between the two surfaces")
     return found[0] if len(found) == 1 else min(found, key=disagreement)
 
 
@@ -63,26 +63,26 @@ def _quiet_open3d() -> AbstractContextManager[Any]:
     return context
 
 
-def _centre(samples: SurfaceSamples) -> Tensor:
+def _center(samples: SurfaceSamples) -> Tensor:
     return samples.points.double().cpu().mean(0)
 
 
-def _described(samples: SurfaceSamples, centre: Tensor, voxel_size: float) -> tuple[open3d.geometry.PointCloud, Any]:
-    """The centred cloud thinned to one point a voxel, and its FPFH descriptors."""
+def _described(samples: SurfaceSamples, center: Tensor, voxel_size: float) -> tuple[open3d.geometry.PointCloud, Any]:
+    """The centered cloud thinned to one point a voxel, and its FPFH descriptors."""
     import open3d
     from open3d.pipelines import registration
 
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector((samples.points.double().cpu() - centre).numpy()))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector((samples.points.double().cpu() - center).numpy()))
     cloud.normals = open3d.utility.Vector3dVector(samples.normals.double().cpu().numpy())
     cloud = cloud.voxel_down_sample(voxel_size)
     if len(cloud.points) < _MIN_VOXELS:
-        raise InitialisationError(f"the surface fills only {len(cloud.points)} voxels of {voxel_size}: too few")
-    search = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS_VOXELS * voxel_size, _FEATURE_NEIGHBOURS)
+        raise InitializationError(f"the surface fills only {len(cloud.points)} voxels of {voxel_size}: too few")
+    search = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS_VOXELS * voxel_size, _FEATURE_NEIGHBORS)
     return cloud, registration.compute_fpfh_feature(cloud, search)
 
 
 def _ransac_and_icp(
-    scene: tuple[Any, Any], obj: tuple[Any, Any], options: InitialisationOptions, seed: int
+    scene: tuple[Any, Any], obj: tuple[Any, Any], options: InitializationOptions, seed: int
 ) -> Sim3 | None:
     """One draw: RANSAC over mutual feature matches, then point-to-point ICP. None when no match survives the checks."""
     import open3d

@@ -2,9 +2,9 @@
 
     rho(r, alpha, p) = |alpha - 2| / alpha * (((r / p)^2 / |alpha - 2| + 1)^(alpha / 2) - 1)
 
-alpha is the shape (1: Charbonnier, towards 0: Cauchy), p the scale. Minimised over p on its own, rho has no minimum: it
+alpha is the shape (1: Charbonnier, towards 0: Cauchy), p the scale. Minimized over p on its own, rho has no minimum: it
 falls towards zero as p grows. Learning p therefore needs the adaptive form, the negative log likelihood of the density
-whose exponent is -rho, and its normaliser p Z(alpha):
+whose exponent is -rho, and its normalizer p Z(alpha):
 
     kappa(r; alpha, p) = rho(r, alpha, p) + log p + log Z(alpha),   Z(alpha) = integral of exp(-rho(x, alpha, 1)) dx.
 """
@@ -44,10 +44,10 @@ def log_partition(shape: Tensor) -> Tensor:
 
 
 class AdaptiveKernel:
-    """The kernel with learnt shape and scale.
+    """The kernel with learned shape and scale.
 
     Both are functions of unconstrained latents, as Barron proposes: the shape a sigmoid stretched over SHAPE_RANGE,
-    the scale a softplus above SCALE_FLOOR. ``latents`` (2,) float64 is the optimiser's parameter. The scale starts
+    the scale a softplus above SCALE_FLOOR. ``latents`` (2,) float64 is the optimizer's parameter. The scale starts
     at 1, the shape in the middle of its range.
     """
 
@@ -69,6 +69,6 @@ class AdaptiveKernel:
     def negative_log_likelihood(self, residuals: tuple[Tensor, ...]) -> Tensor:
         """Sum over the sets of the mean of kappa over each set (N_i,); ()."""
         shape, scale = self.shape, self.scale
-        normaliser = scale.log() + log_partition(shape)
+        normalizer = scale.log() + log_partition(shape)
         means = [robust_kernel(r.double(), shape, scale).mean() for r in residuals]
-        return torch.stack(means).sum() + len(means) * normaliser
+        return torch.stack(means).sum() + len(means) * normalizer

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField, differentiable_signed_distance
-from regnf_core.geometry.nearest_neighbors import NearestNeighbours
+from regnf_core.geometry.nearest_neighbors import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.paper.kernel import AdaptiveKernel
 
@@ -23,12 +23,12 @@ from regnf_core.paper.kernel import AdaptiveKernel
 class SampleSet:
     """Samples of one field with what does not change while the transform does.
 
-    points: (N, 3) float32, field frame · own_distance: (N,) the value there · neighbours: search among all points.
+    points: (N, 3) float32, field frame · own_distance: (N,) the value there · neighbors: search among all points.
     """
 
     points: Tensor
     own_distance: Tensor
-    neighbours: NearestNeighbours
+    neighbors: NearestNeighbors
 
     @classmethod
     def of(cls, field: SdfField, points: Tensor) -> SampleSet:
@@ -41,22 +41,22 @@ class SampleSet:
         if size <= count:
             return self
         chosen = torch.randperm(size, generator=generator)[:count].to(self.points.device)
-        return SampleSet(self.points[chosen], self.own_distance[chosen], self.neighbours)
+        return SampleSet(self.points[chosen], self.own_distance[chosen], self.neighbors)
 
     @classmethod
     def from_distances(cls, points: Tensor, own_distance: Tensor) -> SampleSet:
         """The set of points (N, 3) whose field values (N,) are known already."""
-        return cls(points, own_distance, NearestNeighbours(points))
+        return cls(points, own_distance, NearestNeighbors(points))
 
 
 @dataclass(frozen=True)
 class LossTerms:
-    """The loss () and its parts: residuals (N,) of A and (M,) of B, both >= 0, and the regulariser ()."""
+    """The loss () and its parts: residuals (N,) of A and (M,) of B, both >= 0, and the regularizer ()."""
 
     total: Tensor
     residuals_scene: Tensor
     residuals_object: Tensor
-    regulariser: Tensor
+    regularizer: Tensor
 
 
 def residuals(samples: SampleSet, other: SdfField, T_other_own: Sim3) -> Tensor:
@@ -65,10 +65,10 @@ def residuals(samples: SampleSet, other: SdfField, T_other_own: Sim3) -> Tensor:
     return (samples.own_distance - differentiable_signed_distance(other, moved)).abs()
 
 
-def regulariser(moved: Tensor, target: SampleSet) -> Tensor:
+def regularizer(moved: Tensor, target: SampleSet) -> Tensor:
     """L_r: mean squared distance () from the points (N, 3) to their nearest sample of ``target``, in its frame."""
-    _, nearest = target.neighbours.query(moved)
-    points = target.neighbours.points
+    _, nearest = target.neighbors.query(moved)
+    points = target.neighbors.points
     return (moved - points[nearest.to(points.device)].to(moved)).square().sum(-1).mean()
 
 
@@ -79,11 +79,11 @@ def bidirectional_loss(
     object_samples: SampleSet,
     T_object_scene: Sim3,
     kernel: AdaptiveKernel,
-    regulariser_weight: float,
+    regularizer_weight: float,
 ) -> LossTerms:
     """The loss at the transform, differentiable in it and in the kernel's latents."""
     r_scene = residuals(scene_samples, obj, T_object_scene)
     r_object = residuals(object_samples, scene, T_object_scene.inverse())
-    spread = regulariser(T_object_scene.apply(scene_samples.points), object_samples)
+    spread = regularizer(T_object_scene.apply(scene_samples.points), object_samples)
     likelihood = kernel.negative_log_likelihood((r_scene, r_object))
-    return LossTerms(likelihood + regulariser_weight * spread.to(likelihood), r_scene, r_object, spread)
+    return LossTerms(likelihood + regularizer_weight * spread.to(likelihood), r_scene, r_object, spread)

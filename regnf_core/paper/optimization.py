@@ -12,7 +12,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.euler import euler_from_rotation, rotation_from_euler
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import OptimisationOptions, RegistrationOptions
+from regnf_core.options import OptimizationOptions, RegistrationOptions
 from regnf_core.paper.kernel import AdaptiveKernel
 from regnf_core.paper.loss import LossTerms, SampleSet, bidirectional_loss
 from regnf_core.paper.resampling import resample
@@ -23,7 +23,7 @@ _SMALLEST_SCALE = 1e-3  # the published scale is additive and may step over zero
 
 @dataclass(frozen=True)
 class Refinement:
-    """Where the optimiser ended, how it went there, and whether the residuals fell under the stopping value."""
+    """Where the optimizer ended, how it went there, and whether the residuals fell under the stopping value."""
 
     T_object_scene: Sim3
     trace: list[IterationRecord]
@@ -31,7 +31,7 @@ class Refinement:
 
 
 class PoseParameters:
-    """T = T_translation R_euler diag(s) as learnt numbers, float64 on the CPU: t (3,), Euler angles (3,), s ()."""
+    """T = T_translation R_euler diag(s) as learned numbers, float64 on the CPU: t (3,), Euler angles (3,), s ()."""
 
     def __init__(self, T: Sim3) -> None:
         self.translation = T.translation.detach().clone().double().cpu().requires_grad_()
@@ -66,27 +66,27 @@ def refine(
     generator: torch.Generator,
     on_iteration: Callable[[IterationRecord], None] = lambda record: None,
 ) -> Refinement:
-    """Minimise the bidirectional loss from the initial transform.
+    """Minimize the bidirectional loss from the initial transform.
 
     ``on_iteration`` is called once an iteration and may raise to stop the work.
     Raises InvalidInputError (FIELD_NOT_FINITE) when a field gives NaN or infinity on the way.
     """
     A, B = SampleSet.of(scene, scene_samples.points), SampleSet.of(obj, object_samples.points)
     pose, kernel = PoseParameters(T_object_scene_initial), AdaptiveKernel()
-    adam = _adam(pose, kernel, options.optimisation)
+    adam = _adam(pose, kernel, options.optimization)
     trace: list[IterationRecord] = []
-    for iteration in range(options.optimisation.iterations):
+    for iteration in range(options.optimization.iterations):
         T = pose.transform()
         if iteration > 0 and iteration % options.resampling.every == 0:
             forth = pose.snapshot()
             A = resample(A, scene, obj, forth, options.resampling, generator)
             B = resample(B, obj, scene, forth.inverse(), options.resampling, generator)
-        count = options.optimisation.samples_per_iteration
+        count = options.optimization.samples_per_iteration
         some_A, some_B = A.batch(count, generator), B.batch(count, generator)
-        terms = bidirectional_loss(scene, obj, some_A, some_B, T, kernel, options.optimisation.regulariser_weight)
+        terms = bidirectional_loss(scene, obj, some_A, some_B, T, kernel, options.optimization.regularizer_weight)
         trace.append(_record(iteration, terms, kernel, pose.snapshot(), (A, B)))
         on_iteration(trace[-1])
-        if _converged(trace[-1], options.optimisation):
+        if _converged(trace[-1], options.optimization):
             return Refinement(pose.snapshot(), trace, converged=True)
         adam.zero_grad()
         terms.total.backward()  # type: ignore[no-untyped-call]
@@ -95,7 +95,7 @@ def refine(
     return Refinement(pose.snapshot(), trace, converged=False)
 
 
-def _adam(pose: PoseParameters, kernel: AdaptiveKernel, options: OptimisationOptions) -> torch.optim.Adam:
+def _adam(pose: PoseParameters, kernel: AdaptiveKernel, options: OptimizationOptions) -> torch.optim.Adam:
     groups: list[tuple[Tensor, float]] = [
         (pose.translation, options.translation_rate),
         (pose.angles, options.rotation_rate),
@@ -116,7 +116,7 @@ def _record(
         loss=loss,
         residual_scene=float(terms.residuals_scene.detach().mean()),
         residual_object=float(terms.residuals_object.detach().mean()),
-        regulariser=float(terms.regulariser.detach()),
+        regularizer=float(terms.regularizer.detach()),
         kernel_shape=float(kernel.shape.detach()),
         kernel_scale=float(kernel.scale.detach()),
         scene_samples=sets[0].points.shape[0],
@@ -125,6 +125,6 @@ def _record(
     )
 
 
-def _converged(record: IterationRecord, options: OptimisationOptions) -> bool:
+def _converged(record: IterationRecord, options: OptimizationOptions) -> bool:
     """The paper's early stopping, asked of both directions."""
     return max(record.residual_scene, record.residual_object) <= options.stop_residual

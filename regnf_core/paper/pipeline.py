@@ -1,4 +1,4 @@
-"""The preset `paper`, top to bottom: sample, initialise, refine, verify."""
+"""The preset `paper`, top to bottom: sample, initialize, refine, verify."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def register_paper(
 ) -> RegistrationResult:
     """T_object_scene by the published method; see docs/method.md.
 
-    Raises InvalidDetectionError, NoSurfaceError, InitialisationError, InvalidInputError (FIELD_NOT_FINITE).
+    Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
@@ -48,11 +48,11 @@ def register_paper(
         A = thin_out(scene_samples, options.resampling.max_samples, generator)
         B = thin_out(object_samples, options.resampling.max_samples, generator)
 
-    with run.phase("initialising"):
+    with run.phase("initializing"):
         score = _disagreement_on_few(scene, obj, A, B, _SCORING_CAP * object_diameter, generator)
-        T_initial = initial_transform(scene_samples, object_samples, options.initialisation, seed, score)
+        T_initial = initial_transform(scene_samples, object_samples, options.initialization, seed, score)
 
-    with run.phase("optimising"):
+    with run.phase("optimizing"):
         refined = refine(scene, obj, A, B, T_initial, options, generator, _on_iteration(options, run))
 
     with run.phase("verifying"):
@@ -89,7 +89,7 @@ def _disagreement_on_few(
 
 
 def _on_iteration(options: RegistrationOptions, run: Run) -> Callable[[IterationRecord], None]:
-    span = STARTS["verifying"] - STARTS["optimising"]
+    span = STARTS["verifying"] - STARTS["optimizing"]
     return lambda record: run.report(
-        "optimising", STARTS["optimising"] + span * (record.iteration + 1) / options.optimisation.iterations
+        "optimizing", STARTS["optimizing"] + span * (record.iteration + 1) / options.optimization.iterations
     )

@@ -33,7 +33,7 @@ def resample(
     """
     rho = options.radius_fraction * field_radius(own)
     candidates = samples.points + rho * _uniform(samples.points, generator)
-    spacing, _ = samples.neighbours.query(candidates)
+    spacing, _ = samples.neighbors.query(candidates)
     candidates = candidates[spacing >= rho / _SPACING]
     own_distance = own.signed_distance(candidates).to(candidates)
     near = own_distance.abs() <= options.own_distance

@@ -20,7 +20,7 @@ from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, shorte
 MIN_POINTS = 50
 _BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
-_CLEARANCE = 0.75  # a camera keeps this many box diagonals from the centre at least: outside the box, with room to see
+_CLEARANCE = 0.75  # a camera keeps this many box diagonals from the center at least: outside the box, with room to see
 
 
 def sample_scene(
@@ -78,10 +78,10 @@ def check_box_meets_scene(scene: SdfField, detection: OrientedBox) -> None:
 def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: SamplingOptions, turn: float) -> Tensor:
     """(M, 3) first surface points, seen from all cameras, within the slightly grown box."""
     positions = camera_positions(
-        box.centre, max(distance, _CLEARANCE * box.diagonal), options.views, options.up_axis, turn
+        box.center, max(distance, _CLEARANCE * box.diagonal), options.views, options.up_axis, turn
     )
-    grown = OrientedBox(box.centre, box.size * (1.0 + _BOX_MARGIN), box.rotation)
-    rays = cast_rays(positions, box.centre, grown.corners(), options.image_size, options.pixel_stride)
+    grown = OrientedBox(box.center, box.size * (1.0 + _BOX_MARGIN), box.rotation)
+    rays = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)
     rays = type(rays)(rays.origins.to(field.device), rays.directions.to(field.device))
     entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
     local = type(rays)(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))

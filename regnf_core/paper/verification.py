@@ -1,4 +1,4 @@
-"""The verdict: do the two fields agree on points that the optimiser has never seen? Ours; the paper has none.
+"""The verdict: do the two fields agree on points that the optimizer has never seen? Ours; the paper has none.
 
 A registration is accepted when, on fresh samples of both surfaces, most residuals S_object(T x) - s S_scene(x) are
 small against the object's diameter, in both directions, and their size overall is small too.

@@ -88,7 +88,7 @@ def find_candidates(
 ) -> tuple[Sim3, Tensor]:
     """Candidate poses (H,) and their scores (H,), best first, from the samples alone: no field is evaluated.
 
-    With ``T_start``, a single pose in working frames, only its neighbourhood is searched; ``more_seeds`` (H,) are
+    With ``T_start``, a single pose in working frames, only its neighborhood is searched; ``more_seeds`` (H,) are
     searched beside those of the geometry.
     """
     if T_start is not None:

@@ -34,7 +34,7 @@ def register_robust(
 ) -> RegistrationResult:
     """T_object_scene from nothing but two fields and a box, with a verdict, all equal poses and a covariance.
 
-    With ``T_object_scene_start`` its neighbourhood is searched first, and everything only if that ends in a rejection.
+    With ``T_object_scene_start`` its neighborhood is searched first, and everything only if that ends in a rejection.
     ``object_model`` and ``scene_view`` save the making of them; they must be of these fields, box, options and seed.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
@@ -82,11 +82,11 @@ def _attempt(
     T_start: Sim3 | None = None,
     more_seeds: Sim3 | None = None,
 ) -> tuple[Outcome, Conclusion]:
-    with run.phase("initialising"):
+    with run.phase("initializing"):
         candidates, _ = find_candidates(
             problem.view, problem.model, options.robust, generator, T_start, more_seeds=more_seeds
         )
-    with run.phase("optimising"):
+    with run.phase("optimizing"):
         outcome = refine_candidates(problem, candidates, options.robust, generator, _steps(run))
     with run.phase("verifying"):
         return outcome, conclude(problem, outcome, options)
@@ -95,5 +95,5 @@ def _attempt(
 def _steps(run: Run) -> Callable[[], None]:
     """What to call after each iteration: reports the share done, and lets the caller cancel."""
     taken = count(1)
-    span = STARTS["verifying"] - STARTS["optimising"]
-    return lambda: run.report("optimising", STARTS["optimising"] + span * next(taken) / ITERATIONS)
+    span = STARTS["verifying"] - STARTS["optimizing"]
+    return lambda: run.report("optimizing", STARTS["optimizing"] + span * next(taken) / ITERATIONS)

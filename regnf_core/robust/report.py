@@ -61,7 +61,7 @@ def _trace(problem: Problem, trail: Trail, winner: int) -> list[IterationRecord]
                 loss=float(step.costs[winner]),
                 residual_scene=float(step.residual_scene[winner]) * size,
                 residual_object=float(step.residual_object[winner]) * size / float(T.scale),
-                regulariser=0.0,
+                regularizer=0.0,
                 kernel_shape=_GEMAN_MCCLURE,
                 kernel_scale=step.width * size,
                 scene_samples=min(step.samples, len(problem.A)),

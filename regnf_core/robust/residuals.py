@@ -7,7 +7,7 @@ With y = T x for scene points x, w = T^-1 z for object points z, g the fields' g
 
 Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them.
 
-Fields learnt from images are too thick or too thin by much the same everywhere: the two surfaces are then an offset d
+Fields learned from images are too thick or too thin by much the same everywhere: the two surfaces are then an offset d
 apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 """
 

@@ -22,9 +22,9 @@ from regnf_core.robust.working_frame import WorkingField, WorkingFrame
 from regnf_core.surface.cells import Cells, surface_cells, tighten
 
 REGION_GROWTH = 1.2
-"""The scene is sampled in the box grown by this: boxes are often too small or off centre."""
+"""The scene is sampled in the box grown by this: boxes are often too small or off center."""
 _OBJECT_BASE, _SCENE_BASE, _LEVELS = 8, 9, 2
-_THICKNESS = 0.6  # edges: leaf cells beyond it duplicate what their neighbours find
+_THICKNESS = 0.6  # edges: leaf cells beyond it duplicate what their neighbors find
 _CLOSE = 0.35  # edges: a sample farther from the surface after its step is dropped
 _LEAST_SLOPE = 0.2  # a gradient shorter than this leads nowhere
 
@@ -58,22 +58,22 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
         raise NoSurfaceError(f"only {len(found)} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
     surface = found.on_surface()
     size = diameter(surface)
-    centre = surface.double().mean(0)
-    frame = WorkingFrame(rough.out_of(centre[None])[0], rough.length * size)
-    samples = Samples((found.points - centre.float()) / size, found.values / size, found.normals)
+    center = surface.double().mean(0)
+    frame = WorkingFrame(rough.out_of(center[None])[0], rough.length * size)
+    samples = Samples((found.points - center.float()) / size, found.values / size, found.normals)
     return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size)
 
 
 def sample_scene_surface(
     scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator
 ) -> SampledField:
-    """At most ``limit`` samples of the scene within the grown box; working frame: the box's centre, its diagonal 1.
+    """At most ``limit`` samples of the scene within the grown box; working frame: the box's center, its diagonal 1.
 
     Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
     InvalidInputError (FIELD_NOT_FINITE).
     """
     check_box_meets_scene(scene, detection)
-    frame = WorkingFrame(detection.centre.double(), detection.diagonal)
+    frame = WorkingFrame(detection.center.double(), detection.diagonal)
     field = WorkingField(scene, frame)
     half = detection.size.double() / detection.diagonal * (REGION_GROWTH / 2)
     rotation = detection.rotation.double()
@@ -82,7 +82,7 @@ def sample_scene_surface(
         return field.value(local.to(rotation) @ rotation.T)
 
     cells, space = surface_cells(value, -half, half, _SCENE_BASE, _LEVELS)
-    cells = Cells(cells.centres @ rotation.T, cells.values, cells.edge)
+    cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
     found = _settle(field, cells, limit, generator)
     axes = rotation.to(found.points)
     found = found[space.sees(found.points @ axes, found.normals @ axes)]
@@ -94,7 +94,7 @@ def sample_scene_surface(
 
 
 def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
-    """Two disjoint random parts: the second, a share ``held_out``, for the judgement alone."""
+    """Two disjoint random parts: the second, a share ``held_out``, for the judgment alone."""
     order = torch.randperm(len(samples), generator=generator)
     cut = len(samples) - int(held_out * len(samples))
     return samples[order[:cut]], samples[order[cut:]]
@@ -112,11 +112,11 @@ def _box_frame(low: Tensor, high: Tensor) -> WorkingFrame:
 
 
 def _settle(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
-    """One Newton step from the leaf cells' centres towards the surface; value and normal where it ends."""
+    """One Newton step from the leaf cells' centers towards the surface; value and normal where it ends."""
     close = (cells.values.abs() <= _THICKNESS * cells.edge).nonzero().squeeze(-1)
     if close.numel() > limit:
         close = close[torch.randperm(close.numel(), generator=generator)[:limit]]
-    start = cells.centres[close].float()
+    start = cells.centers[close].float()
     if start.shape[0] == 0:
         return Samples(start, start[:, 0], start)
     value, gradient = field.value_and_gradient(start)

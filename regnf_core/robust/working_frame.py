@@ -1,4 +1,4 @@
-"""Working frames: both fields are seen centred and of size one, so that no number below depends on anybody's units."""
+"""Working frames: both fields are seen centered and of size one, so that no number below depends on anybody's units."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from regnf_core.schema.kinds.observation_grid import SURFACE, UNSEEN
 
 @dataclass(frozen=True, eq=False)
 class WorkingFrame:
-    """x_work = (x - centre) / length. centre: (3,) float64, field frame · length: field units."""
+    """x_work = (x - center) / length. center: (3,) float64, field frame · length: field units."""
 
-    centre: Tensor
+    center: Tensor
     length: float
 
     def into(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the field's frame in the working frame, float32."""
-        return ((points.double().cpu() - self.centre) / self.length).float()
+        return ((points.double().cpu() - self.center) / self.length).float()
 
     def out_of(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the working frame in the field's frame, float64."""
-        return points.double().cpu() * self.length + self.centre
+        return points.double().cpu() * self.length + self.center
 
     def to_field(self) -> Sim3:
         """The working frame's points in the field's frame."""
         return Sim3(
-            torch.tensor(self.length, dtype=torch.float64), torch.eye(3, dtype=torch.float64), self.centre.clone()
+            torch.tensor(self.length, dtype=torch.float64), torch.eye(3, dtype=torch.float64), self.center.clone()
         )
 
 

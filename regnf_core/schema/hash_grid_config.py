@@ -21,7 +21,7 @@ from regnf_core.errors import FieldFormatError
 Interpolation = Literal["linear", "smoothstep"]
 _ENTRY_ALIGNMENT = 8
 MAX_GROWTH = 8.0
-"""Of neighbouring levels' resolutions, as far as the safe format takes it."""
+"""Of neighboring levels' resolutions, as far as the safe format takes it."""
 _ROUNDING_REACH = 1e-3
 """A scale this close to a whole number may be rounded either way by another machine's exp2f."""
 
@@ -40,7 +40,7 @@ class HashGridConfig:
     log2_table_size: Annotated[int, Ge(3), Le(24)] = 19
     base_resolution: Annotated[int, Ge(2), Le(1024)] = 16
     per_level_scale: Annotated[float, Ge(1), Le(MAX_GROWTH)] = 1.3819128799677762
-    """Ratio of the resolutions of neighbouring levels."""
+    """Ratio of the resolutions of neighboring levels."""
     resolutions: tuple[Annotated[int, Gt(1), Le(1 << 24)], ...] | None = None
     """Nodes along an edge, per level, where they must differ from the computed ones (see :meth:`with_entry_count`)."""
     strides: tuple[Annotated[int, Gt(1), Le(1 << 24)], ...] | None = None

@@ -27,8 +27,8 @@ def axis_vector(axis: str) -> Tensor:
     return vector
 
 
-def camera_positions(centre: Tensor, distance: float, views: int, up_axis: str, turn: float = 0.0) -> Tensor:
-    """(views, 3) positions on the upper half of a sphere round ``centre`` (3,), spread by the golden angle.
+def camera_positions(center: Tensor, distance: float, views: int, up_axis: str, turn: float = 0.0) -> Tensor:
+    """(views, 3) positions on the upper half of a sphere round ``center`` (3,), spread by the golden angle.
 
     Heights run from near the pole to near the horizon in equal steps, which gives every camera the same area of the
     half sphere. ``turn`` (radians) rotates all of them about the vertical: another turn, other views.
@@ -42,7 +42,7 @@ def camera_positions(centre: Tensor, distance: float, views: int, up_axis: str, 
     positions[:, up] = height
     positions[:, (up + 1) % 3] = radius * azimuth.cos()
     positions[:, (up + 2) % 3] = radius * azimuth.sin()
-    return centre.to(torch.float64) + distance * positions
+    return center.to(torch.float64) + distance * positions
 
 
 def cast_rays(positions: Tensor, target: Tensor, corners: Tensor, image_size: int, pixel_stride: int) -> Rays:
@@ -52,7 +52,7 @@ def cast_rays(positions: Tensor, target: Tensor, corners: Tensor, image_size: in
     the narrowest square one that holds all ``corners`` (8, 3), so that no ray budget is spent on the room around.
     """
     per_edge = max(1, image_size // pixel_stride)
-    grid = (torch.arange(per_edge, dtype=torch.float64) + 0.5) / per_edge * 2.0 - 1.0  # pixel centres in (-1, 1)
+    grid = (torch.arange(per_edge, dtype=torch.float64) + 0.5) / per_edge * 2.0 - 1.0  # pixel centers in (-1, 1)
     v, u = torch.meshgrid(grid, grid, indexing="ij")
     origins, directions = [], []
     for position in positions:

@@ -21,9 +21,9 @@ _TIGHTENINGS = 8
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cubic cells: centres (N, 3) float64, the field's values there (N,), the edge; all in one frame and unit."""
+    """Cubic cells: centers (N, 3) float64, the field's values there (N,), the edge; all in one frame and unit."""
 
-    centres: Tensor
+    centers: Tensor
     values: Tensor
     edge: float
 
@@ -32,11 +32,11 @@ class Cells:
         return self[self.values.abs() <= _REACH * self.edge]
 
     def __getitem__(self, index: Tensor) -> Cells:
-        return Cells(self.centres[index], self.values[index], self.edge)
+        return Cells(self.centers[index], self.values[index], self.edge)
 
     def extent(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (3,) of all cells."""
-        return self.centres.amin(0) - self.edge / 2, self.centres.amax(0) + self.edge / 2
+        return self.centers.amin(0) - self.edge / 2, self.centers.amax(0) + self.edge / 2
 
 
 def surface_cells(
@@ -55,8 +55,8 @@ def surface_cells(
     for level in range(levels + 1):
         if level > 0:
             cells = _split(value, cells.near())
-        space.mark(cells.centres[cells.values > _REACH * cells.edge], 2 ** (levels - level))
-    space.mark(cells.centres[cells.values > 0], 1)
+        space.mark(cells.centers[cells.values > _REACH * cells.edge], 2 ** (levels - level))
+    space.mark(cells.centers[cells.values > 0], 1)
     return cells.near(), space
 
 
@@ -67,7 +67,7 @@ def tighten(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: 
     """
     for _ in range(_TIGHTENINGS):
         near = _grid(value, low, high, base).near()
-        if near.centres.shape[0] == 0:
+        if near.centers.shape[0] == 0:
             break
         lowest, highest = near.extent()
         lowest, highest = torch.maximum(lowest, low), torch.minimum(highest, high)
@@ -83,12 +83,12 @@ def _grid(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: in
     counts = ((high - low) / edge - 1e-9).ceil().clamp_min(1).long()
     start = (low + high) / 2 - counts * edge / 2
     axes = [start[k] + (torch.arange(int(counts[k]), dtype=torch.float64) + 0.5) * edge for k in range(3)]
-    centres = torch.cartesian_prod(*axes).reshape(-1, 3)
-    return Cells(centres, value(centres), edge)
+    centers = torch.cartesian_prod(*axes).reshape(-1, 3)
+    return Cells(centers, value(centers), edge)
 
 
 def _split(value: Callable[[Tensor], Tensor], cells: Cells) -> Cells:
     edge = cells.edge / 2
     offsets = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3) * edge  # (8, 3)
-    centres = (cells.centres[:, None] + offsets).reshape(-1, 3)
-    return Cells(centres, value(centres), edge)
+    centers = (cells.centers[:, None] + offsets).reshape(-1, 3)
+    return Cells(centers, value(centers), edge)

@@ -16,7 +16,7 @@ _MARGIN = 0.02
 def surface_extent(field: SdfField) -> OrientedBox:
     """The axis-aligned box of the field's zero level, field frame.
 
-    Looks at a grid of cell centres; where a cell may hold surface, one Newton step carries its centre there.
+    Looks at a grid of cell centers; where a cell may hold surface, one Newton step carries its center there.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT) when no cell does, InvalidInputError (FIELD_NOT_FINITE).
     """
     low, high = field.bounds
@@ -26,13 +26,13 @@ def surface_extent(field: SdfField) -> OrientedBox:
         low[k] + (torch.arange(count, dtype=torch.float64) + 0.5) * (high[k] - low[k]) / count
         for k, count in enumerate(counts)
     ]
-    centres = torch.cartesian_prod(*axes).float().to(field.device)
-    near = finite_distance(field, centres).abs() <= 0.5 * 3**0.5 * cell
+    centers = torch.cartesian_prod(*axes).float().to(field.device)
+    near = finite_distance(field, centers).abs() <= 0.5 * 3**0.5 * cell
     if not near.any():
         raise NoSurfaceError("the object's field has no surface within its bounds", reason="NO_SURFACE_IN_OBJECT")
-    distance, gradient = field.signed_distance_and_gradient(centres[near])
+    distance, gradient = field.signed_distance_and_gradient(centers[near])
     step = (distance / gradient.square().sum(-1).clamp_min(0.25)).unsqueeze(-1) * gradient
-    surface = (centres[near] - step.to(centres)).double().cpu()
+    surface = (centers[near] - step.to(centers)).double().cpu()
     lowest, highest = torch.maximum(surface.amin(0), low), torch.minimum(surface.amax(0), high)
-    centre, size = (lowest + highest) / 2, (highest - lowest).clamp_min(cell)
-    return OrientedBox(centre, size * (1.0 + _MARGIN), torch.eye(3, dtype=torch.float64))
+    center, size = (lowest + highest) / 2, (highest - lowest).clamp_min(cell)
+    return OrientedBox(center, size * (1.0 + _MARGIN), torch.eye(3, dtype=torch.float64))

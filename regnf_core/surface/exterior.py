@@ -1,4 +1,4 @@
-"""Which surface can be seen from outside: fields learnt from images have cavities inside matter that mean nothing."""
+"""Which surface can be seen from outside: fields learned from images have cavities inside matter that mean nothing."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class FreeSpace:
     edge: float
     free: Tensor
 
-    def mark(self, centres: Tensor, block: int) -> None:
-        """Mark the blocks of ``block`` cells an edge about ``centres`` (N, 3) as free, in place."""
-        first = ((centres - self.low) / self.edge - block / 2).round().long()
+    def mark(self, centers: Tensor, block: int) -> None:
+        """Mark the blocks of ``block`` cells an edge about ``centers`` (N, 3) as free, in place."""
+        first = ((centers - self.low) / self.edge - block / 2).round().long()
         offsets = torch.cartesian_prod(*[torch.arange(block)] * 3).reshape(-1, 3)
         cells = (first[:, None] + offsets).reshape(-1, 3)
         self.free[cells[:, 0], cells[:, 1], cells[:, 2]] = True

@@ -31,7 +31,7 @@ _FACES = [
     for axis in range(3)
     for side in (-1, 1)
 ]
-"""The step to each neighbour of a cell, and the corners shared with it."""
+"""The step to each neighbor of a cell, and the corners shared with it."""
 _CHUNK = 1 << 16
 
 

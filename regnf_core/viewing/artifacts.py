@@ -14,9 +14,9 @@ from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.viewing.document import result_document, trace_document
 from regnf_core.viewing.ply import write_ply
-from regnf_core.viewing.preview import OBJECT_COLOUR, SCENE_COLOUR, preview
+from regnf_core.viewing.preview import OBJECT_COLOR, SCENE_COLOR, preview
 
-CONTEXT_COLOUR = (0.80, 0.82, 0.85)
+CONTEXT_COLOR = (0.80, 0.82, 0.85)
 _ALWAYS = (
     "scene_points.ply",
     "object_points.ply",
@@ -41,19 +41,19 @@ def write_artifacts(
 
     ``truth``, ``symmetries``, ``object_name`` and ``candidates`` are for the result document.
 
-    scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, coloured by
+    scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
     source), context_points.ply (the scene round the detection, where the result has it), residuals.npz,
     trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
     """
     scene, obj = result.scene_samples, result.object_samples
     back = result.T_object_scene.inverse()
     placed = SurfaceSamples(back.apply(obj.points.double().cpu()), obj.normals.double().cpu() @ back.rotation.mT)
-    _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOUR))
-    _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOUR))
-    _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOUR), (placed, OBJECT_COLOUR))
+    _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
+    _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
+    _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
     names = list(_ALWAYS)
     if result.surroundings is not None and len(result.surroundings.points):
-        _write_cloud(directory / "context_points.ply", (result.surroundings, CONTEXT_COLOUR))
+        _write_cloud(directory / "context_points.ply", (result.surroundings, CONTEXT_COLOR))
         names.append("context_points.ply")
     arrays: dict[str, Any] = {name: _float32(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
@@ -69,13 +69,13 @@ def write_artifacts(
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:
     points = np.concatenate([_float32(samples.points) for samples, _ in parts])
     normals = np.concatenate([_float32(samples.normals) for samples, _ in parts])
-    colours = np.concatenate(
+    colors = np.concatenate(
         [
-            np.tile((255 * np.array(colour)).round().astype(np.uint8), (len(samples.points), 1))
-            for samples, colour in parts
+            np.tile((255 * np.array(color)).round().astype(np.uint8), (len(samples.points), 1))
+            for samples, color in parts
         ]
     )
-    write_ply(path, points, normals, colours)
+    write_ply(path, points, normals, colors)
 
 
 def _write_json(path: Path, values: Any) -> None:

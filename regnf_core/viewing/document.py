@@ -88,7 +88,7 @@ def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
             "loss": _json_number(record.loss),
             "residual_scene": _json_number(record.residual_scene),
             "residual_object": _json_number(record.residual_object),
-            "regulariser": _json_number(record.regulariser),
+            "regularizer": _json_number(record.regularizer),
             "kernel_shape": record.kernel_shape,
             "kernel_scale": record.kernel_scale,
             "scene_samples": record.scene_samples,

@@ -13,7 +13,7 @@ from regnf_core.viewing.splats import Floats, Surfels, render, view_from
 PANEL = 320
 _RESOLUTION = 72
 _OVERSAMPLING = 2
-_COLOUR = np.array([0.72, 0.75, 0.79])
+_COLOR = np.array([0.72, 0.75, 0.79])
 _BACKGROUND = np.array([0.975, 0.975, 0.97])
 _SIDES = ((1.0, 0.55, 0.6), (-0.7, -1.0, 0.6))
 """Where the viewer stands: along the first and second level axis, and up."""
@@ -46,10 +46,10 @@ def _view(surface: Surface, side: tuple[float, float, float], up_axis: str, step
     up = np.eye(3)[axis] * (-1.0 if up_axis.startswith("-") else 1.0)
     first = np.eye(3)[(axis + 1) % 3]
     direction = side[0] * first + side[1] * np.cross(up, first) + side[2] * up
-    colours = np.broadcast_to(_COLOUR, surface.vertices.shape)
+    colors = np.broadcast_to(_COLOR, surface.vertices.shape)
     view = view_from(direction, up, surface.vertices, PANEL * _OVERSAMPLING)
     picture = render(
-        Surfels(surface.vertices, surface.normals, colours), view, PANEL * _OVERSAMPLING, _DISC * step, _BACKGROUND
+        Surfels(surface.vertices, surface.normals, colors), view, PANEL * _OVERSAMPLING, _DISC * step, _BACKGROUND
     )
     return _image(picture).resize((PANEL, PANEL), Image.Resampling.LANCZOS)
 
@@ -77,13 +77,13 @@ def _section(field: SdfField, surface: Surface) -> Image.Image:
 
 
 def _shades(distance: Floats, pixel: float) -> Floats:
-    """(N, 3) colours of distances (N,) in diagonals: the surface dark, isolines faint; a line is two pixels wide."""
+    """(N, 3) colors of distances (N,) in diagonals: the surface dark, isolines faint; a line is two pixels wide."""
     fade = np.clip(np.abs(distance) / 0.35, 0.0, 1.0)[:, None] * 0.75
     base = np.where(distance[:, None] < 0, _INSIDE, _OUTSIDE)
-    colours = base * (1.0 - fade) + fade
+    colors = base * (1.0 - fade) + fade
     from_line = np.abs(distance * _LINES - np.round(distance * _LINES)) / _LINES
-    colours = np.where((from_line < 0.7 * pixel)[:, None], 0.82 * colours, colours)
-    return np.where((np.abs(distance) < pixel)[:, None], np.array([0.15, 0.17, 0.20]), colours)
+    colors = np.where((from_line < 0.7 * pixel)[:, None], 0.82 * colors, colors)
+    return np.where((np.abs(distance) < pixel)[:, None], np.array([0.15, 0.17, 0.20]), colors)
 
 
 def _image(picture: Floats) -> Image.Image:

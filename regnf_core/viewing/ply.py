@@ -12,15 +12,13 @@ _VERTEX = np.dtype(
 )
 
 
-def write_ply(
-    path: Path, points: NDArray[np.float32], normals: NDArray[np.float32], colours: NDArray[np.uint8]
-) -> None:
-    """Write points (N, 3), unit normals (N, 3) and colours (N, 3), 0 to 255."""
+def write_ply(path: Path, points: NDArray[np.float32], normals: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
+    """Write points (N, 3), unit normals (N, 3) and colors (N, 3), 0 to 255."""
     vertices = np.empty(points.shape[0], dtype=_VERTEX)
     for names, values in (
         (("x", "y", "z"), points),
         (("nx", "ny", "nz"), normals),
-        (("red", "green", "blue"), colours),
+        (("red", "green", "blue"), colors),
     ):
         for column, name in enumerate(names):
             vertices[name] = values[:, column]

@@ -16,8 +16,8 @@ from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.surface.cameras import axis_vector
 from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
 
-SCENE_COLOUR = (0.38, 0.58, 0.80)
-OBJECT_COLOUR = (0.95, 0.56, 0.20)
+SCENE_COLOR = (0.38, 0.58, 0.80)
+OBJECT_COLOR = (0.95, 0.56, 0.20)
 _BACKGROUND = np.array([0.975, 0.975, 0.97])
 _INK = (52, 56, 62)
 _PANEL = 480
@@ -32,9 +32,9 @@ _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable
 
 def preview(result: RegistrationResult) -> Image.Image:
     """Three panels side by side in the scene frame: at the start, at the end, and the residuals of both surfaces."""
-    scene = _surfels(result.scene_samples, SCENE_COLOUR)
-    start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOUR)
-    end = _placed(result.object_samples, result.T_object_scene, OBJECT_COLOUR)
+    scene = _surfels(result.scene_samples, SCENE_COLOR)
+    start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOR)
+    end = _placed(result.object_samples, result.T_object_scene, OBJECT_COLOR)
     up = axis_vector(_up_axis(result.options)).numpy()
     direction = _best_direction(scene, up)
     edge = _PANEL * _OVERSAMPLING
@@ -46,7 +46,7 @@ def preview(result: RegistrationResult) -> Image.Image:
     panels = [
         _panel(before, nearest_surfels(before, view, edge, radius), view),
         _panel(after, in_front, view),
-        _panel(residual, in_front, view),  # the same discs in other colours
+        _panel(residual, in_front, view),  # the same discs in other colors
     ]
     sheet = Image.new("RGB", (3 * _PANEL, _PANEL + _CAPTION), tuple(int(255 * part) for part in _BACKGROUND))
     for number, panel in enumerate(panels):
@@ -61,25 +61,25 @@ def _up_axis(options: dict[str, Any]) -> str:
     return str(robust or options["sampling"]["up_axis"])
 
 
-def residual_colours(shares: Floats) -> Floats:
-    """(N, 3) colours of |residuals| (N,) given as a share of the ramp's top, clipped to it."""
+def residual_colors(shares: Floats) -> Floats:
+    """(N, 3) colors of |residuals| (N,) given as a share of the ramp's top, clipped to it."""
     position = np.clip(shares, 0.0, 1.0) * (len(_RAMP) - 1)
     low = np.minimum(position.astype(np.int64), len(_RAMP) - 2)
     weight = (position - low)[:, None]
-    colours: Floats = (1.0 - weight) * _RAMP[low] + weight * _RAMP[low + 1]
-    return colours
+    colors: Floats = (1.0 - weight) * _RAMP[low] + weight * _RAMP[low + 1]
+    return colors
 
 
-def _surfels(samples: SurfaceSamples, colour: tuple[float, float, float]) -> Surfels:
+def _surfels(samples: SurfaceSamples, color: tuple[float, float, float]) -> Surfels:
     points = samples.points.double().cpu().numpy()
-    return Surfels(points, samples.normals.double().cpu().numpy(), np.broadcast_to(np.array(colour), points.shape))
+    return Surfels(points, samples.normals.double().cpu().numpy(), np.broadcast_to(np.array(color), points.shape))
 
 
-def _placed(samples: SurfaceSamples, T_object_scene: Sim3, colour: tuple[float, float, float]) -> Surfels:
+def _placed(samples: SurfaceSamples, T_object_scene: Sim3, color: tuple[float, float, float]) -> Surfels:
     """The object's samples in the scene frame."""
     back = T_object_scene.inverse()
     moved = SurfaceSamples(back.apply(samples.points.double().cpu()), samples.normals.double().cpu() @ back.rotation.mT)
-    return _surfels(moved, colour)
+    return _surfels(moved, color)
 
 
 def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfels) -> Surfels:
@@ -87,7 +87,7 @@ def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfel
     parts = []
     for cloud, name in ((scene, "scene_residuals"), (placed, "object_residuals")):
         sizes = result.residuals[name].double().abs().cpu().numpy()
-        parts.append(Surfels(cloud.points, cloud.normals, residual_colours(sizes / top)))
+        parts.append(Surfels(cloud.points, cloud.normals, residual_colors(sizes / top)))
     return Surfels.join(*parts)
 
 
@@ -121,15 +121,15 @@ def _captions(sheet: Image.Image, result: RegistrationResult) -> None:
         left = number * _PANEL + 24
         draw.text((left, 16), heading, fill=_INK, font=title)
         draw.text((left, 42), note, fill=(120, 124, 130), font=small)
-    _colour_bar(sheet, draw, small)
+    _color_bar(sheet, draw, small)
 
 
-def _colour_bar(
+def _color_bar(
     sheet: Image.Image, draw: ImageDraw.ImageDraw, font: ImageFont.FreeTypeFont | ImageFont.ImageFont
 ) -> None:
     width, height = 150, 10
     left, top = 3 * _PANEL - width - 24, 22
-    ramp = residual_colours(np.linspace(0.0, 1.0, width))
+    ramp = residual_colors(np.linspace(0.0, 1.0, width))
     bar = np.broadcast_to((255 * ramp).astype(np.uint8), (height, width, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
     draw.text((left, top + 20), "0", fill=_INK, font=font)

@@ -18,20 +18,20 @@ Singles = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class View:
-    """An orthographic camera: rows right, up, back (3, 3), the centre (3,) shown mid-picture, and pixels a unit."""
+    """An orthographic camera: rows right, up, back (3, 3), the center (3,) shown mid-picture, and pixels a unit."""
 
     axes: Floats
-    centre: Floats
+    center: Floats
     pixels_per_unit: float
 
 
 @dataclass(frozen=True)
 class Surfels:
-    """Oriented coloured points: points, normals (N, 3) in one frame, colours (N, 3) within 0 and 1."""
+    """Oriented colored points: points, normals (N, 3) in one frame, colors (N, 3) within 0 and 1."""
 
     points: Floats
     normals: Floats
-    colours: Floats
+    colors: Floats
 
     @classmethod
     def join(cls, *parts: Surfels) -> Surfels:
@@ -39,7 +39,7 @@ class Surfels:
         return cls(
             np.concatenate([part.points for part in parts]),
             np.concatenate([part.normals for part in parts]),
-            np.concatenate([part.colours for part in parts]),
+            np.concatenate([part.colors for part in parts]),
         )
 
 
@@ -65,16 +65,16 @@ def render(surfels: Surfels, view: View, size: int, radius: float, background: F
 
 def nearest_surfels(surfels: Surfels, view: View, size: int, radius: float) -> NDArray[np.int64]:
     """(size, size) index of the disc nearest to the viewer in each pixel, -1 where there is none."""
-    seen = ((surfels.points - view.centre) @ view.axes.T * view.pixels_per_unit).astype(np.float32)  # right, up, near
+    seen = ((surfels.points - view.center) @ view.axes.T * view.pixels_per_unit).astype(np.float32)  # right, up, near
     towards = _towards_viewer(surfels, view).astype(np.float32)
     return _nearest(seen, towards, size, radius * view.pixels_per_unit).reshape(size, size)
 
 
 def paint(surfels: Surfels, nearest: NDArray[np.int64], view: View, background: Floats) -> NDArray[np.uint8]:
-    """The picture (size, size, 3), in bytes, of what ``nearest_surfels`` found, in the colours of ``surfels``."""
-    shaded = surfels.colours * _shade(_towards_viewer(surfels, view))[:, None]
-    colours = np.concatenate([shaded, background[None]])  # where there is no disc, -1 takes the last
-    painted: NDArray[np.uint8] = (255 * np.clip(colours, 0.0, 1.0)).round().astype(np.uint8)[nearest]
+    """The picture (size, size, 3), in bytes, of what ``nearest_surfels`` found, in the colors of ``surfels``."""
+    shaded = surfels.colors * _shade(_towards_viewer(surfels, view))[:, None]
+    colors = np.concatenate([shaded, background[None]])  # where there is no disc, -1 takes the last
+    painted: NDArray[np.uint8] = (255 * np.clip(colors, 0.0, 1.0)).round().astype(np.uint8)[nearest]
     return painted
 
 
@@ -87,7 +87,7 @@ def _towards_viewer(surfels: Surfels, view: View) -> Floats:
 def _nearest(seen: Singles, normals: Singles, size: int, radius: float) -> NDArray[np.int64]:
     """(size * size,) index of the disc nearest to the viewer in each pixel, -1 where there is none.
 
-    seen: (N, 3) centres, pixels from the middle · normals: (N, 3) towards the viewer · radius: pixels.
+    seen: (N, 3) centers, pixels from the middle · normals: (N, 3) towards the viewer · radius: pixels.
     Works through the discs row by row, each row of a disc being one span of pixels. A pixel keeps the largest of 64-bit
     keys with the depth in the upper and the index in the lower half, so that one maximum decides and no sorting is
     needed.
@@ -113,9 +113,9 @@ def _nearest(seen: Singles, normals: Singles, size: int, radius: float) -> NDArr
 def _spans(
     column: Singles, dy: Singles, slope: Singles, radius: float, size: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First pixel (N,) and number of pixels (N,) of the row at ``dy`` above each disc's centre that the disc covers.
+    """First pixel (N,) and number of pixels (N,) of the row at ``dy`` above each disc's center that the disc covers.
 
-    A pixel dx, dy from the centre is covered where dx^2 + dy^2 + dz^2 <= radius^2, dz = -(slope . (dx, dy)): between
+    A pixel dx, dy from the center is covered where dx^2 + dy^2 + dz^2 <= radius^2, dz = -(slope . (dx, dy)): between
     the roots of a quadratic in dx.
     """
     square = 1.0 + slope[:, 0] ** 2

@@ -11,24 +11,24 @@ GRID_RADIUS = 2.0
 _LEAST_PIXELS = 100
 _LEAST_DEPTH_SHARE = 1e-4
 _LEAST_SPREAD = 2.0
-"""Standard deviation of the colours, of 255."""
+"""Standard deviation of the colors, of 255."""
 
 
 def check_images(images: PosedImages) -> None:
     """Raise DatasetError where a fit would have nothing to go by.
 
     Reasons: DATASET_NO_FRAMES, DATASET_POSE_NOT_RIGID, DATASET_INTRINSICS_INVALID, DATASET_BOUNDS_EMPTY,
-    DATASET_OUTSIDE_GRID, DATASET_DEPTH_MISSING, DATASET_NO_COLOUR_VARIETY.
+    DATASET_OUTSIDE_GRID, DATASET_DEPTH_MISSING, DATASET_NO_COLOR_VARIETY.
     """
-    if len(images) == 0 or images.colours[0].size == 0:
+    if len(images) == 0 or images.colors[0].size == 0:
         raise DatasetError("the dataset holds no pixels", reason="DATASET_NO_FRAMES")
     _check_cameras(images)
     _check_bounds(images.bounds)
     if images.depths is not None:
         if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _LEAST_DEPTH_SHARE:
             raise DatasetError("no image has depths worth the name", reason="DATASET_DEPTH_MISSING")
-    elif float(images.colours.reshape(-1, 3).std(axis=0).max()) < _LEAST_SPREAD:
-        raise DatasetError("the images have no depths and are all of one colour", reason="DATASET_NO_COLOUR_VARIETY")
+    elif float(images.colors.reshape(-1, 3).std(axis=0).max()) < _LEAST_SPREAD:
+        raise DatasetError("the images have no depths and are all of one color", reason="DATASET_NO_COLOR_VARIETY")
 
 
 def check_seen(pixels: int) -> None:

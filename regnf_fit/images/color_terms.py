@@ -1,4 +1,4 @@
-"""Colour, depth and opacity of rays, rendered through the field."""
+"""Color, depth and opacity of rays, rendered through the field."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import render_weights
 from regnf_fit.images.rays import PixelRays
 
-_COLOURED_SECTIONS = 3
-"""On each ray the colour is evaluated in so many sections, those that count most."""
+_COLORED_SECTIONS = 3
+"""On each ray the color is evaluated in so many sections, those that count most."""
 _FREE_SAMPLES = 5
 _BAND_SAMPLES = 9
 _EVEN_SAMPLES = 24
@@ -21,10 +21,10 @@ _EVEN_SAMPLES = 24
 
 @dataclass(frozen=True)
 class Rendered:
-    """Of R rays: colours (R, 3) in [0, 1], as they lie before ``background`` · depths (R,) along the camera's axis,
+    """Of R rays: colors (R, 3) in [0, 1], as they lie before ``background`` · depths (R,) along the camera's axis,
     of what is opaque · opacity (R,) in [0, 1]."""
 
-    colours: Tensor
+    colors: Tensor
     depths: Tensor
     opacity: Tensor
 
@@ -32,9 +32,9 @@ class Rendered:
 def render_rays(
     field: RadianceField, rays: PixelRays, depths: Tensor, sharpness: Tensor, background: Tensor
 ) -> Rendered:
-    """Render rays through samples at ``depths`` (R, S), ascending; background: (3,) the colour behind everything.
+    """Render rays through samples at ``depths`` (R, S), ascending; background: (3,) the color behind everything.
 
-    Differentiable by the field's parameters. Normals given to the colour's network are not differentiated: the
+    Differentiable by the field's parameters. Normals given to the color's network are not differentiated: the
     geometry learns from the opacity.
     """
     function = field.function()
@@ -42,19 +42,19 @@ def render_rays(
     weights, rest = render_weights(distances, sharpness)
     middles = (depths[:, 1:] + depths[:, :-1]) / 2.0
     opacity = 1.0 - rest
-    heaviest = weights.detach().topk(min(_COLOURED_SECTIONS, weights.shape[1]), dim=1).indices
+    heaviest = weights.detach().topk(min(_COLORED_SECTIONS, weights.shape[1]), dim=1).indices
     points = rays.at(middles.gather(1, heaviest))  # (R, K, 3)
     directions = torch.nn.functional.normalize(rays.directions, dim=1)[:, None].expand_as(points)
     flat = points.flatten(0, 1)
     with torch.no_grad():
         normals = torch.nn.functional.normalize(function.value_and_gradient(flat)[1], dim=1)
     _, features = field.distance_and_feature(flat)
-    colours = field.colour(flat, directions.flatten(0, 1), normals, features).view_as(points)
+    colors = field.color(flat, directions.flatten(0, 1), normals, features).view_as(points)
     chosen = weights.gather(1, heaviest)
-    share = chosen / chosen.sum(dim=1, keepdim=True).clamp_min(1e-6)  # the sections left out are coloured alike
-    colour = opacity[:, None] * (share[..., None] * colours).sum(dim=1) + rest[:, None] * background
+    share = chosen / chosen.sum(dim=1, keepdim=True).clamp_min(1e-6)  # the sections left out are colored alike
+    color = opacity[:, None] * (share[..., None] * colors).sum(dim=1) + rest[:, None] * background
     depth = (weights * middles).sum(dim=1) / opacity.clamp_min(1e-6)
-    return Rendered(colour, depth, opacity)
+    return Rendered(color, depth, opacity)
 
 
 def samples_about_depth(rays: PixelRays, bands: Tensor, generator: torch.Generator) -> Tensor:

@@ -45,7 +45,7 @@ class FitFiles:
     pictures: bool = False
     """Draw the field after 3, 10 and 30 % of the iterations and at the end, beside ``output``, as .png."""
     sdfstudio: Path | None = None
-    """The field with its colours in the layout of sdfstudio's checkpoints, if wanted."""
+    """The field with its colors in the layout of sdfstudio's checkpoints, if wanted."""
 
 
 def reconstruct(
@@ -176,7 +176,7 @@ class _Writer:
 def _key(images: PosedImages, options: ReconstructionOptions, seed: int) -> str:
     """Tells one fit from another: of the pixels, cameras, options and seed."""
     digest = hashlib.sha256(repr((options, seed)).encode())
-    for array in (images.colours, images.depths, images.masks, images.intrinsics, images.T_world_camera, images.bounds):
+    for array in (images.colors, images.depths, images.masks, images.intrinsics, images.T_world_camera, images.bounds):
         if array is not None:
             digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()

@@ -30,11 +30,11 @@ class HeldOutFigures:
 
 @dataclass(frozen=True)
 class FirstHits:
-    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3) · colours (R, 3)."""
+    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3) · colors (R, 3)."""
 
     depths: Tensor
     normals: Tensor
-    colours: Tensor
+    colors: Tensor
 
 
 @torch.no_grad()
@@ -44,7 +44,7 @@ def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     if not parts:
         empty = torch.zeros(0, 3)
         return FirstHits(empty[:, 0], empty, empty)
-    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals", "colours")))
+    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals", "colors")))
 
 
 @torch.no_grad()
@@ -55,7 +55,7 @@ def judge(field: RadianceField, rays: PixelRays, size: float) -> HeldOutFigures:
     met = hits.depths > 0.0
     psnr = None
     if met.any():
-        error = (hits.colours[met] - rays.colours[met]).square().mean()
+        error = (hits.colors[met] - rays.colors[met]).square().mean()
         psnr = -10.0 * math.log10(max(float(error), 1e-10))
     both = met & (rays.depths > 0.0)
     depth_error = (hits.depths - rays.depths).abs()[both]
@@ -96,7 +96,7 @@ def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     points = rays.at(high[:, None])[:, 0]
     normals = function.value_and_gradient(points)[1]
     directions = torch.nn.functional.normalize(rays.directions, dim=1)
-    colours = field.colour(
+    colors = field.color(
         points, directions, torch.nn.functional.normalize(normals, dim=1), field.distance_and_feature(points)[1]
     )
-    return FirstHits(torch.where(hit, high, 0.0), normals, colours)
+    return FirstHits(torch.where(hit, high, 0.0), normals, colors)

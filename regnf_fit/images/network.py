@@ -1,4 +1,4 @@
-"""The parameters of a field that is being fitted to images: geometry, colour and the opacity's sharpness."""
+"""The parameters of a field that is being fitted to images: geometry, color and the opacity's sharpness."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from regnf_fit.images.options import ReconstructionOptions
 
 DEGREE = 6
 DIRECTION_DEGREE = 4
-COLOUR_INPUTS = 3 + (3 + 6 * DIRECTION_DEGREE) + 3
+COLOR_INPUTS = 3 + (3 + 6 * DIRECTION_DEGREE) + 3
 """Point, direction with its sines and cosines, normal; the geometry's feature follows."""
 _TABLE_SPREAD = 1e-4
-_COLOUR_LAYERS = 2
+_COLOR_LAYERS = 2
 
 
 @dataclass(frozen=True)
 class StartShape:
     """The sphere that a field starts as: matter within, or (``hollow``) around. Field units."""
 
-    centre: Tensor  # (3,)
+    center: Tensor  # (3,)
     radius: float
     hollow: bool
 
 
 class RadianceField(nn.Module):
-    """A neus-facto field with colours, starting as roughly a sphere.
+    """A neus-facto field with colors, starting as roughly a sphere.
 
-    The start is the geometric initialisation of Atzmon and Lipman (2020, "SAL"): it gives a signed distance from the
-    first iteration on. The colour's network sees what neus-facto's does, in its order: point, direction, normal,
+    The start is the geometric initialization of Atzmon and Lipman (2020, "SAL"): it gives a signed distance from the
+    first iteration on. The color's network sees what neus-facto's does, in its order: point, direction, normal,
     feature.
     """
 
@@ -53,7 +53,7 @@ class RadianceField(nn.Module):
         widths = [3 + self._encoding.width + grid.width] + [options.hidden_width] * options.hidden_layers
         weights, biases = _random_layers(widths, generator)
         weights[0][:, 3 : 3 + self._encoding.width] = 0.0
-        biases[0] -= weights[0][:, :3] @ start.centre
+        biases[0] -= weights[0][:, :3] @ start.center
         sign = -1.0 if start.hollow else 1.0
         weights.append(torch.full((1, widths[-1]), sign * math.sqrt(math.pi / widths[-1])))
         biases.append(torch.full((1,), -sign * start.radius))
@@ -61,11 +61,11 @@ class RadianceField(nn.Module):
         self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
         self.feature_weight = nn.Parameter(feature)
         self.feature_bias = nn.Parameter(torch.zeros(options.feature_width))
-        widths = [COLOUR_INPUTS + options.feature_width] + [options.hidden_width] * _COLOUR_LAYERS + [3]
+        widths = [COLOR_INPUTS + options.feature_width] + [options.hidden_width] * _COLOR_LAYERS + [3]
         weights, biases = _random_layers(widths, generator)
-        self.colour_weights, self.colour_biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        self.color_weights, self.color_biases = nn.ParameterList(weights), nn.ParameterList(biases)
         self.background = nn.Parameter(torch.zeros(3))
-        """Logit of the colour behind everything."""
+        """Logit of the color behind everything."""
         self.log_sharpness = nn.Parameter(torch.zeros(()))
         """Logarithm of the sharpness over the least one that the schedule allows."""
 
@@ -75,19 +75,19 @@ class RadianceField(nn.Module):
         return NeusFactoFunction(mlp, self._encoding, HashEncoding(self.options.grid, self.table))
 
     def distance_and_feature(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3), and the feature (N, F) that the colour depends on."""
+        """Signed distance (N,) at points (N, 3), and the feature (N, F) that the color depends on."""
         function = self.function()
         h = function.mlp.hidden(function.encode(points))
         distance = torch.addmm(self.biases[-1], h, self.weights[-1].T).squeeze(-1)
         return distance, torch.addmm(self.feature_bias, h, self.feature_weight.T)
 
-    def colour(self, points: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
-        """Colour (N, 3) in [0, 1] of points seen along unit ``directions`` (N, 3)."""
+    def color(self, points: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
+        """Color (N, 3) in [0, 1] of points seen along unit ``directions`` (N, 3)."""
         encoded = self._direction_encoding.encode(directions)
         h = torch.cat((points, directions, encoded, normals, features), dim=-1)
-        for weight, bias in zip(self.colour_weights[:-1], self.colour_biases[:-1], strict=True):
+        for weight, bias in zip(self.color_weights[:-1], self.color_biases[:-1], strict=True):
             h = torch.relu(torch.addmm(bias, h, weight.T))
-        return torch.sigmoid(torch.addmm(self.colour_biases[-1], h, self.colour_weights[-1].T))
+        return torch.sigmoid(torch.addmm(self.color_biases[-1], h, self.color_weights[-1].T))
 
     def tensors(self) -> dict[str, NDArray[Any]]:
         """The geometry's parameters by the safe format's names."""

@@ -27,11 +27,11 @@ _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
 
 
 def observe(images: PosedImages, voxels: int) -> Observation | None:
-    """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colours): what
+    """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colors): what
     a camera looked through is free, where a depth ends there is a surface, nobody looked at the rest.
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
-    Voxels are judged by their centres, in every image that shows them.
+    Voxels are judged by their centers, in every image that shows them.
     """
     if images.depths is None or voxels == 0:
         return None
@@ -40,10 +40,10 @@ def observe(images: PosedImages, voxels: int) -> Observation | None:
     counts = [int(n) for n in ((high - low) / voxel - 1e-9).ceil().clamp_min(1)]
     states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
     axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
-    centres = torch.cartesian_prod(*axes).float()
-    left = torch.arange(len(centres))
+    centers = torch.cartesian_prod(*axes).float()
+    left = torch.arange(len(centers))
     for image in range(len(images)):
-        free = _looked_through(centres[left], images, image, _MARGIN * voxel)
+        free = _looked_through(centers[left], images, image, _MARGIN * voxel)
         states[left[free]] = FREE
         left = left[~free]
     ends = torch.cat([_ends(images, image) for image in range(len(images))])
@@ -60,11 +60,11 @@ def _pixel_width(images: PosedImages) -> float:
     return float(np.median(widths)) if widths.size else 0.0
 
 
-def _looked_through(centres: Tensor, images: PosedImages, image: int, margin: float) -> Tensor:
-    """(N,) bool: which centres (N, 3) lie before what one image shows, by ``margin`` along the camera's axis."""
+def _looked_through(centers: Tensor, images: PosedImages, image: int, margin: float) -> Tensor:
+    """(N,) bool: which centers (N, 3) lie before what one image shows, by ``margin`` along the camera's axis."""
     assert images.depths is not None
     T = torch.from_numpy(np.linalg.inv(images.T_world_camera[image])).float()
-    local = centres @ T[:3, :3].T + T[:3, 3]
+    local = centers @ T[:3, :3].T + T[:3, 3]
     z = local[:, 2]
     pixel = local @ torch.from_numpy(images.intrinsics[image]).float().T
     column, row = (pixel[:, :2] / z.clamp_min(1e-6)[:, None]).floor().unbind(-1)

@@ -24,9 +24,9 @@ def render_weights(distances: Tensor, sharpness: Tensor | float) -> tuple[Tensor
 
 
 def least_sharpness(share: float, size: float) -> float:
-    """The sharpness below which the learnt one may not fall after ``share`` of the fit, per field unit.
+    """The sharpness below which the learned one may not fall after ``share`` of the fit, per field unit.
 
     It grows from 20 to 400 over the diagonal ``size``: blurred at first, so that every section on a ray learns, and at
-    last narrower than a hundredth of the diagonal whatever was learnt.
+    last narrower than a hundredth of the diagonal whatever was learned.
     """
     return 20.0 * math.exp(math.log(20.0) * min(max(share, 0.0), 1.0)) / size

@@ -29,9 +29,9 @@ class LossWeights:
     Lengths are measured in diagonals of the bounds, so that a cup and a room are weighted alike.
     """
 
-    colour: float = 1.0
+    color: float = 1.0
     eikonal: float = 0.4
-    """The paper's lambda, against a colour term of weight 1."""
+    """The paper's lambda, against a color term of weight 1."""
     surface: float = 20.0
     """|signed distance| where a depth was measured, and the distance along the ray near it."""
     free_space: float = 10.0
@@ -49,7 +49,7 @@ class ReconstructionOptions:
     hidden_layers: int = 2
     hidden_width: int = 64
     feature_width: int = 16
-    """What the geometry's network hands to the colour's."""
+    """What the geometry's network hands to the color's."""
     iterations: int = 3000
     surface_rays: int = 512
     """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
@@ -57,10 +57,10 @@ class ReconstructionOptions:
     free_points: int = 1024
     eikonal_points: int = 512
     """Points an iteration for the Eikonal term, half of them near surfaces, half anywhere in the bounds."""
-    colour_rays: int = 64
-    """Rays an iteration for colour and opacity, where there is depth."""
+    color_rays: int = 64
+    """Rays an iteration for color and opacity, where there is depth."""
     rays_without_depth: int = 384
-    """The same where there is none: colour is all there is to learn from."""
+    """The same where there is none: color is all there is to learn from."""
     band_deviations: float = 5.0
     """How far before a measured surface the distance along the ray is believed, in standard deviations of the depth's
     noise, or a pixel's width there if that is more; half as far behind it."""
@@ -109,7 +109,7 @@ class ReconstructionReport:
     loss: float
     """Mean over the last iterations."""
     psnr: float | None
-    """Of the colours, decibels; None: no ray met a surface."""
+    """Of the colors, decibels; None: no ray met a surface."""
     depth_error: float | None
     """Mean |rendered - measured depth|, field units, where both are; None without depth. Sensor noise is part of it."""
     depth_error_median: float | None

@@ -40,7 +40,7 @@ class PreparedImages:
 def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
     """The rays that meet the bounds, at most three million. Raises DatasetError, see :func:`check_images`."""
     check_images(images)
-    pixels = rng.permutation(images.colours[..., 0].size)[:_MOST_PIXELS]
+    pixels = rng.permutation(images.colors[..., 0].size)[:_MOST_PIXELS]
     planes = None if images.depths is None else local_planes(images.depths, images.intrinsics)
     rays = rays_of_pixels(images, pixels, planes)
     rays = rays.take(rays.far > rays.near)
@@ -64,9 +64,9 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
 def start_shape(images: PosedImages, start: Start) -> StartShape:
     """A ball in the middle of the bounds; for a room a hollow one, so large that the cameras are in free space."""
     low, high = images.bounds
-    centre = (low + high) / 2.0
+    center = (low + high) / 2.0
     cameras = images.T_world_camera[:, :3, 3]
     within = ((cameras > low) & (cameras < high)).all(axis=1).mean()
     hollow = start == "room" or (start == "auto" and within > 0.5)
     size = float(np.linalg.norm(high - low))
-    return StartShape(torch.from_numpy(centre).float(), (0.5 if hollow else _START_RADIUS) * size, hollow)
+    return StartShape(torch.from_numpy(center).float(), (0.5 if hollow else _START_RADIUS) * size, hollow)

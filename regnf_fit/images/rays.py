@@ -18,7 +18,7 @@ class PixelRays:
     """R rays, one a pixel, world frame.
 
     A point at depth z lies at origins + z directions: directions (R, 3) are not of unit length, their part along the
-    camera's axis is 1. near, far: (R,) depths between which the ray is inside the bounds · colours: (R, 3) in [0, 1] ·
+    camera's axis is 1. near, far: (R,) depths between which the ray is inside the bounds · colors: (R, 3) in [0, 1] ·
     depths: (R,), 0 where none was measured · background: (R,) true where a mask says so · cosines: (R,) between ray
     and surface normal, 0 where unknown · deviations: (R,) of the depths' noise, 0 where unknown.
     """
@@ -27,7 +27,7 @@ class PixelRays:
     directions: Tensor
     near: Tensor
     far: Tensor
-    colours: Tensor
+    colors: Tensor
     depths: Tensor
     background: Tensor
     cosines: Tensor
@@ -54,10 +54,10 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
 
     planes: of the images' depths.
     """
-    image, row, column = np.unravel_index(pixels, images.colours.shape[:3])
-    centres = np.stack([column + 0.5, row + 0.5, np.ones(len(pixels))], axis=-1)
+    image, row, column = np.unravel_index(pixels, images.colors.shape[:3])
+    centers = np.stack([column + 0.5, row + 0.5, np.ones(len(pixels))], axis=-1)
     T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
-    directions = np.einsum("rij,rj->ri", T_world_pixel[image], centres)
+    directions = np.einsum("rij,rj->ri", T_world_pixel[image], centers)
     origins = images.T_world_camera[image, :3, 3]
     near, far = depths_in_box(origins, directions, images.bounds)
 
@@ -71,7 +71,7 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
         directions=torch.from_numpy(directions).float(),
         near=torch.from_numpy(near).float(),
         far=torch.from_numpy(far).float(),
-        colours=picked(images.colours) / 255.0 if len(pixels) else torch.zeros(0, 3),
+        colors=picked(images.colors) / 255.0 if len(pixels) else torch.zeros(0, 3),
         depths=picked(images.depths),
         background=picked(None if images.masks is None else ~images.masks) > 0.5,
         cosines=picked(None if planes is None else planes.cosines),

@@ -1,4 +1,4 @@
-"""A fitted field in the layout of sdfstudio's neus-facto checkpoints, colours included."""
+"""A fitted field in the layout of sdfstudio's neus-facto checkpoints, colors included."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from regnf_fit.images.network import RadianceField
 
 _EMBEDDING = 32
-"""Columns of the colour's network for an image's appearance, which our fields have not: zeros."""
+"""Columns of the color's network for an image's appearance, which our fields have not: zeros."""
 
 
 def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path) -> None:
@@ -26,12 +26,12 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
     for i, (weight, bias) in layers.items():
         if i == last:  # the feature's rows follow the distance's
             weight, bias = torch.cat((weight, field.feature_weight)), torch.cat((bias, field.feature_bias))
-        entries |= _normalised(f"glin{i}", weight, bias)
-    colours = zip(field.colour_weights, field.colour_biases, strict=True)
-    for i, (weight, bias) in enumerate(colours):
+        entries |= _normalized(f"glin{i}", weight, bias)
+    colors = zip(field.color_weights, field.color_biases, strict=True)
+    for i, (weight, bias) in enumerate(colors):
         if i == 0:
             weight = torch.cat((weight, weight.new_zeros(len(weight), _EMBEDDING)), dim=1)
-        entries |= _normalised(f"clin{i}", weight, bias)
+        entries |= _normalized(f"clin{i}", weight, bias)
     # sdfstudio keeps a tenth of the sharpness's logarithm; the density of VolSDF beside it is not used
     entries["deviation_network.variance"] = torch.tensor([math.log(sharpness) / 10.0])
     entries["laplace_density.beta"] = torch.tensor([0.1])
@@ -46,8 +46,8 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
         temporary.unlink(missing_ok=True)
 
 
-def _normalised(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:
-    """A layer with weight normalisation: W = g v / |v|, row by row; here v = W."""
+def _normalized(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:
+    """A layer with weight normalization: W = g v / |v|, row by row; here v = W."""
     return {
         f"{name}.weight_g": weight.norm(dim=1, keepdim=True),
         f"{name}.weight_v": weight,

@@ -21,7 +21,7 @@ from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
 
 _SHARPEST = 50.0
-"""How far above the least sharpness the learnt one may rise."""
+"""How far above the least sharpness the learned one may rise."""
 _SHARPNESS_RATE = 5.0
 """The sharpness learns so much faster than the networks: it is one number with far to go."""
 
@@ -54,9 +54,9 @@ class Trainer:
         self._bounds = prepared.bounds.float().to(device)
         self._device = device
         field = self.field
-        networks = [*field.weights, *field.biases, *field.colour_weights, *field.colour_biases]
+        networks = [*field.weights, *field.biases, *field.color_weights, *field.color_biases]
         networks += [field.feature_weight, field.feature_bias, field.background]
-        self.optimiser = torch.optim.Adam(
+        self.optimizer = torch.optim.Adam(
             [
                 {"params": [field.table], "lr": options.table_rate, "eps": 1e-15},
                 {"params": networks, "lr": options.network_rate},
@@ -65,7 +65,7 @@ class Trainer:
             betas=(0.9, 0.99),
             fused=True,
         )
-        self._rates = [group["lr"] for group in self.optimiser.param_groups]
+        self._rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def mean_loss(self) -> float:
         """Of the iterations since the last call; NaN before the first."""
@@ -79,13 +79,13 @@ class Trainer:
     def step(self) -> None:
         """One iteration."""
         share = self.options.rate_share(self.iteration)
-        for group, rate in zip(self.optimiser.param_groups, self._rates, strict=True):
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
             group["lr"] = rate * share
         loss = self._loss()
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         self._hold_back_fine_levels()
-        self.optimiser.step()
+        self.optimizer.step()
         with torch.no_grad():
             self.field.log_sharpness.clamp_(0.0, math.log(_SHARPEST))
             keep = self.options.decay(self.iteration)
@@ -109,13 +109,13 @@ class Trainer:
         weights = self.options.weights
         function = self.field.function()
         if self._data is None:
-            loss, near = self._colour_alone()
+            loss, near = self._color_alone()
             return loss + weights.eikonal * self._eikonal(function, near)
         surface, free_space, near = depth_terms(function, self._data, self.options, self.generator)
         loss = weights.surface * surface + weights.free_space * free_space
         loss = loss + weights.eikonal * self._eikonal(function, near)
-        if self.options.colour_rays > 0:
-            loss = loss + self._colour(self._data)
+        if self.options.color_rays > 0:
+            loss = loss + self._color(self._data)
         return loss
 
     def _eikonal(self, function: NeusFactoFunction, near: Tensor) -> Tensor:
@@ -127,27 +127,27 @@ class Trainer:
         loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
         return loss
 
-    def _colour(self, data: DepthSupervision) -> Tensor:
-        """Colour and rendered depth of rays with depth, L1 both."""
+    def _color(self, data: DepthSupervision) -> Tensor:
+        """Color and rendered depth of rays with depth, L1 both."""
         options = self.options
-        index = torch.randint(len(data.rays), (options.colour_rays,), generator=self.generator).to(self._device)
+        index = torch.randint(len(data.rays), (options.color_rays,), generator=self.generator).to(self._device)
         rays = data.rays.take(index)
         depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
         rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
-        colour = (rendered.colours - rays.colours).abs().mean()
+        color = (rendered.colors - rays.colors).abs().mean()
         depth = (rendered.depths - rays.depths).abs().mean() / data.size
-        return options.weights.colour * colour + options.weights.rendered_depth * depth
+        return options.weights.color * color + options.weights.rendered_depth * depth
 
-    def _colour_alone(self) -> tuple[Tensor, Tensor]:
+    def _color_alone(self) -> tuple[Tensor, Tensor]:
         """The terms of rays without depth, and points (N, 3) close to where they end."""
         weights = self.options.weights
         index = torch.randint(len(self._rays), (self.options.rays_without_depth,), generator=self.generator)
         rays, sharpness = self._rays.take(index.to(self._device)), self.sharpness()
         depths = samples_by_weight(self.field.function(), rays, sharpness.detach(), self.generator)
         rendered = render_rays(self.field, rays, depths, sharpness, self.field.background.sigmoid())
-        error = (rendered.colours - rays.colours).abs().mean(dim=1)
-        # what lies behind a masked thing has no colour of its own
-        loss = weights.colour * error[~rays.background].sum() / len(rays)
+        error = (rendered.colors - rays.colors).abs().mean(dim=1)
+        # what lies behind a masked thing has no color of its own
+        loss = weights.color * error[~rays.background].sum() / len(rays)
         if self._masked:
             wanted = (~rays.background).float()
             opacity = rendered.opacity.clamp(1e-4, 1.0 - 1e-4)
@@ -160,7 +160,7 @@ class Trainer:
             "iteration": self.iteration,
             "field": self.field.state_dict(),
             "averaged": self.averaged.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
         }
 
@@ -169,5 +169,5 @@ class Trainer:
         self.iteration = state["iteration"]
         self.field.load_state_dict(state["field"])
         self.averaged.load_state_dict(state["averaged"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])

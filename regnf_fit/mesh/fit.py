@@ -88,7 +88,7 @@ def _train(
     generator = torch.Generator().manual_seed(seed)
     size = diagonal(target)
     network = TrainableField(options, radius=size / 4.0, generator=generator)
-    optimiser = torch.optim.Adam(
+    optimizer = torch.optim.Adam(
         [
             {"params": [network.table], "lr": options.table_rate, "eps": 1e-15},
             {"params": [*network.weights, *network.biases], "lr": options.network_rate},
@@ -96,13 +96,13 @@ def _train(
         betas=(0.9, 0.99),
         fused=True,
     )
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, options.rate_share)
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, options.rate_share)
     started = time.monotonic()
     for iteration in range(1, options.iterations + 1):
         loss = _loss(network, near, volume, options, size, generator)
-        optimiser.zero_grad(set_to_none=True)
+        optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
-        optimiser.step()
+        optimizer.step()
         schedule.step()
         if progress is not None and (iteration % _REPORT_EVERY == 0 or iteration == options.iterations):
             spent = time.monotonic() - started

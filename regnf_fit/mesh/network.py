@@ -23,7 +23,7 @@ _TABLE_SPREAD = 1e-4
 class TrainableField(nn.Module):
     """A neus-facto field with trainable table and layers, starting as roughly a sphere of ``radius``.
 
-    The start is the geometric initialisation of Atzmon and Lipman (2020, "SAL"): it gives a signed distance from the
+    The start is the geometric initialization of Atzmon and Lipman (2020, "SAL"): it gives a signed distance from the
     first iteration on.
     """
 

@@ -1,4 +1,4 @@
-"""Cases in other frames, and the judgement on results: against what is known of the untouched ones."""
+"""Cases in other frames, and the judgment on results: against what is known of the untouched ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_case_seen_in_other_frames_is_the_same_case() -> None:
     seen = case.seen_in(T_scene, T_object)
     assert case.truth is not None
     assert seen.truth is not None
-    points = case.detection.centre + (torch.rand(200, 3, dtype=torch.float64) - 0.5) * 2.0 * case.detection.size
+    points = case.detection.center + (torch.rand(200, 3, dtype=torch.float64) - 0.5) * 2.0 * case.detection.size
     moved = T_scene.apply(points)
     assert torch.equal(seen.detection.contains(moved), case.detection.contains(points))
     assert torch.allclose(
@@ -65,7 +65,7 @@ def test_declared_symmetries_form_the_group() -> None:
 
 
 def result(verdict: str, T: Sim3, *others: Sim3) -> RegistrationResult:
-    """As much of a result as the judgement looks at."""
+    """As much of a result as the judgment looks at."""
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     found = SimpleNamespace(
         verdict=verdict,

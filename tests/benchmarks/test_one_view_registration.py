@@ -27,7 +27,7 @@ def test_it_is_found(position: tuple[float, float, float]) -> None:
     placed = together(*(box(low, high) for low, high in PARTS)).transformed(chair_pose().inverse().matrix().numpy())
     room = together(placed, box((-1.0, -1.0, -0.06), (1.0, 1.0, 0.0)), box((-1.0, 0.94, 0.0), (1.0, 1.0, 0.9)))
     camera = DepthCamera(room.vertices.astype(np.float32), room.faces.astype(np.int32), far=4.0)
-    image = camera.look(np.array(position), detection().centre.numpy(), pixels=200)
+    image = camera.look(np.array(position), detection().center.numpy(), pixels=200)
     scene = OneViewField(image, torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]).double())
     result = register(scene, chair(), detection(), ROBUST)
     assert result.verdict == "registered"

@@ -14,7 +14,7 @@ from benchmarks.peers.disturbance import disturbed, keypoints, rigid_fit
 from benchmarks.peers.nerf2nerf import RigidMotion, one_way_residuals
 from benchmarks.peers.splats import _turn_z_to
 from regnf_core import Sim3
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 from regnf_core.result import SurfaceSamples
 from tests.core.analytic import sphere
 from tests.core.robust.shapes import random_pose
@@ -24,11 +24,11 @@ def some_samples(points: Tensor) -> SurfaceSamples:
     return SurfaceSamples(points.float(), torch.nn.functional.normalize(points, dim=-1).float())
 
 
-def test_a_normalised_pair_leads_back_by_hand() -> None:
+def test_a_normalized_pair_leads_back_by_hand() -> None:
     """Four points about (1, 0, 0) with radius 2; the object's are the same about (0, 5, 0) with radius 6."""
     cross = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     scene, obj = 2 * cross + torch.tensor([1.0, 0, 0]), 6 * cross + torch.tensor([0.0, 5, 0])
-    pair = cloud_pair(some_samples(scene), some_samples(obj), normalised=True)
+    pair = cloud_pair(some_samples(scene), some_samples(obj), normalized=True)
     assert np.allclose(pair.scene, cross.numpy())
     assert np.allclose(pair.object, cross.numpy())
     quarter = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
@@ -40,7 +40,7 @@ def test_a_normalised_pair_leads_back_by_hand() -> None:
 
 def test_a_pair_as_it_is_keeps_its_scale() -> None:
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
-    pair = cloud_pair(some_samples(points), some_samples(5 * points), normalised=False)
+    pair = cloud_pair(some_samples(points), some_samples(5 * points), normalized=False)
     T = pair.to_object_scene(np.eye(4))
     assert float(T.scale) == 1.0
     assert torch.allclose(T.apply(points.double().mean(0)[None])[0], (5 * points.float()).double().mean(0), atol=1e-6)
@@ -54,7 +54,7 @@ def test_matrices_of_other_packages() -> None:
     rounded = np.asarray(T.matrix().tolist()) + 1e-7 * np.eye(4)
     assert torch.allclose(similarity(rounded).matrix(), T.matrix(), atol=1e-6)
     for bad in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([0.0, 0.0, 0.0, 1.0]), np.full((4, 4), np.nan)):
-        with pytest.raises(InitialisationError):
+        with pytest.raises(InitializationError):
             similarity(bad)
 
 
@@ -125,12 +125,12 @@ def test_the_residuals_gradient_against_differences() -> None:
     assert torch.allclose(gradient, torch.stack(differences), rtol=1e-6, atol=1e-7)
 
 
-def test_the_motion_turns_about_its_centre() -> None:
-    centre = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    motion = RigidMotion(Sim3.identity(), centre, 2.0)
+def test_the_motion_turns_about_its_center() -> None:
+    center = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    motion = RigidMotion(Sim3.identity(), center, 2.0)
     motion.turn.data = torch.tensor([0.0, 0.0, math.pi / 2], dtype=torch.float64)
     motion.shift.data = torch.tensor([0.0, 0.0, 0.5], dtype=torch.float64)
-    moved = motion.transform().apply(torch.stack([centre, centre + torch.tensor([1.0, 0, 0])]))
+    moved = motion.transform().apply(torch.stack([center, center + torch.tensor([1.0, 0, 0])]))
     expected = torch.tensor([[1.0, 2.0, 4.0], [1.0, 3.0, 4.0]], dtype=torch.float64)
     assert torch.allclose(moved.detach(), expected)
 

@@ -15,7 +15,7 @@ from benchmarks.peers.nerf2nerf import Nerf2nerf
 from benchmarks.peers.registry import PEERS, Entry
 from benchmarks.robust.cases import Case
 from regnf_core import Sim3
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 from regnf_core.geometry.metrics import mssd
 from tests.core.analytic import chair, chair_box, chair_pose, seen_from
 
@@ -23,10 +23,10 @@ LARGER = 1.6
 RIGID = ("paper", "nerf2nerf", "fgr", "ransac_icp", "kiss_matcher", "small_gicp")
 SCALED = (
     "robust",
-    "fgr_normalised",
-    "ransac_icp_normalised",
+    "fgr_normalized",
+    "ransac_icp_normalized",
     "ransac_icp_scaled",
-    "kiss_matcher_normalised",
+    "kiss_matcher_normalized",
 )
 
 
@@ -61,7 +61,7 @@ def share(case: PeerCase, T: Sim3 | None) -> float:
 
 def test_every_method_is_tested() -> None:
     """But splatreg: on this chair it finds now the pose and now its half turn, so there is nothing to hold it to."""
-    assert {*RIGID, *SCALED, "splatreg", "splatreg_normalised"} == set(PEERS)
+    assert {*RIGID, *SCALED, "splatreg", "splatreg_normalized"} == set(PEERS)
 
 
 @pytest.mark.parametrize("name", RIGID)
@@ -96,7 +96,7 @@ def test_a_method_that_gives_up_has_no_pose(same_size: PeerCase) -> None:
         name, given, uses_samples = "gives up", "", True
 
         def register(self, case: PeerCase, seed: int) -> None:
-            raise InitialisationError("nothing found")
+            raise InitializationError("nothing found")
 
     run = run_one("gives up", GivesUp, same_size, seed=0)
     assert run["category"] == NO_POSE

@@ -14,7 +14,7 @@ from regnf_core.fields.safe_format import open_field, read_description
 from regnf_data.sdfstudio import write_dataset
 from regnf_fit.images.observing import observe
 from tests.cli.conftest import DATA, Run
-from tests.fit.images.scenes import BALL_CENTRE, BALL_RADIUS, BOX_CENTRE, BOX_HALF, images
+from tests.fit.images.scenes import BALL_CENTER, BALL_RADIUS, BOX_CENTER, BOX_HALF, images
 
 
 @pytest.fixture
@@ -49,8 +49,8 @@ def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
     [
         ("chair.stl", "INVALID_OPTIONS"),
         ("absent/chair.ply", "INVALID_OPTIONS"),
-        ("chair.safetensors", "FORMAT_NOT_RECOGNISED"),
-        ("chair.ply", "FORMAT_NOT_RECOGNISED"),
+        ("chair.safetensors", "FORMAT_NOT_RECOGNIZED"),
+        ("chair.ply", "FORMAT_NOT_RECOGNIZED"),
     ],
 )
 @pytest.mark.usefixtures("cache")
@@ -64,8 +64,8 @@ def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("cache")
 def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTRE)
-    box = trimesh.creation.box(extents=2.0 * BOX_HALF).apply_translation(BOX_CENTRE)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTER)
+    box = trimesh.creation.box(extents=2.0 * BOX_HALF).apply_translation(BOX_CENTER)
     trimesh.util.concatenate([ball, box]).export(tmp_path / "scene.glb")
     box.export(tmp_path / "other.glb")
     seen = images()

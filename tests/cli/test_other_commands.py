@@ -29,7 +29,7 @@ def test_inspect_shows_a_field(run: Run) -> None:
     assert "plausibility:" in run("inspect", DATA / "armchair.safetensors").stdout
 
 
-@pytest.mark.parametrize(("content", "reason"), [(b"", "FILE_EMPTY"), (b"\x07" * 4000, "FORMAT_NOT_RECOGNISED")])
+@pytest.mark.parametrize(("content", "reason"), [(b"", "FILE_EMPTY"), (b"\x07" * 4000, "FORMAT_NOT_RECOGNIZED")])
 def test_inspect_refuses_what_is_no_field(content: bytes, reason: str, run: Run, tmp_path: Path) -> None:
     (tmp_path / "field.ckpt").write_bytes(content)
     outcome = run("inspect", tmp_path / "field.ckpt")

@@ -29,7 +29,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
         (tmp_path / name).touch()
     monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
     box = chair_box(truth)
-    (tmp_path / "box.json").write_text(json.dumps({"centre": box.centre.tolist(), "size": box.size.tolist()}))
+    (tmp_path / "box.json").write_text(json.dumps({"center": box.center.tolist(), "size": box.size.tolist()}))
     (tmp_path / "truth.json").write_text(json.dumps({"T_object_scene": truth.matrix().tolist()}))
     files = [tmp_path / name for name in ("room.safetensors", "chair.safetensors")]
     return ["register", *files, "--detection", tmp_path / "box.json", "--truth", tmp_path / "truth.json"]
@@ -60,7 +60,7 @@ def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[o
 
 
 def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_path: Path) -> None:
-    (tmp_path / "options.json").write_text('{"optimisation": {"iterations": 1}}')
+    (tmp_path / "options.json").write_text('{"optimization": {"iterations": 1}}')
     far = {"T_object_scene": {"matrix": np.eye(4).tolist()}}
     (tmp_path / "truth.json").write_text(json.dumps(far))  # as results spell it
     outcome = run(*exact, "--preset", "paper", "--options", tmp_path / "options.json")
@@ -154,12 +154,12 @@ def test_an_unknown_preset_is_refused(run: Run, demo: list[object]) -> None:
         ("no JSON", "MALFORMED_JSON"),
         ("[1, 2]", "MALFORMED_JSON"),
         ("[" * 100_000, "MALFORMED_JSON"),
-        ("{}", "INVALID_DETECTION detection lacks 'centre'"),
+        ("{}", "INVALID_DETECTION detection lacks 'center'"),
         ('{"min": [0, 0, 0]}', "INVALID_DETECTION detection lacks 'max'"),
         ('{"max": [0, 0, 0]}', "INVALID_DETECTION detection lacks 'min'"),
-        ('{"centre": [0, 0, 0], "size": [1, 1, 1], "colour": 3}', "INVALID_DETECTION detection holds unknown"),
-        ('{"centre": [5, 5, 5], "size": [1, 1, 1]}', "DETECTION_OUTSIDE_SCENE"),
-        ('{"centre": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}', "NO_SURFACE_IN_DETECTION"),
+        ('{"center": [0, 0, 0], "size": [1, 1, 1], "color": 3}', "INVALID_DETECTION detection holds unknown"),
+        ('{"center": [5, 5, 5], "size": [1, 1, 1]}', "DETECTION_OUTSIDE_SCENE"),
+        ('{"center": [0, 0, 0.9], "size": [1e-9, 1e-9, 1e-9]}', "NO_SURFACE_IN_DETECTION"),
     ],
 )
 def test_detections_that_are_refused(detection: str, said: str, run: Run, exact: list[object], tmp_path: Path) -> None:
@@ -174,14 +174,14 @@ def test_detections_that_are_refused(detection: str, said: str, run: Run, exact:
     "values",
     [
         {"min": [0], "max": [1, 1, 1]},
-        {"min": [0, 0, 0], "max": [1, 1, 1], "centre": [0, 0, 0]},
+        {"min": [0, 0, 0], "max": [1, 1, 1], "center": [0, 0, 0]},
         {"min": [1, 1, 1], "max": [0, 0, 0]},
-        {"centre": [0, 0, "a"], "size": [1, 1, 1]},
-        {"centre": {"x": 1}, "size": [1, 1, 1]},
-        {"centre": [10**400, 0, 0], "size": [1, 1, 1]},
-        {"centre": [0, 0, 0], "size": [1, 1, 0]},
-        {"centre": [0, 0, 0], "size": [1, 1, 1], "score": "high"},
-        {"centre": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 0]},
+        {"center": [0, 0, "a"], "size": [1, 1, 1]},
+        {"center": {"x": 1}, "size": [1, 1, 1]},
+        {"center": [10**400, 0, 0], "size": [1, 1, 1]},
+        {"center": [0, 0, 0], "size": [1, 1, 0]},
+        {"center": [0, 0, 0], "size": [1, 1, 1], "score": "high"},
+        {"center": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 0]},
     ],
 )
 def test_boxes_that_are_refused(values: dict[str, object]) -> None:

@@ -18,7 +18,7 @@ SMALL = ("--width", 32, "--height", 24)
 def test_a_mesh_becomes_a_dataset(run: Run, tmp_path: Path) -> None:
     write_room(tmp_path)
     outcome = run(
-        "render-dataset", tmp_path / "chest.ply", tmp_path / "out", "--frames", 4, *SMALL, "--units-per-metre", 2
+        "render-dataset", tmp_path / "chest.ply", tmp_path / "out", "--frames", 4, *SMALL, "--units-per-meter", 2
     )
     assert outcome.code == 0, outcome.stderr
     assert "4 images of chest" in outcome.stdout
@@ -45,8 +45,8 @@ def test_a_layout_becomes_a_dataset(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "more", "reason"),
     [
-        ("chest.ply", ["--units-per-metre", "0"], "INVALID_OPTIONS"),
-        ("chest.ply", ["--units-per-metre", "nan"], "INVALID_OPTIONS"),
+        ("chest.ply", ["--units-per-meter", "0"], "INVALID_OPTIONS"),
+        ("chest.ply", ["--units-per-meter", "nan"], "INVALID_OPTIONS"),
         ("chest.ply", ["--instance", "a"], "INVALID_OPTIONS"),
         ("chest.ply", ["--meshes", "."], "INVALID_OPTIONS"),
         ("chest.ply", ["--trajectory", "single", "--frames", "2"], "DATASET_FRAMES_INVALID"),

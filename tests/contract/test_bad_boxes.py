@@ -10,7 +10,7 @@ from tests.contract.bad_input import post
 from tests.contract.world import BOX, World, assert_refused
 
 pytestmark = pytest.mark.usefixtures("nothing_of_a_request_stays")
-UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
+UNIT = {"center": [0, 0, 0], "size": [1, 1, 1]}
 
 
 @pytest.mark.parametrize(
@@ -19,18 +19,18 @@ UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
         pytest.param(None, "/detection", id="none"),
         pytest.param([], "/detection", id="an empty list"),
         pytest.param([BOX, BOX], "/detection", id="too many"),
-        pytest.param({}, "/detection/centre", id="empty"),
+        pytest.param({}, "/detection/center", id="empty"),
         pytest.param("the chair", "/detection", id="a word"),
-        pytest.param(UNIT | {"centre": [float("nan"), 0, 0]}, "/detection/centre/0", id="NaN"),
-        pytest.param(UNIT | {"centre": [0, float("inf"), 0]}, "/detection/centre/1", id="Inf"),
-        pytest.param(UNIT | {"centre": [0, 0, float("-inf")]}, "/detection/centre/2", id="-Inf"),
-        pytest.param(UNIT | {"centre": [1e308, 0, 0]}, "/detection/centre/0", id="1e308"),
-        pytest.param(UNIT | {"centre": [10**400, 0, 0]}, "/detection/centre/0", id="10^400"),
-        pytest.param(UNIT | {"centre": ["0", 0, 0]}, "/detection/centre/0", id="a string for a number"),
-        pytest.param(UNIT | {"centre": [True, 0, 0]}, "/detection/centre/0", id="a boolean for a number"),
-        pytest.param(UNIT | {"centre": [None, 0, 0]}, "/detection/centre/0", id="null for a number"),
-        pytest.param(UNIT | {"centre": [0, 0]}, "/detection/centre", id="two coordinates"),
-        pytest.param(UNIT | {"centre": [0, 0, 0, 0]}, "/detection/centre", id="four coordinates"),
+        pytest.param(UNIT | {"center": [float("nan"), 0, 0]}, "/detection/center/0", id="NaN"),
+        pytest.param(UNIT | {"center": [0, float("inf"), 0]}, "/detection/center/1", id="Inf"),
+        pytest.param(UNIT | {"center": [0, 0, float("-inf")]}, "/detection/center/2", id="-Inf"),
+        pytest.param(UNIT | {"center": [1e308, 0, 0]}, "/detection/center/0", id="1e308"),
+        pytest.param(UNIT | {"center": [10**400, 0, 0]}, "/detection/center/0", id="10^400"),
+        pytest.param(UNIT | {"center": ["0", 0, 0]}, "/detection/center/0", id="a string for a number"),
+        pytest.param(UNIT | {"center": [True, 0, 0]}, "/detection/center/0", id="a boolean for a number"),
+        pytest.param(UNIT | {"center": [None, 0, 0]}, "/detection/center/0", id="null for a number"),
+        pytest.param(UNIT | {"center": [0, 0]}, "/detection/center", id="two coordinates"),
+        pytest.param(UNIT | {"center": [0, 0, 0, 0]}, "/detection/center", id="four coordinates"),
         pytest.param(UNIT | {"size": [1, 0, 1]}, "/detection/size/1", id="zero extent"),
         pytest.param(UNIT | {"size": [1, -1, 1]}, "/detection/size/1", id="negative extent"),
         pytest.param(UNIT | {"size": [1, 1, float("nan")]}, "/detection/size/2", id="NaN extent"),
@@ -63,7 +63,7 @@ UNIT = {"centre": [0, 0, 0], "size": [1, 1, 1]}
         pytest.param({"min": [0, 0, 0], "max": [1, -1, 1]}, "/detection", id="min above max"),
         pytest.param({"min": [0, 0, 0], "max": [1, 0, 1]}, "/detection", id="min equal to max"),
         pytest.param({"min": [0, 0, 0]}, "/detection/max", id="min alone"),
-        pytest.param(UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, "/detection/centre", id="both spellings"),
+        pytest.param(UNIT | {"min": [0, 0, 0], "max": [1, 1, 1]}, "/detection/center", id="both spellings"),
     ],
 )
 def test_boxes(world: World, box: Any, pointer: str) -> None:
@@ -75,9 +75,9 @@ def test_boxes(world: World, box: Any, pointer: str) -> None:
     "box",
     [
         {"min": [1.1, 0, 0], "max": [1.2, 1, 1]},
-        {"centre": [150.0, 50.0, 200.0], "size": [500.0, 20.0, 40.0]} | {"centre": [-1500.0, 50.0, 200.0]},
+        {"center": [150.0, 50.0, 200.0], "size": [500.0, 20.0, 40.0]} | {"center": [-1500.0, 50.0, 200.0]},
         # its corner points at the scene's corner, but stays short of it: only a slanted axis tells
-        {"centre": [1.8, 1.8, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0.38268343, 0.92387953]},
+        {"center": [1.8, 1.8, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0.38268343, 0.92387953]},
     ],
 )
 def test_a_box_wholly_outside_the_scene(world: World, box: dict[str, Any]) -> None:

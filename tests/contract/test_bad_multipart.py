@@ -31,7 +31,7 @@ FILE = part("file", GOOD, file=True)
         pytest.param(part("description", b"{}"), 400, "MISSING_PART", id="no file"),
         pytest.param(part("file", b"", file=True), 400, "UPLOAD_EMPTY", id="an empty file"),
         pytest.param(part("file", TOO_LARGE, file=True), 413, "UPLOAD_TOO_LARGE", id="a file too large"),
-        pytest.param(part("file", PNG, file=True), 415, "FIELD_NOT_RECOGNISED", id="a PNG"),
+        pytest.param(part("file", PNG, file=True), 415, "FIELD_NOT_RECOGNIZED", id="a PNG"),
         pytest.param(
             FILE + part("description", b'{"label": 5}'), 422, "INVALID_DESCRIPTION", id="a label that is no text"
         ),

@@ -38,12 +38,12 @@ def matrix(*changes: tuple[int, int, Any]) -> dict[str, Any]:
             {"sampling": {"scene_camera_distance": float("nan")}}, "/options/sampling/scene_camera_distance", id="NaN"
         ),
         pytest.param(
-            {"optimisation": {"iterations": 10**12}}, "/options/optimisation/iterations", id="huge iterations"
+            {"optimization": {"iterations": 10**12}}, "/options/optimization/iterations", id="huge iterations"
         ),
         pytest.param(
-            {"optimisation": {"translation_rate": float("inf")}}, "/options/optimisation/translation_rate", id="Inf"
+            {"optimization": {"translation_rate": float("inf")}}, "/options/optimization/translation_rate", id="Inf"
         ),
-        pytest.param({"optimisation": []}, "/options/optimisation", id="a list"),
+        pytest.param({"optimization": []}, "/options/optimization", id="a list"),
     ],
 )
 def test_options(world: World, options: Any, pointer: str) -> None:

@@ -25,7 +25,7 @@ PLAIN_ZIP = b"PK\x03\x04" + b"\0" * 22 + b"\x09\0\0\0" + b"notes.txt" + b"\0" * 
     ("method", "path", "content", "headers", "status", "reason"),
     [
         pytest.param("PUT", f"/fields/{sha256(b'')}", b"", {}, 400, "UPLOAD_EMPTY", id="empty"),
-        pytest.param("PUT", f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNISED", id="one byte"),
+        pytest.param("PUT", f"/fields/{sha256(b'x')}", b"x", {}, 415, "FIELD_NOT_RECOGNIZED", id="one byte"),
         pytest.param(
             "PUT", f"/fields/{sha256(TOO_LARGE)}", TOO_LARGE, {}, 413, "UPLOAD_TOO_LARGE", id="too large by its header"
         ),
@@ -84,9 +84,9 @@ PLAIN_ZIP = b"PK\x03\x04" + b"\0" * 22 + b"\x09\0\0\0" + b"notes.txt" + b"\0" * 
         pytest.param("PUT", "/fields/%00", GOOD, {}, 400, "INVALID_DIGEST", id="NUL for a hash"),
         pytest.param("PUT", "/fields/%E2%80%AE", GOOD, {}, 400, "INVALID_DIGEST", id="RTL for a hash"),
         pytest.param("PUT", "/fields/..%2f..%2fetc", GOOD, {}, 404, "NOT_FOUND", id="encoded traversal for a hash"),
-        pytest.param("POST", "/fields", PNG, {}, 415, "FIELD_NOT_RECOGNISED", id="PNG"),
-        pytest.param("POST", "/fields", LEGACY_TAR, {}, 415, "FIELD_NOT_RECOGNISED", id="legacy tar"),
-        pytest.param("POST", "/fields", PLAIN_ZIP, {}, 415, "FIELD_NOT_RECOGNISED", id="plain zip"),
+        pytest.param("POST", "/fields", PNG, {}, 415, "FIELD_NOT_RECOGNIZED", id="PNG"),
+        pytest.param("POST", "/fields", LEGACY_TAR, {}, 415, "FIELD_NOT_RECOGNIZED", id="legacy tar"),
+        pytest.param("POST", "/fields", PLAIN_ZIP, {}, 415, "FIELD_NOT_RECOGNIZED", id="plain zip"),
         pytest.param(
             "POST",
             "/fields",
@@ -135,7 +135,7 @@ def test_an_unknown_kind_is_refused_before_the_rest_is_sent(world: World) -> Non
             sent.append(piece)
             yield piece
 
-    assert_refused(world.client.post("/fields", content=pieces()), 415, "FIELD_NOT_RECOGNISED")
+    assert_refused(world.client.post("/fields", content=pieces()), 415, "FIELD_NOT_RECOGNIZED")
     assert sent == [PNG]
 
 

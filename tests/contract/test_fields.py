@@ -121,8 +121,8 @@ def test_lists_go_page_by_page_and_by_label(world: World) -> None:
     second = world.client.get("/fields", params={"limit": 2, "page_token": first["next_page_token"]}).json()
     assert [field["sha256"] for field in first["fields"] + second["fields"]] == known[::-1]
     assert second["next_page_token"] is None
-    labelled = world.client.get("/fields", params={"label": "chair"}).json()
-    assert [field["sha256"] for field in labelled["fields"]] == [known[1]]
+    labeled = world.client.get("/fields", params={"label": "chair"}).json()
+    assert [field["sha256"] for field in labeled["fields"]] == [known[1]]
 
 
 def test_delete_leaves_nothing(world: World) -> None:

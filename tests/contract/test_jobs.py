@@ -16,11 +16,11 @@ def test_the_document_follows_the_record(world: World) -> None:
     assert waiting.headers["retry-after"] == "1"
     assert "cancel" in waiting.json()["links"]
     world.run(job_id)
-    world.records.update_job(job_id, 1, phase="optimising", progress=0.5, engine={"version": "0.1.0", "device": "cpu"})
+    world.records.update_job(job_id, 1, phase="optimizing", progress=0.5, engine={"version": "0.1.0", "device": "cpu"})
     running = world.client.get(f"/jobs/{job_id}").json()
     assert [running[name] for name in ("status", "phase", "progress", "queue_position")] == [
         "running",
-        "optimising",
+        "optimizing",
         0.5,
         None,
     ]

@@ -147,7 +147,7 @@ def test_uploads_at_once(limited: Callable[..., World]) -> None:
             assert (int(refused.headers["retry-after"]) > 0, refused.headers["connection"]) == (True, "close")
             assert put(world.client, "b", **BOB).status_code == 201
     odd = world.client.put("/fields/" + "0" * 64, content=b"x" * 600, headers=ALICE)
-    assert_refused(odd, 415, "FIELD_NOT_RECOGNISED")
+    assert_refused(odd, 415, "FIELD_NOT_RECOGNIZED")
     assert uploads.taken == 0, "places are given back, by a refused upload too"
 
 

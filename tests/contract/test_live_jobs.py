@@ -19,10 +19,10 @@ DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 QUICK = {
     "preset": "paper",
     "sampling": {"views": 2, "image_size": 64, "pixel_stride": 2},
-    "initialisation": {"ransac_iterations": 1000},
-    "optimisation": {"iterations": 5},
+    "initialization": {"ransac_iterations": 1000},
+    "optimization": {"iterations": 5},
 }
-ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
+ENDLESS = {"preset": "paper", "optimization": {"iterations": 10_000, "stop_residual": 0.0}}
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_the_usual_preset_over_the_wire_and_a_second_look_from_its_result(
     assert again["T_object_scene"]["scale"] == pytest.approx(result["T_object_scene"]["scale"], rel=0.01)
 
 
-def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learnt(
+def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learned(
     client: httpx.Client, fields: dict[str, str], live: Live
 ) -> None:
     data = (DATA / "dining-chair.safetensors").read_bytes()

@@ -144,7 +144,7 @@ def test_a_refusal_reaches_a_client_that_goes_on_sending(live: Live) -> None:
     data = b"\x89PNG" + bytes(8 * MIB)
     with live.client() as client:
         answer = client.put(f"/fields/{sha256(data)}", content=data)
-    assert_refused(answer, 415, "FIELD_NOT_RECOGNISED")
+    assert_refused(answer, 415, "FIELD_NOT_RECOGNIZED")
 
 
 @pytest.mark.parametrize("line", [b"GET", b"\x00\x01\x02", b"GET /" + b"a" * 200_000 + b" HTTP/1.1"])

@@ -33,10 +33,10 @@ def test_the_record_holds_the_canonical_request(world: World) -> None:
     assert record is not None
     detection = record.request["detection"]
     assert detection["rotation_quaternion_xyzw"] == [0.0, 0.0, 0.0, 1.0]
-    assert [round(value, 9) for value in detection["centre"] + detection["size"]] == [-0.15, -0.05, 0.2, 0.5, 0.5, 0.4]
+    assert [round(value, 9) for value in detection["center"] + detection["size"]] == [-0.15, -0.05, 0.2, 0.5, 0.5, 0.4]
     assert (detection["label"], detection["score"]) == (None, None)
     assert record.request["options"]["sampling"]["views"] == 9
-    assert record.request["options"]["optimisation"]["iterations"] == 200
+    assert record.request["options"]["optimization"]["iterations"] == 200
     assert (record.request["seed"], record.request["ground_truth"]) == (0, None)
     assert set(record.request) == {
         "scene", "object", "candidates", "detection", "options", "seed", "initial_transform", "ground_truth",
@@ -45,14 +45,14 @@ def test_the_record_holds_the_canonical_request(world: World) -> None:
 
 def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
     request = world.valid_request()
-    box = {"centre": [0, 0.25, 0.5], "size": [1, 1, 1]}
+    box = {"center": [0, 0.25, 0.5], "size": [1, 1, 1]}
     turned = box | {"rotation_quaternion_xyzw": [0, 0, 0, -3]}
     spellings = [
         request | {"detection": box},
         request | {"detection": {"min": [-0.5, -0.25, 0.0], "max": [0.5, 0.75, 1.0]}, "seed": 0},
         request | {"scene": {"field": request["scene"]}, "detection": turned},
-        request | {"detection": box | {"label": None}, "options": {"optimisation": {"iterations": 200}}},
-        request | {"detection": box, "options": {"optimisation": {"iterations": 200.0}}, "seed": 0.0},
+        request | {"detection": box | {"label": None}, "options": {"optimization": {"iterations": 200}}},
+        request | {"detection": box, "options": {"optimization": {"iterations": 200.0}}, "seed": 0.0},
     ]
     assert len({world.client.post("/register", json=body).json()["id"] for body in spellings}) == 1
     assert len(world.queue.registrations) == 1

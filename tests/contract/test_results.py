@@ -58,7 +58,7 @@ def test_a_dismissed_job_has_no_result(world: World) -> None:
     ("asked", "start", "stop"),
     [("bytes=0-9", 0, 10), ("bytes=1000-", 1000, 1024), ("bytes=-24", 1000, 1024), ("bytes=1020-9999", 1020, 1024)],
 )
-def test_one_range_is_honoured(world: World, job_id: str, asked: str, start: int, stop: int) -> None:
+def test_one_range_is_honored(world: World, job_id: str, asked: str, start: int, stop: int) -> None:
     answer = world.client.get(f"/jobs/{job_id}/artifacts/scene_points.ply", headers={"Range": asked})
     assert (answer.status_code, answer.content) == (206, DATA[start:stop])
     assert answer.headers["content-range"] == f"bytes {start}-{stop - 1}/1024"

@@ -46,12 +46,12 @@ def _unit_bounds() -> list[list[float]]:
 
 
 def sphere(
-    radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), bounds: Sequence[Sequence[float]] | None = None
+    radius: float, center: Sequence[float] = (0.0, 0.0, 0.0), bounds: Sequence[Sequence[float]] | None = None
 ) -> AnalyticField:
     """A ball."""
 
     def formula(points: Tensor) -> Tensor:
-        return (points - torch.tensor(list(centre), dtype=points.dtype)).norm(dim=-1) - radius
+        return (points - torch.tensor(list(center), dtype=points.dtype)).norm(dim=-1) - radius
 
     return AnalyticField(formula, bounds or _unit_bounds())
 

@@ -17,7 +17,7 @@ from tests.core.analytic import chair, chair_box, chair_pose, room
 QUICK = {
     "preset": "paper",
     "sampling": {"pixel_stride": 12},
-    "optimisation": {"iterations": 120, "samples_per_iteration": 800},
+    "optimization": {"iterations": 120, "samples_per_iteration": 800},
     "resampling": {"max_samples": 2000},
 }
 """Options that keep a test's registration with the published method to a few seconds."""

@@ -10,17 +10,17 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.errors import CancelledError, InitialisationError, InvalidInputError
+from regnf_core.errors import CancelledError, InitializationError, InvalidInputError
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import errors_against_truth
-from regnf_core.options import OptimisationOptions, RegistrationOptions
+from regnf_core.options import OptimizationOptions, RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.result import Phase
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
 from tests.core.conftest import QUICK, ChairRun
 
 OPTIONS = RegistrationOptions.from_dict(QUICK)
-BRIEF = replace(OPTIONS, optimisation=OptimisationOptions(iterations=12, samples_per_iteration=200))
+BRIEF = replace(OPTIONS, optimization=OptimizationOptions(iterations=12, samples_per_iteration=200))
 
 
 def test_the_chair_is_registered(chair_run: ChairRun) -> None:
@@ -36,7 +36,7 @@ def test_the_chair_is_registered(chair_run: ChairRun) -> None:
 def test_the_result_is_complete(chair_run: ChairRun) -> None:
     result = chair_run.result
     names = {"residual_rms", "inlier_share_scene", "inlier_share_object", "iterations", "field_evaluations"}
-    phases = {f"seconds_{phase}" for phase in ("sampling", "initialising", "optimising", "verifying")}
+    phases = {f"seconds_{phase}" for phase in ("sampling", "initializing", "optimizing", "verifying")}
     assert names | phases <= set(result.metrics)
     assert result.seed == 1
     assert result.options == OPTIONS.to_dict()
@@ -84,12 +84,12 @@ def test_progress_names_the_phases_in_order_and_never_falls() -> None:
     T = chair_pose()
     seen: list[tuple[Phase, float]] = []
     register(room(T), chair(), chair_box(T), BRIEF, progress=lambda phase, done: seen.append((phase, done)))
-    phases = ["sampling", "initialising", "optimising", "verifying", "exporting"]
+    phases = ["sampling", "initializing", "optimizing", "verifying", "exporting"]
     assert list(dict.fromkeys(phase for phase, _ in seen)) == phases
     shares = [done for _, done in seen]
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 1.0)
-    assert sum(phase == "optimising" for phase, _ in seen) >= 12
+    assert sum(phase == "optimizing" for phase, _ in seen) >= 12
 
 
 def test_a_progress_callback_may_cancel() -> None:
@@ -98,7 +98,7 @@ def test_a_progress_callback_may_cancel() -> None:
 
     def stop(phase: Phase, done: float) -> None:
         nonlocal iterations
-        iterations += phase == "optimising"
+        iterations += phase == "optimizing"
         if iterations > 3:
             raise CancelledError("enough")
 
@@ -116,7 +116,7 @@ def test_a_wrong_object_is_never_registered() -> None:
 
 def test_a_ball_offers_no_features_to_match() -> None:
     T = chair_pose()
-    with pytest.raises(InitialisationError):
+    with pytest.raises(InitializationError):
         register(room(T), sphere(0.35), chair_box(T), OPTIONS)
 
 
@@ -154,7 +154,7 @@ def test_the_same_seed_gives_the_same_result_in_another_process() -> None:
 
 def test_it_stops_early_once_the_residuals_are_small() -> None:
     T = chair_pose(scale=1.0)
-    options = RegistrationOptions.from_dict({**QUICK, "optimisation": {"stop_residual": 0.01}})
+    options = RegistrationOptions.from_dict({**QUICK, "optimization": {"stop_residual": 0.01}})
     result = register(room(T), chair(), chair_box(T), options, seed=1)
     assert result.metrics["converged"] == 1.0
     last = result.trace[-1]

@@ -10,12 +10,12 @@ import numpy as np
 import trimesh
 
 CHEST = np.array([[-0.3, -0.2, 0.0], [0.3, 0.2, 0.5]])
-"""The chest in its own frame, metres."""
+"""The chest in its own frame, meters."""
 QUARTER_TURN = [[0.0, -1.0, 0.0, 0.9], [1.0, 0.0, 0.0, 0.6], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 
 
 def write_chest(path: Path) -> Path:
-    """A box with a colour of its own on every face."""
+    """A box with a color of its own on every face."""
     box = trimesh.creation.box(bounds=CHEST)
     rng = np.random.default_rng(0)
     box.visual.face_colors = rng.integers(60, 255, (len(box.faces), 4), dtype=np.uint8)

@@ -24,7 +24,7 @@ def two_images() -> PosedImages:
     T_object_world[:3, :3] = turn * 1.7
     T_metric_world = np.diag([2.0, 2.0, 2.0, 1.0])
     return PosedImages(
-        colours=rng.integers(0, 256, (2, 4, 6, 3), dtype=np.uint8),
+        colors=rng.integers(0, 256, (2, 4, 6, 3), dtype=np.uint8),
         intrinsics=intrinsics,
         T_world_camera=poses,
         bounds=np.array([[-0.7, -0.8, -0.9], [0.1, 0.2, 1.0 / 3.0]]),

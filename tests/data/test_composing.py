@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.make_fields import UNITS_PER_METRE
+from benchmarks.make_fields import UNITS_PER_METER
 from regnf_core.errors import DatasetError
 from regnf_core.fields.mesh import MeshField
 from regnf_data.composing import RenderOptions, render_object, render_room
@@ -37,7 +37,7 @@ def points_of(images: PosedImages) -> torch.Tensor:
 
 def test_an_objects_depths_lie_on_it_in_the_librarys_frame(tmp_path: Path) -> None:
     mesh = MeshField.load(write_chest(tmp_path / "chest.ply"))
-    images = render_object(tmp_path / "chest.ply", RenderOptions(frames=8, **SMALL), units_per_metre=0.8)
+    images = render_object(tmp_path / "chest.ply", RenderOptions(frames=8, **SMALL), units_per_meter=0.8)
     assert len(images) == 8
     assert images.size == (48, 64)
     library = mesh.transformed(demo.object_from_mesh(mesh, 0.8))
@@ -48,7 +48,7 @@ def test_an_objects_depths_lie_on_it_in_the_librarys_frame(tmp_path: Path) -> No
     assert images.masks is not None
     np.testing.assert_array_equal(images.masks, images.depths > 0.0)
     assert 0.03 < images.masks.mean() < 0.9
-    assert (images.colours[~images.masks] == 255).mean() > 0.9
+    assert (images.colors[~images.masks] == 255).mean() > 0.9
     (chest,) = images.instances
     np.testing.assert_array_equal(chest.T_object_world, np.eye(4))
     np.testing.assert_allclose(chest.box.size, 0.8 * (CHEST[1] - CHEST[0]))
@@ -58,14 +58,14 @@ def test_an_objects_depths_lie_on_it_in_the_librarys_frame(tmp_path: Path) -> No
 
 def test_a_rooms_depths_lie_on_it_in_the_scenes_frame(tmp_path: Path) -> None:
     layout = read_layout(write_room(tmp_path), tmp_path)
-    images = render_room(layout, RenderOptions("long", frames=10, **SMALL), object_units_per_metre={"b": 1.3})
+    images = render_room(layout, RenderOptions("long", frames=10, **SMALL), object_units_per_meter={"b": 1.3})
     points = points_of(images)
     assert demo.compose_room(tmp_path, room()).signed_distance(points).abs().max() < 2e-6
     assert images.masks is None
     np.testing.assert_allclose(images.bounds, [[-1.1, -1.0, -0.55], [1.0, 1.0, 0.5]])
     names = [instance.label for instance in images.instances]
     assert names == ["a", "b"]
-    # The chest's upper corner (.3, .2, .5), turned by 90 degrees and carried to (.9, .6), halved with z less one metre.
+    # The chest's upper corner (.3, .2, .5), turned by 90 degrees and carried to (.9, .6), halved with z less one meter.
     corner = np.array([0.5 * (0.9 - 0.2), 0.5 * (0.6 + 0.3), 0.5 * (0.5 - 1.0), 1.0])
     T_object_world = images.instances[1].T_object_world
     assert T_object_world is not None
@@ -89,17 +89,17 @@ def test_two_pieces_of_one_name_keep_their_places(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"id": "b"', '"id": "a"'))
     images = render_room(read_layout(path, tmp_path), RenderOptions("short", frames=1, **SMALL), instance="a")
     assert len(images) == 1
-    first, second = (instance.box.centre.numpy() for instance in images.instances)
+    first, second = (instance.box.center.numpy() for instance in images.instances)
     np.testing.assert_allclose(first[:2], [-0.4, -0.35], atol=1e-6)
     np.testing.assert_allclose(second[:2], [0.45, 0.3], atol=1e-6)
 
 
-def test_noise_is_told_in_metres_and_decided_by_the_seed(tmp_path: Path) -> None:
+def test_noise_is_told_in_meters_and_decided_by_the_seed(tmp_path: Path) -> None:
     write_chest(tmp_path / "chest.ply")
 
     def depths(seed: int, **given: Any) -> Any:
         options = RenderOptions(frames=2, size=(48, 64), seed=seed, **given)
-        return render_object(tmp_path / "chest.ply", options, units_per_metre=0.5).depths
+        return render_object(tmp_path / "chest.ply", options, units_per_meter=0.5).depths
 
     first, again, other, exact = depths(1), depths(1), depths(2), depths(1, sensor=None)
     np.testing.assert_array_equal(first, again)
@@ -114,7 +114,7 @@ def test_written_and_read_again(tmp_path: Path) -> None:
     write_dataset(images, tmp_path / "data")
     read = load_dataset(tmp_path / "data")
     np.testing.assert_array_equal(read.depths, images.depths)
-    np.testing.assert_array_equal(read.colours, images.colours)
+    np.testing.assert_array_equal(read.colors, images.colors)
     np.testing.assert_array_equal(read.T_world_camera, images.T_world_camera)
 
 
@@ -122,14 +122,14 @@ def test_truths_and_boxes_are_those_of_the_benchmarks_fields() -> None:
     meshes, path = dev_data("furniture"), dev_data("rooms", "ac-room.json")
     written = json.loads(path.read_text())
     options = RenderOptions("short", frames=1, size=(12, 16))
-    images = render_room(read_layout(path, meshes), options, object_units_per_metre=UNITS_PER_METRE)
+    images = render_room(read_layout(path, meshes), options, object_units_per_meter=UNITS_PER_METER)
     for instance, entry in zip(images.instances, written["instances"], strict=True):
         mesh = demo.load_instance(meshes, entry)
         T_scene_mesh = demo.SCENE_FRAME.from_room() @ np.array(entry["T_room_from_object"])
-        truth = demo.object_from_mesh(mesh, UNITS_PER_METRE[entry["id"]]) @ np.linalg.inv(T_scene_mesh)
+        truth = demo.object_from_mesh(mesh, UNITS_PER_METER[entry["id"]]) @ np.linalg.inv(T_scene_mesh)
         np.testing.assert_allclose(instance.T_object_world, truth, atol=1e-8)
         detection = demo.detection(entry)
-        np.testing.assert_allclose(instance.box.centre, detection["centre"], atol=1e-12)
+        np.testing.assert_allclose(instance.box.center, detection["center"], atol=1e-12)
         np.testing.assert_allclose(instance.box.size, detection["size"], atol=1e-12)
 
 
@@ -140,8 +140,8 @@ def test_refused_requests(tmp_path: Path) -> None:
         (RenderOptions("single", **SMALL), {}, "DATASET_NO_INSTANCE"),
         (RenderOptions("single", frames=2, **SMALL), {"instance": "a"}, "DATASET_FRAMES_INVALID"),
         (RenderOptions("long", frames=0, **SMALL), {}, "DATASET_FRAMES_INVALID"),
-        (RenderOptions("short", frames=1, **SMALL), {"units_per_metre": -1.0}, "DATASET_SCALE_INVALID"),
-        (RenderOptions("short", frames=1, **SMALL), {"units_per_metre": 0.0}, "DATASET_SCALE_INVALID"),
+        (RenderOptions("short", frames=1, **SMALL), {"units_per_meter": -1.0}, "DATASET_SCALE_INVALID"),
+        (RenderOptions("short", frames=1, **SMALL), {"units_per_meter": 0.0}, "DATASET_SCALE_INVALID"),
     ):
         with pytest.raises(DatasetError) as refused:
             render_room(layout, options, **given)  # type: ignore[arg-type]
@@ -163,7 +163,7 @@ def test_refused_requests(tmp_path: Path) -> None:
         ({"instances": [{"id": "a", "mesh": "../../etc/passwd"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "a\0b"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "chest.ply", "T_room_from_object": [1]}]}, "DATASET_LAYOUT_INVALID"),
-        ({"scene_units_per_metre": 0}, "DATASET_LAYOUT_INVALID"),
+        ({"scene_units_per_meter": 0}, "DATASET_LAYOUT_INVALID"),
         ({"scene_origin_m": "here"}, "DATASET_LAYOUT_INVALID"),
     ],
 )

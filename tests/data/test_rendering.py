@@ -70,16 +70,16 @@ def test_light_follows_lamberts_law() -> None:
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [np.sqrt(0.75), 0.0, 0.5]])
     np.testing.assert_allclose(shading.light(normals), [0.6 + 0.4, 0.4 * 0.6, 0.3 + 0.4 * 0.9])
     view = render(cube(), SIZE, intrinsics_of(SIZE, 60.0), ALONG_Y, Shading((0.0, -1.0, 0.0), 0.5, 0.25))
-    assert (view.colours[60, 80] == to_srgb(np.array([0.5 + 0.25 * 0.8]))).all()
-    assert (view.colours[0, 0] == 255).all()
+    assert (view.colors[60, 80] == to_srgb(np.array([0.5 + 0.25 * 0.8]))).all()
+    assert (view.colors[0, 0] == 255).all()
 
 
-def test_colours_are_the_mean_of_a_pixels_rays() -> None:
+def test_colors_are_the_mean_of_a_pixels_rays() -> None:
     # The upper edge falls on row 25.359: of three rows of rays at 25.167, .5 and .833 two meet the box.
     black = TilePaint((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0)
     scene = MeshScene([box_thing([-0.5, -1.0, -0.5], [0.5, 1.0, 0.5], black)])
     view = render(scene, SIZE, intrinsics_of(SIZE, 60.0), ALONG_Y)
-    assert (view.colours[25, 80] == to_srgb(np.array([1.0 / 3.0]))).all()
+    assert (view.colors[25, 80] == to_srgb(np.array([1.0 / 3.0]))).all()
 
 
 def test_a_texture_lies_the_right_way_up() -> None:
@@ -97,15 +97,15 @@ def test_a_texture_lies_the_right_way_up() -> None:
         scene = MeshScene([Thing((PaintedMesh(solid.vertices, solid.faces, paint),), solid)])
         origins = np.array([[x, y, 1.0] for y, x in product((0.75, 0.25), (0.25, 0.75))])
         hits = scene.cast(origins, np.tile([0.0, 0.0, -1.0], (4, 1)))
-        np.testing.assert_array_equal(hits.colour, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+        np.testing.assert_array_equal(hits.color, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
 
 
-def test_vertex_colours_are_mixed() -> None:
-    colours = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+def test_vertex_colors_are_mixed() -> None:
+    colors = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     solid = MeshField([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    scene = MeshScene([Thing((PaintedMesh(solid.vertices, solid.faces, VertexPaint(colours)),), solid)])
+    scene = MeshScene([Thing((PaintedMesh(solid.vertices, solid.faces, VertexPaint(colors)),), solid)])
     hits = scene.cast(np.array([[0.2, 0.3, 1.0], [2.0, 2.0, 1.0]]), np.array([[0.0, 0.0, -2.0]] * 2))
-    np.testing.assert_allclose(hits.colour, [[0.5, 0.2, 0.3], [0.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(hits.color, [[0.5, 0.2, 0.3], [0.0, 0.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(hits.distance, [0.5, np.inf])
     np.testing.assert_array_equal(hits.thing, [0, -1])
 
@@ -113,4 +113,4 @@ def test_vertex_colours_are_mixed() -> None:
 def test_srgb_there_and_back() -> None:
     every = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(to_srgb(to_linear(every)), every)
-    assert to_linear(np.array([188]))[0] == pytest.approx(0.503, abs=1e-3)  # the well-known middle grey of light
+    assert to_linear(np.array([188]))[0] == pytest.approx(0.503, abs=1e-3)  # the well-known middle gray of light

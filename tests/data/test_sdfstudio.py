@@ -34,14 +34,14 @@ def change(folder: Path, mend: Change) -> None:
 
 
 def assert_same(read: PosedImages, written: PosedImages) -> None:
-    for name in ("colours", "intrinsics", "T_world_camera", "bounds", "depths", "masks", "T_metric_world"):
+    for name in ("colors", "intrinsics", "T_world_camera", "bounds", "depths", "masks", "T_metric_world"):
         np.testing.assert_array_equal(getattr(read, name), getattr(written, name), err_msg=name)
         if getattr(written, name) is not None:
             assert getattr(read, name).dtype == getattr(written, name).dtype, name
     assert len(read.instances) == len(written.instances)
     for one, other in zip(read.instances, written.instances, strict=True):
         assert one.label == other.label == one.box.label
-        for name in ("centre", "size", "rotation"):
+        for name in ("center", "size", "rotation"):
             np.testing.assert_array_equal(getattr(one.box, name), getattr(other.box, name))
         for name in ("T_object_world", "world_pose", "gt_pose"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
@@ -115,8 +115,8 @@ def test_a_frame_without_depth_or_mask(folder: Path) -> None:
 
 
 def test_depth_as_a_16_bit_image(folder: Path) -> None:
-    millimetres = np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000
-    Image.fromarray(millimetres).save(folder / "depth.png")
+    millimeters = np.arange(24, dtype=np.uint16).reshape(4, 6) * 1000
+    Image.fromarray(millimeters).save(folder / "depth.png")
 
     def use(metadata: dict[str, Any]) -> None:
         metadata["depth_unit_scale_factor"] = 0.0005

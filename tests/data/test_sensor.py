@@ -26,12 +26,12 @@ def test_axial_noise_grows_with_the_square_of_the_distance(depth: float, deviati
     assert read.mean() == pytest.approx(depth, abs=0.02 * deviation)
 
 
-def test_readings_are_whole_millimetres_whatever_the_unit() -> None:
-    read = DepthSensor().measure(np.full(SIZE, 0.7), FACING, rng(), metres_per_unit=2.0)
+def test_readings_are_whole_millimeters_whatever_the_unit() -> None:
+    read = DepthSensor().measure(np.full(SIZE, 0.7), FACING, rng(), meters_per_unit=2.0)
     assert abs(read.mean() - 0.7) < 1e-4
     assert read.std() == pytest.approx(0.5 * (0.0012 + 0.0019 * 1.0**2), rel=0.02)
-    millimetres = read * 2000.0
-    np.testing.assert_allclose(millimetres, np.round(millimetres), atol=1e-6)
+    millimeters = read * 2000.0
+    np.testing.assert_allclose(millimeters, np.round(millimeters), atol=1e-6)
 
 
 def test_nothing_is_read_beyond_the_range_at_grazing_angles_and_of_nothing() -> None:

@@ -119,9 +119,9 @@ def test_a_bad_view_is_free_shows_the_thing_and_sees_less_of_it_than_others() ->
     pose = bad_view(furnished(), thing, SIZE, INTRINSICS, 0.0)
     assert furnished().signed_distance(pose[None, :3, 3]).min() >= 0.15
     share = seen_share(pose[None], thing)
-    centre = BOXES[0].mean(axis=0)
-    distance = float(np.linalg.norm(pose[:3, 3] - centre))
-    good = look_at(centre + distance * np.array([[0.6, 0.6, 0.53]]), centre[None])
+    center = BOXES[0].mean(axis=0)
+    distance = float(np.linalg.norm(pose[:3, 3] - center))
+    good = look_at(center + distance * np.array([[0.6, 0.6, 0.53]]), center[None])
     assert 0.1 < share < 0.8 * seen_share(good, thing)
 
 

@@ -129,7 +129,7 @@ class House:
         """A job that a worker has begun, and that waits to be let go."""
         self.hold()
         job_id = self.submit(seed)
-        eventually(lambda: self.job(job_id)["phase"] == "optimising", self.log)
+        eventually(lambda: self.job(job_id)["phase"] == "optimizing", self.log)
         return job_id
 
     def job(self, job_id: str) -> dict[str, Any]:

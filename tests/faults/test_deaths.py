@@ -41,7 +41,7 @@ def test_kill_of_the_job_s_process_twice(house: House) -> None:
     job_id = house.running()
     with fault():
         os.kill(children_of(worker.pid)[0], signal.SIGKILL)
-        eventually(lambda: (job := house.job(job_id))["attempts"] == 2 and job["phase"] == "optimising", house.log)
+        eventually(lambda: (job := house.job(job_id))["attempts"] == 2 and job["phase"] == "optimizing", house.log)
         os.kill(children_of(worker.pid)[0], signal.SIGKILL)
         check_promise(house, [], {job_id: "WORKER_LOST"})
     house.let_go()

@@ -51,7 +51,7 @@ class HeldEngine(TinyEngine):
 
     def while_held(self, report: Report) -> None:
         while True:
-            report("optimising", 0.5)
+            report("optimizing", 0.5)
             if not is_held("hold"):
                 return
             time.sleep(0.01)

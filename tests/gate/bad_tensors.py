@@ -24,7 +24,7 @@ def saved(change: Change) -> Build:
     """A small checkpoint as torch saves it, after a change to its state."""
 
     def build(_: object) -> bytes:
-        values = checkpoint(log2_size=8, hidden=6, optimiser=False)
+        values = checkpoint(log2_size=8, hidden=6, optimizer=False)
         change(values["pipeline"])
         buffer = io.BytesIO()
         torch.save(values, buffer)
@@ -82,7 +82,7 @@ TENSORS: Files = {
         weight(b"ctorch._utils\n_rebuild_sparse_tensor\n(K\x00(" + tensor("0", (1, 1), (1, 1)) + b"ttR"),
         UNSAFE,
     ),
-    "a quantised stride": (
+    "a quantized stride": (
         weight(b"ctorch._utils\n_rebuild_qtensor\n(" + tensor("0", (6,), (1,), kind="QInt8Storage") + b"tR"),
         UNSAFE,
     ),
@@ -104,7 +104,7 @@ TENSORS: Files = {
     "a constant field": (saved(constant), "rejected NO_ZERO_LEVEL"),
     "a missing layer's bias": (without("glin1.bias"), "rejected TENSOR_MISSING"),
     "a missing table": (without("encoding.params"), "rejected TENSOR_MISSING"),
-    "renamed layers": (saved(renamed), "rejected FIELD_NOT_RECOGNISED"),
+    "renamed layers": (saved(renamed), "rejected FIELD_NOT_RECOGNIZED"),
     "an extra layer": (saved(another_layer), "rejected TENSOR_SHAPE"),
     "wrong shapes": (put("glin1.weight_v", lambda found: found[:, 1:].clone()), "rejected TENSOR_SHAPE"),
     "a transposed weight": (put("glin0.weight_v", lambda found: found.t().contiguous()), "rejected TENSOR_SHAPE"),

@@ -25,8 +25,8 @@ FILES = {
 QUICK = {
     "preset": "paper",
     "sampling": {"views": 2, "image_size": 64, "pixel_stride": 2},
-    "initialisation": {"ransac_iterations": 1000},
-    "optimisation": {"iterations": 5},
+    "initialization": {"ransac_iterations": 1000},
+    "optimization": {"iterations": 5},
 }
 NOTHING_FOUND = {("failed", "NO_SURFACE_IN_DETECTION"), ("failed", "NO_INITIAL_TRANSFORM")}
 """Honest ends of a registration of what has nothing, or too much, in common, with as little work as these do."""
@@ -119,8 +119,8 @@ def test_the_whole_scene(client: httpx.Client, pair: dict[str, str]) -> None:
     assert ended in NOTHING_FOUND or ended[0] == "successful"
 
 
-def test_millimetres_for_metres(client: httpx.Client, pair: dict[str, str]) -> None:
+def test_millimeters_for_meters(client: httpx.Client, pair: dict[str, str]) -> None:
     box = json.loads((DATA / "detection.json").read_text())
-    scaled = {name: [1000 * value for value in box[name]] for name in ("centre", "size")}
+    scaled = {name: [1000 * value for value in box[name]] for name in ("center", "size")}
     answer = client.post("/register", json={**pair, "detection": box | scaled})
     assert_refused(answer, 422, "DETECTION_OUTSIDE_SCENE")

@@ -20,7 +20,7 @@ from tests.core.importing.checkpoints import write_small_checkpoint
 from tests.devdata import ROOT
 
 DATA = ROOT / "examples" / "data"
-ENDLESS = {"preset": "paper", "optimisation": {"iterations": 10_000, "stop_residual": 0.0}}
+ENDLESS = {"preset": "paper", "optimization": {"iterations": 10_000, "stop_residual": 0.0}}
 DEADLINE_S = 120
 Client = httpx.Client
 
@@ -120,7 +120,7 @@ def small_checkpoint(folder: Path, **arguments: Any) -> bytes:
 def test_a_wrong_file_is_refused_at_once(client: Client) -> None:
     content = b"\x89PNG\r\n\x1a\n" + bytes(1000)
     response = client.put(f"/fields/{hashlib.sha256(content).hexdigest()}", content=content)
-    assert (response.status_code, response.json()["reason"]) == (415, "FIELD_NOT_RECOGNISED")
+    assert (response.status_code, response.json()["reason"]) == (415, "FIELD_NOT_RECOGNIZED")
 
 
 def test_a_truncated_checkpoint_and_one_with_nan_are_rejected(client: Client, tmp_path: Path) -> None:
@@ -137,8 +137,8 @@ def test_a_truncated_checkpoint_and_one_with_nan_are_rejected(client: Client, tm
 
 REFUSED: list[tuple[str, dict[str, Any], int, str]] = [
     ("an unknown field", {"scene": "0" * 64}, 404, "FIELD_NOT_FOUND"),
-    ("a box outside", {"detection": {"centre": [9, 9, 9], "size": [1, 1, 1]}}, 422, "DETECTION_OUTSIDE_SCENE"),
-    ("a sliver", {"detection": {"centre": [0, 0, 0], "size": [1, 1, 0]}}, 422, "INVALID_DETECTION"),
+    ("a box outside", {"detection": {"center": [9, 9, 9], "size": [1, 1, 1]}}, 422, "DETECTION_OUTSIDE_SCENE"),
+    ("a sliver", {"detection": {"center": [0, 0, 0], "size": [1, 1, 0]}}, 422, "INVALID_DETECTION"),
     ("an unknown option", {"options": {"speed": "fast"}}, 422, "INVALID_OPTIONS"),
     ("no such seed", {"seed": -1}, 422, "INVALID_REQUEST"),
 ]
@@ -154,21 +154,21 @@ def test_bad_requests_are_refused(
 
 
 def test_nan_in_a_box_is_refused(client: Client, demo: dict[str, Any]) -> None:
-    text = json.dumps({**demo, "detection": {"centre": [float("nan"), 0, 0], "size": [1, 1, 1]}})
+    text = json.dumps({**demo, "detection": {"center": [float("nan"), 0, 0], "size": [1, 1, 1]}})
     response = client.post("/register", content=text, headers={"Content-Type": "application/json"})
     assert response.status_code in (400, 422)
     assert response.json()["reason"] in ("MALFORMED_JSON", "INVALID_DETECTION")
 
 
 def test_a_box_of_air_holds_no_surface(client: Client, demo: dict[str, Any]) -> None:
-    job = finished(client, submit(client, {**demo, "detection": {"centre": [0.1, 0.1, 0.5], "size": [0.2, 0.2, 0.2]}}))
+    job = finished(client, submit(client, {**demo, "detection": {"center": [0.1, 0.1, 0.5], "size": [0.2, 0.2, 0.2]}}))
     assert (job["status"], job["error"]["reason"]) == ("failed", "NO_SURFACE_IN_DETECTION")
 
 
 def running(client: Client, request: dict[str, Any]) -> str:
-    """A long job that has begun to optimise."""
+    """A long job that has begun to optimize."""
     job_id = submit(client, {**request, "options": ENDLESS})
-    wait(lambda: client.get(f"/jobs/{job_id}", params={"wait": 1}).json(), lambda job: job["phase"] == "optimising")
+    wait(lambda: client.get(f"/jobs/{job_id}", params={"wait": 1}).json(), lambda job: job["phase"] == "optimizing")
     return job_id
 
 
@@ -184,7 +184,7 @@ def test_a_job_killed_twice_says_so_and_the_next_one_runs(client: Client, demo: 
     for attempt in (1, 2):
         wait(
             lambda: client.get(f"/jobs/{job_id}", params={"wait": 1}).json(),
-            lambda job, attempt=attempt: (job["attempts"], job["phase"]) == (attempt, "optimising"),
+            lambda job, attempt=attempt: (job["attempts"], job["phase"]) == (attempt, "optimizing"),
         )
         (process,) = [pid for pid in processes_with_torch() if is_descendant_of(pid, os.getpid())]
         os.kill(process, signal.SIGKILL)

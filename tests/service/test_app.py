@@ -26,7 +26,8 @@ from tests.contract.world import make_world
 
 
 def test_the_application_loads_neither_torch_nor_open3d() -> None:
-    code = "import sys, regnf_service.app; sys.exit(' '.join({'torch', 'open3d', 'worker', 'numpy'} & set(sys.modules)) or 0)"
+    heavy = "{'torch', 'open3d', 'regnf_worker', 'numpy'}"
+    code = f"import sys, regnf_service.app; sys.exit(' '.join({heavy} & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

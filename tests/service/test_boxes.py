@@ -36,7 +36,7 @@ def test_no_negative_zero() -> None:
 
 
 @pytest.mark.parametrize(
-    ("centre", "size", "xyzw", "overlap"),
+    ("center", "size", "xyzw", "overlap"),
     [
         ((0, 0, 0), (1, 1, 1), (0, 0, 0, 1), True),
         ((1.4, 0, 0), (1, 1, 1), (0, 0, 0, 1), True),
@@ -52,9 +52,9 @@ def test_no_negative_zero() -> None:
     ],
 )
 def test_overlap_with_the_cube_of_edge_two(
-    centre: tuple[float, ...], size: tuple[float, ...], xyzw: tuple[float, ...], overlap: bool
+    center: tuple[float, ...], size: tuple[float, ...], xyzw: tuple[float, ...], overlap: bool
 ) -> None:
-    assert boxes_overlap(centre, size, xyzw, (-1, -1, -1), (1, 1, 1)) is overlap
+    assert boxes_overlap(center, size, xyzw, (-1, -1, -1), (1, 1, 1)) is overlap
 
 
 def test_no_box_with_a_point_inside_is_called_outside() -> None:
@@ -62,19 +62,19 @@ def test_no_box_with_a_point_inside_is_called_outside() -> None:
     rng = random.Random(0)
     proved = 0
     for _ in range(300):
-        centre = [rng.uniform(-2.5, 2.5) for _ in range(3)]
+        center = [rng.uniform(-2.5, 2.5) for _ in range(3)]
         size = [rng.uniform(0.1, 3) for _ in range(3)]
         xyzw = normal_quaternion([rng.gauss(0, 1) for _ in range(4)])
         columns = rotation_columns(xyzw)
         steps = [-0.5, -0.25, 0.0, 0.25, 0.5]
         inside = any(
             all(
-                abs(centre[axis] + sum(f * size[i] * columns[i][axis] for i, f in enumerate(fractions))) <= 1
+                abs(center[axis] + sum(f * size[i] * columns[i][axis] for i, f in enumerate(fractions))) <= 1
                 for axis in range(3)
             )
             for fractions in itertools.product(steps, repeat=3)
         )
         proved += inside
         if inside:
-            assert boxes_overlap(centre, size, xyzw, (-1, -1, -1), (1, 1, 1))
+            assert boxes_overlap(center, size, xyzw, (-1, -1, -1), (1, 1, 1))
     assert 50 < proved < 290

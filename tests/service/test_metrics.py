@@ -62,7 +62,7 @@ def test_a_jobs_way_is_counted_once(redis: Redis, tmp_path: Path) -> None:
     now = scrape(metrics)
     assert now["regnf_jobs_active", "loading", "running"] == 1
     assert now["regnf_jobs_active", "", "accepted"] == now["regnf_queue_depth",] == 2
-    store.update_job("good", 1, phase="optimising", progress=0.5)
+    store.update_job("good", 1, phase="optimizing", progress=0.5)
     for _ in range(3):
         store.update_job("good", 1, progress=0.6)
     store.update_job("good", 1, status="successful", verdict="ambiguous")
@@ -74,7 +74,7 @@ def test_a_jobs_way_is_counted_once(redis: Redis, tmp_path: Path) -> None:
     assert now["regnf_jobs_finished_total", "WORKER_LOST", "failed", ""] == 1
     assert now["regnf_job_attempts_total",] == 4
     assert now["regnf_job_wait_seconds_count",] == 2
-    assert now["regnf_job_phase_seconds_count", "loading"] == now["regnf_job_phase_seconds_count", "optimising"] == 1
+    assert now["regnf_job_phase_seconds_count", "loading"] == now["regnf_job_phase_seconds_count", "optimizing"] == 1
     assert now["regnf_job_run_seconds_count", "successful"] == 1
     assert now["regnf_job_run_seconds_sum", "successful"] < 60
     assert now["regnf_workers",] == 0

@@ -150,7 +150,7 @@ def test_pointers_stop_at_names_that_are_not_ours() -> None:
 
 
 def test_job_ids_depend_on_everything_and_on_nothing_else() -> None:
-    request = {"scene": "a", "seed": 0, "detection": {"centre": [0.0, 1.0, 2.0], "label": "ä"}}
+    request = {"scene": "a", "seed": 0, "detection": {"center": [0.0, 1.0, 2.0], "label": "ä"}}
     shuffled = dict(reversed(list(request.items())))
     assert job_id_of(request) == job_id_of(shuffled)
     assert len({job_id_of(request | {"seed": seed}) for seed in range(20)}) == 20

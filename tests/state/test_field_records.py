@@ -30,7 +30,7 @@ def test_a_field_becomes_ready(store: RecordStore) -> None:
 
 def test_a_rejected_field_starts_anew(store: RecordStore) -> None:
     first, _ = store.create_field(field(store))
-    store.update_field(SCENE, attempt=1, state="rejected", error={"reason": "FIELD_NOT_RECOGNISED"})
+    store.update_field(SCENE, attempt=1, state="rejected", error={"reason": "FIELD_NOT_RECOGNIZED"})
     again, created = store.create_field(replace(field(store), description={"family": "neus-facto"}))
     assert created
     assert (again.state, again.attempt, again.error) == ("validating", 2, None)

@@ -19,8 +19,8 @@ def test_a_job_runs_its_course(store: RecordStore) -> None:
     running = store.update_job("j1", 1, status="running", phase="loading", engine={"version": "0"})
     assert running.started is not None
     assert running.heartbeat == running.started >= accepted.created
-    optimising = store.update_job("j1", 1, phase="optimising", progress=0.5)
-    assert (optimising.phase, optimising.progress) == ("optimising", 0.5)
+    optimizing = store.update_job("j1", 1, phase="optimizing", progress=0.5)
+    assert (optimizing.phase, optimizing.progress) == ("optimizing", 0.5)
     done = store.update_job("j1", 1, status="successful")
     assert (done.status, done.progress, done.error) == ("successful", 1.0, None)
     assert done.finished is not None
@@ -54,7 +54,7 @@ def test_a_successful_job_is_never_started_anew(store: RecordStore) -> None:
 @pytest.mark.parametrize("status", ["successful", "failed", "dismissed"])
 def test_nothing_changes_a_finished_job(store: RecordStore, status: str) -> None:
     done = finished(store, status)
-    for change in ({"status": "running"}, {"status": "failed"}, {"phase": "optimising"}, {"progress": 0.9}):
+    for change in ({"status": "running"}, {"status": "failed"}, {"phase": "optimizing"}, {"progress": 0.9}):
         with pytest.raises(StaleAttemptError):
             store.update_job("j1", 1, **change)
     with pytest.raises(StaleAttemptError):

@@ -46,7 +46,7 @@ STORIES = (
 STEPS: tuple[dict[str, Any], ...] = (
     {"status": "accepted", "queue_position": 3},
     {"status": "running", "phase": "loading", "progress": 0.05},
-    {"status": "running", "phase": "optimising", "progress": 0.6},
+    {"status": "running", "phase": "optimizing", "progress": 0.6},
     {"status": "successful", "phase": "exporting", "progress": 1.0},
 )
 
@@ -96,7 +96,7 @@ class Stage:
         }
         still = {"finished_at": None, "expires_at": None}
         if story == "running":
-            document |= {"status": "running", "phase": "optimising", "progress": 0.62, **still}
+            document |= {"status": "running", "phase": "optimizing", "progress": 0.62, **still}
             if self.cancelled:
                 document |= {"status": "dismissed"}
         elif story == "queued":
@@ -134,7 +134,7 @@ FAILURE = {
 
 
 def field_picture(sha256: str) -> bytes:
-    """A PNG in a colour of its own, by which a test tells it from another field's."""
+    """A PNG in a color of its own, by which a test tells it from another field's."""
     buffer = io.BytesIO()
     Image.new("RGB", (96, 32), f"#{sha256[:6]}").save(buffer, "PNG")
     return buffer.getvalue()

@@ -43,13 +43,13 @@ def overlap(one: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     return float((one & other).sum() / (one | other).sum())
 
 
-def coloured(pixels: Pixels, hue: str) -> NDArray[np.bool_]:
+def colored(pixels: Pixels, hue: str) -> NDArray[np.bool_]:
     """(H, W): which pixels show the object after (blue) or before (orange)."""
     red, blue = pixels[..., 0], pixels[..., 2]
     return blue - red > 70 if hue == "blue" else red - blue > 25
 
 
-def centre_of(mask: NDArray[np.bool_]) -> tuple[float, float]:
+def center_of(mask: NDArray[np.bool_]) -> tuple[float, float]:
     """Mean row and column of the true pixels."""
     rows, columns = np.nonzero(mask)
     return float(rows.mean()), float(columns.mean())

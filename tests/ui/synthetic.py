@@ -21,8 +21,8 @@ JOB_ID = "5f0c1d2e9a7b4c3d8e6f5a4b3c2d1e0f"
 PHASE_SECONDS = {
     "loading": 0.41,
     "sampling": 2.13,
-    "initialising": 3.02,
-    "optimising": 5.74,
+    "initializing": 3.02,
+    "optimizing": 5.74,
     "verifying": 0.66,
     "exporting": 0.38,
 }
@@ -117,13 +117,13 @@ def sim3_document(matrix: Array) -> dict[str, Any]:
     }
 
 
-def ply(points: Array, normals: Array, colour: tuple[int, int, int]) -> bytes:
+def ply(points: Array, normals: Array, color: tuple[int, int, int]) -> bytes:
     """A binary little-endian PLY file: x y z nx ny nz red green blue."""
     kind = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("r", "g", "b")]
     rows = np.empty(len(points), dtype=kind)
     for i, name in enumerate(("x", "y", "z")):
         rows[name], rows[f"n{name}"] = points[:, i], normals[:, i]
-    for name, part in zip(("r", "g", "b"), colour, strict=True):
+    for name, part in zip(("r", "g", "b"), color, strict=True):
         rows[name] = part
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
@@ -209,7 +209,7 @@ def synthetic(seed: int = 7, spacing: float = 0.018) -> Synthetic:
     initial = np.linalg.inv(poses[0])
     low, high = seen.min(axis=0) - 0.04, seen.max(axis=0) + 0.04
     detection = {
-        "centre": ((low + high) / 2).tolist(),
+        "center": ((low + high) / 2).tolist(),
         "size": (high - low).tolist(),
         "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
         "label": "chair",

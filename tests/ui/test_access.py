@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.ui.conftest import Visit
-from tests.ui.pixels import canvas_pixels, coloured
+from tests.ui.pixels import canvas_pixels, colored
 
 pytestmark = pytest.mark.browser
 
@@ -33,7 +33,7 @@ def test_tab_visits_the_controls_in_reading_order(visit: Visit) -> None:
         "copy-id",
         "canvas",
         "scene",
-        "colour",
+        "color",
         "up",
         "size",
         "frame-object",
@@ -91,7 +91,7 @@ def test_text_stands_out_from_its_ground(visit: Visit, scheme: Any) -> None:
         }"""
     )
     assert [(name, ratio) for name, ratio in ratios if ratio < 4.5] == []
-    assert coloured(canvas_pixels(page), "blue").mean() > 0.01
+    assert colored(canvas_pixels(page), "blue").mean() > 0.01
 
 
 @pytest.fixture
@@ -115,5 +115,5 @@ def test_nothing_overflows_on_a_phone(visit: Visit, story: str) -> None:
 @pytest.mark.usefixtures("phone")
 def test_touch_turns_the_view_on_a_phone(visit: Visit) -> None:
     page = visit.open("done")
-    assert coloured(canvas_pixels(page), "blue").mean() > 0.005
+    assert colored(canvas_pixels(page), "blue").mean() > 0.005
     assert page.locator("#canvas").evaluate("node => getComputedStyle(node).touchAction") == "none"

@@ -22,7 +22,7 @@ from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from tests.ui.conftest import Visit
 from tests.ui.fixture_server import field_picture
-from tests.ui.pixels import canvas_pixels, coloured
+from tests.ui.pixels import canvas_pixels, colored
 from tests.ui.synthetic import JOB_ID, Synthetic
 
 pytestmark = pytest.mark.browser
@@ -93,15 +93,15 @@ def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
         page.goto(service.view)
         expect(page.locator("#message-title")).to_have_text("In the queue")
         service.records.update_job(JOB_ID, 1, status="running")
-        service.records.update_job(JOB_ID, 1, phase="optimising", progress=0.5)
-        expect(page.locator("#message-title")).to_have_text("Optimising", timeout=30_000)
+        service.records.update_job(JOB_ID, 1, phase="optimizing", progress=0.5)
+        expect(page.locator("#message-title")).to_have_text("Optimizing", timeout=30_000)
         service.records.update_job(JOB_ID, 1, progress=0.75)
         expect(page.locator("#message-text")).to_have_text("75 % done", timeout=30_000)
         service.finish(data)
         expect(page.locator("#verdict-word")).to_have_text("Registered", timeout=30_000)
         page.wait_for_selector("#tools:not([hidden])")
-        assert coloured(canvas_pixels(page), "blue").mean() > 0.01
-        page.locator("#colour").select_option("residual")
+        assert colored(canvas_pixels(page), "blue").mean() > 0.01
+        page.locator("#color").select_option("residual")
         page.wait_for_selector("#legend svg rect")
         assert page.locator("#box-chip").is_visible()
         assert "result.json" in page.locator("#files").inner_text()

@@ -15,7 +15,7 @@ def test_running_shows_phase_and_progress(visit: Visit) -> None:
     page.goto(visit.server.view("running"))
     page.wait_for_selector("#phases [aria-current=step]")
     assert page.locator("#status").inner_text() == "Running"
-    assert page.locator("#message-title").inner_text() == "Optimising"
+    assert page.locator("#message-title").inner_text() == "Optimizing"
     assert page.locator("#message-text").inner_text() == "62 % done"
     assert page.locator("#progress").evaluate("bar => bar.value") == pytest.approx(0.62)
     assert page.locator("#phases [data-state=done]").count() == 3
@@ -33,7 +33,7 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     page = visit.page
     page.goto(visit.server.view(story))
     page.wait_for_selector("text=2 jobs before it.")
-    for phase in ("Loading", "Optimising"):
+    for phase in ("Loading", "Optimizing"):
         visit.server.stage.advance()
         expect(page.locator("#message-title")).to_have_text(phase, timeout=30_000)
     visit.server.stage.advance()

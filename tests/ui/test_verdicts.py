@@ -50,9 +50,9 @@ def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Vis
     expect(page.locator("#transform-note")).to_be_hidden()
 
 
-def test_residual_colours_say_whose_they_are(visit: Visit) -> None:
+def test_residual_colors_say_whose_they_are(visit: Visit) -> None:
     page = visit.open("ambiguous")
-    page.locator("#colour").select_option("residual")
+    page.locator("#color").select_option("residual")
     page.wait_for_selector("#legend svg rect")
     assert page.locator("#legend figcaption").inner_text() == "Residual, object units"
     page.locator("#pose-list label", has_text="172 degrees").click()

@@ -13,7 +13,7 @@ from playwright.sync_api import expect
 
 from tests.ui.conftest import Visit
 from tests.ui.fixture_server import TOKEN
-from tests.ui.pixels import canvas_pixels, centre_of, changed_share, coloured, differs, overlap
+from tests.ui.pixels import canvas_pixels, center_of, changed_share, colored, differs, overlap
 from tests.ui.synthetic import ITERATIONS
 
 pytestmark = pytest.mark.browser
@@ -32,8 +32,8 @@ def test_draws_the_clouds_and_stays_at_home(visit: Visit) -> None:
     page = visit.open("done")
     pixels = canvas_pixels(page)
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 500
-    assert coloured(pixels, "blue").mean() > 0.01
-    assert coloured(pixels, "orange").mean() > 0.005
+    assert colored(pixels, "blue").mean() > 0.01
+    assert colored(pixels, "orange").mean() > 0.005
     assert visit.complaints == []
     assert visit.requests
     assert [url for url in visit.requests if not url.startswith(visit.server.origin + "/")] == []
@@ -67,24 +67,24 @@ def test_slider_moves_the_object_from_the_start_into_place(visit: Visit) -> None
     seek(visit, 0)
     assert page.locator("#iteration-text").inner_text() == "Start"
     hide(visit, "before")
-    start = coloured(canvas_pixels(page), "blue")
+    start = colored(canvas_pixels(page), "blue")
     hide(visit, "before", "after")
-    ghost = coloured(canvas_pixels(page), "orange")
+    ghost = colored(canvas_pixels(page), "orange")
     # At the start the object stands where its ghost does ...
-    assert math.dist(centre_of(start), centre_of(ghost)) < 6
+    assert math.dist(center_of(start), center_of(ghost)) < 6
     hide(visit, "before", "after")
     seek(visit, 5)
     assert "Iteration 5" in page.locator("#iteration-text").inner_text()
-    halfway = coloured(canvas_pixels(page), "blue")
+    halfway = colored(canvas_pixels(page), "blue")
     seek(visit, ITERATIONS + 1)
-    end = coloured(canvas_pixels(page), "blue")
+    end = colored(canvas_pixels(page), "blue")
     # ... and every step brings it nearer to its place.
-    assert math.dist(centre_of(start), centre_of(end)) > math.dist(centre_of(halfway), centre_of(end)) > 6
+    assert math.dist(center_of(start), center_of(end)) > math.dist(center_of(halfway), center_of(end)) > 6
 
 
 def test_result_lies_on_the_scene(visit: Visit) -> None:
     page = visit.open("done")
-    page.locator("#colour").select_option("residual")  # its scene points are those of the chair alone
+    page.locator("#color").select_option("residual")  # its scene points are those of the chair alone
     page.wait_for_selector("#legend svg rect")
     hide(visit, "before", "box", "scene", "after")
     nothing = canvas_pixels(page)
@@ -126,14 +126,14 @@ def test_matrix_is_copied_whole(visit: Visit) -> None:
     assert np.allclose(copied, visit.server.stage.data.T_object_scene, atol=1e-12)
 
 
-def test_residuals_colour_the_clouds(visit: Visit) -> None:
+def test_residuals_color_the_clouds(visit: Visit) -> None:
     page = visit.open("done")
     before = canvas_pixels(page)
-    page.locator("#colour").select_option("residual")
+    page.locator("#color").select_option("residual")
     page.wait_for_selector("#legend svg rect")
     assert changed_share(before, canvas_pixels(page)) > 0.02
     assert page.locator("#legend").is_visible()
-    page.locator("#colour").select_option("layer")
+    page.locator("#color").select_option("layer")
     assert changed_share(before, canvas_pixels(page)) < 0.001
     assert visit.complaints == []
 
@@ -209,20 +209,20 @@ def test_every_artifact_can_be_downloaded(visit: Visit, tmp_path: Path) -> None:
     assert (tmp_path / "trace.json").read_bytes() == artifacts["trace.json"]
 
 
-def colours_of_the_fields(visit: Visit) -> list[str]:
-    """The colour in the middle of each field's picture; the fixture's are all of one colour."""
+def colors_of_the_fields(visit: Visit) -> list[str]:
+    """The color in the middle of each field's picture; the fixture's are all of one color."""
     visit.page.wait_for_selector("#fields:not([hidden])")
     program = """all => all.map(one => {
         const [r, g, b] = one.getContext('2d').getImageData(one.width / 2, one.height / 2, 1, 1).data;
         return [r, g, b].map(value => value.toString(16).padStart(2, '0')).join('');
     })"""
-    colours: list[str] = visit.page.locator("#field-pictures canvas").evaluate_all(program)
-    return colours
+    colors: list[str] = visit.page.locator("#field-pictures canvas").evaluate_all(program)
+    return colors
 
 
 def test_the_fields_pictures_are_shown(visit: Visit) -> None:
     page = visit.open("done")
-    assert colours_of_the_fields(visit) == ["a3" * 3, "7c" * 3]
+    assert colors_of_the_fields(visit) == ["a3" * 3, "7c" * 3]
     assert page.locator("#field-pictures figcaption").all_inner_texts() == ["Scene", "Object"]
     labels = page.locator("#field-pictures canvas").evaluate_all("all => all.map(one => one.ariaLabel)")
     assert [label.split(":")[0] for label in labels] == ["Scene", "Object"]
@@ -238,7 +238,7 @@ def test_fields_without_a_picture_have_no_card(visit: Visit) -> None:
 
 def test_sparse_result_is_shown_without_trace_and_start(visit: Visit) -> None:
     page = visit.open("bare")
-    assert coloured(canvas_pixels(page), "blue").mean() > 0.01
+    assert colored(canvas_pixels(page), "blue").mean() > 0.01
     assert not page.locator("#timeline").is_visible()
     assert not page.locator("#before-chip").is_visible()
     assert not page.locator("#convergence").is_visible()
@@ -266,7 +266,7 @@ def test_token_opens_page_and_downloads(visit: Visit, tmp_path: Path) -> None:
     page.locator("#token").fill(TOKEN)
     page.keyboard.press("Enter")
     page.wait_for_selector("#tools:not([hidden])")
-    assert len(colours_of_the_fields(visit)) == 2
+    assert len(colors_of_the_fields(visit)) == 2
     with page.expect_download() as download:
         page.locator("#files a", has_text="trace.json").click()
     download.value.save_as(tmp_path / "trace.json")

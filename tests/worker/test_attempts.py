@@ -83,7 +83,7 @@ def test_progress_is_written_a_few_times_a_second_but_every_phase(context: Conte
     context.records.update_job("j1", 1, status="running")
     with Pulse(context.records, "j1", 1, 60) as pulse:
         for step in range(1000):
-            pulse.report("optimising", step / 1000)
+            pulse.report("optimizing", step / 1000)
         for phase in ("verifying", "exporting"):
             pulse.report(phase, 0.999)
     events = context.records.events("j1", None, 0)
@@ -96,5 +96,5 @@ def test_a_job_hears_that_another_attempt_has_taken_over(context: Context) -> No
     context.records.update_job("j1", 1, status="running")
     context.records.requeue_job("j1", 1)
     with Pulse(context.records, "j1", 1, 60) as pulse, pytest.raises(CancelledError):
-        pulse.report("optimising", 0.5)
+        pulse.report("optimizing", 0.5)
     assert pulse.superseded

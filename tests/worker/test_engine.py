@@ -12,7 +12,7 @@ from regnf_worker.engine import CoreEngine
 
 START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
 REQUEST: dict[str, Any] = {
-    "detection": {"centre": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 1]},
+    "detection": {"center": [0, 0, 0], "size": [1, 1, 1], "rotation_quaternion_xyzw": [0, 0, 0, 1]},
     "options": RegistrationOptions().to_dict(),
     "seed": 3,
     "object": "b" * 64,

@@ -105,7 +105,7 @@ def test_redis_forgets_everything(table: Bench) -> None:
     """FLUSHALL while a job runs: the job has no record any more, stops, and the worker goes on."""
     worker = table.start_worker()
     table.submit("iterate")
-    table.reaches("optimising")
+    table.reaches("optimizing")
     table.redis.flushall()
     eventually(lambda: not children_of(worker.pid), "the end of a job that nobody knows")
     table.add_ready_fields()

@@ -44,7 +44,7 @@ def test_a_job_succeeds(table: Bench) -> None:
     with table.context.blobs.open("jobs/j1/1/result.json") as file:
         assert json.load(file)["pid"] not in (worker.pid, os.getpid()), "jobs have a process of their own"
     phases = [event.data["phase"] for event in table.context.records.events("j1", None, 0)]
-    assert phases == [None, "loading", "sampling", "optimising", "exporting", "exporting"]
+    assert phases == [None, "loading", "sampling", "optimizing", "exporting", "exporting"]
     eventually(lambda: not table.redis.keys("rq:job:*"), "the queue's forgetting the job")
     assert_next_job_runs(table)
 
@@ -100,7 +100,7 @@ def test_a_job_that_ends_without_a_word_is_run_again_once(table: Bench) -> None:
 def test_a_running_job_is_cancelled(table: Bench, do: str) -> None:
     table.start_worker()
     table.submit(do)
-    table.reaches("optimising" if do == "iterate" else "sampling")
+    table.reaches("optimizing" if do == "iterate" else "sampling")
     table.context.records.request_cancel("j1")
     table.context.queue.stop("j1", 1)
     assert table.finished().status == "dismissed"
@@ -111,7 +111,7 @@ def test_a_running_job_is_cancelled(table: Bench, do: str) -> None:
 def test_a_cancelled_job_stops_though_the_stop_command_is_lost(table: Bench, do: str) -> None:
     table.start_worker()
     table.submit(do)
-    table.reaches("optimising" if do == "iterate" else "sampling")
+    table.reaches("optimizing" if do == "iterate" else "sampling")
     table.context.records.request_cancel("j1")
     assert table.finished().status == "dismissed"
     assert_next_job_runs(table)
@@ -252,6 +252,6 @@ def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
         table.start_worker("regnf_worker.main")
         rejected = field_state(table, SCENE)
         assert rejected.error is not None
-        assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNISED")
+        assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNIZED")
         assert list(table.context.blobs.list("fields")) == []
         assert "Traceback" not in table.log()

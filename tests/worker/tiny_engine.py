@@ -45,7 +45,7 @@ class TinyEngine:
     read_model = symmetry = make_model
 
     def succeed(self, report: Report) -> None:
-        report("optimising", 0.5)
+        report("optimizing", 0.5)
 
     def refuse(self, report: Report) -> None:
         raise NoSurfaceError("nothing in the box")
@@ -59,7 +59,7 @@ class TinyEngine:
     def iterate(self, report: Report) -> None:
         """Goes on until it is stopped, reporting all the while."""
         while True:
-            report("optimising", 0.5)
+            report("optimizing", 0.5)
             time.sleep(0.01)
 
     def wait_for_file(self, report: Report) -> None:

@@ -1,4 +1,4 @@
-"""ONNX's operators that add elements up: products of matrices, normalisations, reductions, samples of a grid."""
+"""ONNX's operators that add elements up: products of matrices, normalizations, reductions, samples of a grid."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def _layer_normalization(attributes: Attributes, inputs: Inputs) -> Tensor:
     axis = int(attributes.get("axis", -1)) % value.dim()
     bias = inputs[2].to(value.device) if len(inputs) > 2 and inputs[2] is not None else 0.0
     axes = tuple(range(axis, value.dim()))
-    centred = value - value.mean(axes, keepdim=True)
-    variance = centred.square().mean(axes, keepdim=True)
-    return centred / (variance + float(attributes.get("epsilon", 1e-5))).sqrt() * scale + bias
+    centered = value - value.mean(axes, keepdim=True)
+    variance = centered.square().mean(axes, keepdim=True)
+    return centered / (variance + float(attributes.get("epsilon", 1e-5))).sqrt() * scale + bias
 
 
 def _batch_normalization(attributes: Attributes, inputs: Inputs) -> Tensor:
     if attributes.get("training_mode", 0):
-        raise ValueError("a normalisation in training")
+        raise ValueError("a normalization in training")
     value, *rest = together(*inputs)
     shape = (1, -1, *([1] * (value.dim() - 2)))
     scale, bias, mean, variance = (part.reshape(shape) for part in rest)

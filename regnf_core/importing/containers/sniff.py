@@ -56,7 +56,7 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     return (
-        "FORMAT_NOT_RECOGNISED",
+        "FORMAT_NOT_RECOGNIZED",
         "none of the formats that are taken: torch.save archives, safetensors, npz, SQLite, ONNX, meshes",
     )
 

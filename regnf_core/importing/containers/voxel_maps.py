@@ -74,7 +74,7 @@ def require_shape_of_blocks(name: str, values: npt.NDArray[np.generic], blocks: 
 
 
 def _slopes(values: Float32Array, seen: BoolArray) -> Float32Array:
-    """The gradients' norms per voxel where a voxel and its three upper neighbours are well within the range."""
+    """The gradients' norms per voxel where a voxel and its three upper neighbors are well within the range."""
     usable = seen & (np.abs(values) < _MIDDLE)
     here = (slice(None), slice(0, -1), slice(0, -1), slice(0, -1))
     squared = np.zeros_like(values[here])

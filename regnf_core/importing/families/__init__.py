@@ -1,4 +1,4 @@
-"""The families of checkpoints that the gate recognises: one module a family, listed in ``FAMILIES``."""
+"""The families of checkpoints that the gate recognizes: one module a family, listed in ``FAMILIES``."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _SHOWN_KEYS = 8
 def convert_checkpoint(checkpoint: Any, source: TensorSource, description: UploadDescription) -> ConvertedField:
     """The checkpoint's signed distance field. Everything the field does not need is left behind.
 
-    Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, FIELD_NOT_RECOGNISED, FAMILY_NOT_SUPPORTED, and what the family
+    Raises FieldFormatError: UNSAFE_GLOBAL_IN_WEIGHTS, FIELD_NOT_RECOGNIZED, FAMILY_NOT_SUPPORTED, and what the family
     raises.
     """
     if isinstance(checkpoint, (Placeholder, GlobalRef)):
@@ -59,7 +59,7 @@ def convert_checkpoint(checkpoint: Any, source: TensorSource, description: Uploa
             converted = family(checkpoint, source, description)
             if converted is not None:
                 return converted
-    raise FieldFormatError(f"no known family of fields; {_contents(checkpoint)}", reason="FIELD_NOT_RECOGNISED")
+    raise FieldFormatError(f"no known family of fields; {_contents(checkpoint)}", reason="FIELD_NOT_RECOGNIZED")
 
 
 def _contents(checkpoint: object) -> str:

@@ -1,4 +1,4 @@
-"""The families of .npz files that the gate recognises: one module a family, listed in ``ARRAY_FAMILIES``."""
+"""The families of .npz files that the gate recognizes: one module a family, listed in ``ARRAY_FAMILIES``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SHOWN_NAMES = 8
 def convert_arrays(arrays: ArraySource, description: UploadDescription) -> ConvertedField:
     """The signed distance field in the arrays. Those that it does not need are never unpacked.
 
-    Raises FieldFormatError: FIELD_NOT_RECOGNISED and what the family raises.
+    Raises FieldFormatError: FIELD_NOT_RECOGNIZED and what the family raises.
     """
     for family in ARRAY_FAMILIES:
         converted = family(arrays, description)
@@ -29,4 +29,4 @@ def convert_arrays(arrays: ArraySource, description: UploadDescription) -> Conve
             return converted
     names = [name[:40] for name in arrays.names if name.isprintable()][:_SHOWN_NAMES]
     message = f"no known family of fields; the first arrays are {names}"
-    raise FieldFormatError(message, reason="FIELD_NOT_RECOGNISED")
+    raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")

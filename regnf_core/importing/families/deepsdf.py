@@ -35,7 +35,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     if prefix is None:
         if network is None and _CODES in checkpoint:
             message = "DeepSDF's latent codes without its network; upload both in one file"
-            raise FieldFormatError(message, reason="FIELD_NOT_RECOGNISED")
+            raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
         return None
     require_family(wanted, FAMILY)
     refuse_other_entries(wanted, FAMILY, ("latent", "latent_index"))
@@ -55,7 +55,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         **shared_entries(wanted, UNIT_CUBE),
         "activation": "relu",
         "input_at": seeing,
-        "normalised": sorted({int(name.split(".")[1]) for name in norms}),
+        "normalized": sorted({int(name.split(".")[1]) for name in norms}),
         "output_tanh": 1,
         "source": {"family": FAMILY},
     }
@@ -104,7 +104,7 @@ def _all_codes(stored: object, source: TensorSource, width: int) -> Float32Array
 
 
 def _norms(state: dict[str, Any], layers: Layers, source: TensorSource) -> dict[str, Float32Array]:
-    """The layer normalisations that networks without weight normalisation have behind some layers."""
+    """The layer normalizations that networks without weight normalization have behind some layers."""
     found = {}
     for i in range(len(layers.weights) - 1):
         if f"bn{i}.weight" in state:

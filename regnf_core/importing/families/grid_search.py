@@ -30,7 +30,7 @@ def find_grids(parameters: int, width: int, habits: GridHabits, wanted: GridDesc
 
     ``wanted`` narrows the search. Exact layouts are preferred to those in which another machine's rounding moved a
     level by one node. At the end come the ways in which the training device may have indexed the same tables.
-    Raises FieldFormatError (HASH_GRID_NOT_RECOGNISED).
+    Raises FieldFormatError (HASH_GRID_NOT_RECOGNIZED).
     """
     candidates = list(_candidates(parameters, width, habits, wanted))
     fitting = [c for c in candidates if c.entries * c.features_per_level == parameters]
@@ -38,7 +38,7 @@ def find_grids(parameters: int, width: int, habits: GridHabits, wanted: GridDesc
         fitting = [c for c in (_rounded(c, parameters) for c in candidates) if c is not None]
     if not fitting:
         message = f"no usual hash grid has {parameters} parameters and {width} features; describe it under 'hash'"
-        raise FieldFormatError(message, reason="HASH_GRID_NOT_RECOGNISED")
+        raise FieldFormatError(message, reason="HASH_GRID_NOT_RECOGNIZED")
     distinct: dict[object, HashGridConfig] = {}
     for config in fitting:
         distinct.setdefault(_function(config), config)

@@ -31,7 +31,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, BOUNDS_INVALID,
-    HASH_GRID_NOT_RECOGNISED and what TensorSource raises.
+    HASH_GRID_NOT_RECOGNIZED and what TensorSource raises.
     """
     state = below(checkpoint.get("state_dict"), _PREFIX)
     if not state:

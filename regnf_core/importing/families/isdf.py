@@ -22,7 +22,7 @@ FAMILY = "isdf"
 _INPUT_SCALE, _OUTPUT_SCALE = 0.05937489, 0.14
 _DIRECTIONS = 21
 _REACH = 4.0
-"""Half an edge of the bounds that are assumed, metres: a room's."""
+"""Half an edge of the bounds that are assumed, meters: a room's."""
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:

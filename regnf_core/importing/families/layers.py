@@ -1,4 +1,4 @@
-"""The linear layers of a geometry network, weight normalisation folded in, their shapes checked against each other."""
+"""The linear layers of a geometry network, weight normalization folded in, their shapes checked against each other."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.schema.kinds.neus_facto import MAX_LAYERS
 
-_NORMALISED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
-"""How torch names direction and length of a normalised weight: the older way, the newer way."""
+_NORMALIZED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
+"""How torch names direction and length of a normalized weight: the older way, the newer way."""
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,12 @@ def require_extra_columns(layers: Layers, names: Sequence[str], allowed: Mapping
 
 
 def folded_weight(state: Mapping[str, Any], name: str, source: TensorSource) -> Float32Array:
-    """W = g v / |v|, row by row; or the plain weight of a network without weight normalisation."""
+    """W = g v / |v|, row by row; or the plain weight of a network without weight normalization."""
     if f"{name}.weight" in state:
         weight = source.array(f"{name}.weight", state[f"{name}.weight"])
         require_shape(f"{name}.weight", weight, (None, None))
         return weight
-    v, g = next((pair for pair in _NORMALISED if f"{name}.{pair[0]}" in state), _NORMALISED[0])
+    v, g = next((pair for pair in _NORMALIZED if f"{name}.{pair[0]}" in state), _NORMALIZED[0])
     direction = source.array(f"{name}.{v}", lookup(state, f"{name}.{v}"))
     require_shape(f"{name}.{v}", direction, (None, None))
     length = source.array(f"{name}.{g}", lookup(state, f"{name}.{g}"))

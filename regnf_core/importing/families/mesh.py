@@ -100,7 +100,7 @@ def _is_inside_out(vertices: npt.NDArray[np.float32], faces: Int64Array) -> bool
 
 
 def _open_edge_share(faces: Int64Array, vertices: int) -> float:
-    """Share of the directed edges that no neighbour runs through the other way, exactly once."""
+    """Share of the directed edges that no neighbor runs through the other way, exactly once."""
     start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     forward, count = np.unique(start * vertices + end, return_counts=True)
     single = forward[count == 1]

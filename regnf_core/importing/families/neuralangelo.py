@@ -36,7 +36,7 @@ _UNTRAINED = 1.01e-4
 def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
-    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNISED and what
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNIZED and what
     TensorSource raises.
     """
     model = checkpoint.get("model")
@@ -59,7 +59,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
 
 
 def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
-    """The hidden layers, then the one for the distance. The last of ``linears`` makes colour's features alone."""
+    """The hidden layers, then the one for the distance. The last of ``linears`` makes color's features alone."""
     names: Sequence[str] = [*numbered(state, "mlp.linears.")[:-1], "mlp.linear_sdf"]
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)

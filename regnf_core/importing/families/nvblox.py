@@ -27,7 +27,7 @@ _FARTHEST = 1 << 31
 def convert_database(tables: TableSource, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
     """The map's truncated distances as a field.
 
-    Raises FieldFormatError: FIELD_NOT_RECOGNISED, FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING,
+    Raises FieldFormatError: FIELD_NOT_RECOGNIZED, FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING,
     TENSOR_SHAPE, TENSOR_TOO_LARGE, TENSOR_NOT_FINITE and what TableSource raises.
     """
     layer = _layer(tables)
@@ -47,7 +47,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, wanted: UploadDescr
     }
     why = (
         f"tables {layer}{_DATA} and {layer}{_SETTINGS}: {len(blocks)} blocks of {_EDGE}^3 voxels",
-        "values belong to the voxels' middles, in metres",
+        "values belong to the voxels' middles, in meters",
     )
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.astype(np.int32)}
     return ConvertedField(FAMILY, why, description, tensors)
@@ -58,7 +58,7 @@ def _layer(tables: TableSource) -> str:
     layers = [name.removesuffix(_DATA) for name in tables.tables if name.endswith(_DATA)]
     layers = sorted(layer for layer in layers if layer + _SETTINGS in tables.tables)
     if not layers:
-        raise FieldFormatError("a database, but not one of layers of voxels", reason="FIELD_NOT_RECOGNISED")
+        raise FieldFormatError("a database, but not one of layers of voxels", reason="FIELD_NOT_RECOGNIZED")
     found = [layer for layer in layers if "tsdf" in layer.lower()]
     if len(found) != 1:
         message = f"a map with {len(found)} layers of truncated distances; its layers are {layers[:8]}"
@@ -67,7 +67,7 @@ def _layer(tables: TableSource) -> str:
 
 
 def _block_size(tables: TableSource, layer: str) -> float:
-    """Edge of a block, metres."""
+    """Edge of a block, meters."""
     columns = ("param_name", "value_float")
     settings = dict(tables.rows(layer + _SETTINGS, columns, _MOST_SETTINGS))
     size = settings.get("block_size")

@@ -29,9 +29,9 @@ class _Settings:
 
     cell_size: float
     buffer_size: int
-    neighbour_cells: int
+    neighbor_cells: int
     search_alpha: float
-    neighbours: int
+    neighbors: int
     blend_first: bool
     oriented: bool
     distance_scale: float
@@ -59,9 +59,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         **shared_entries(wanted, [(low - settings.cell_size).tolist(), (high + settings.cell_size).tolist()]),
         "cell_size": settings.cell_size,
         "buffer_size": settings.buffer_size,
-        "reach": settings.neighbour_cells + settings.search_alpha,
-        "max_distance": 3.0**0.5 * (settings.neighbour_cells + 1) * settings.cell_size,
-        "neighbours": settings.neighbours,
+        "reach": settings.neighbor_cells + settings.search_alpha,
+        "max_distance": 3.0**0.5 * (settings.neighbor_cells + 1) * settings.cell_size,
+        "neighbors": settings.neighbors,
         "blend_first": settings.blend_first,
         "oriented": settings.oriented,
         "source": {"family": FAMILY},
@@ -94,9 +94,9 @@ def _settings(attributes: Mapping[Any, Any]) -> _Settings:
     return _Settings(
         cell_size=_number(attributes, "resolution"),
         buffer_size=int(_number(attributes, "buffer_size")),
-        neighbour_cells=int(_number(config, "num_nei_cells")),
+        neighbor_cells=int(_number(config, "num_nei_cells")),
         search_alpha=_number(config, "search_alpha"),
-        neighbours=int(_number(config, "query_nn_k")),
+        neighbors=int(_number(config, "query_nn_k")),
         blend_first=bool(config.get("weighted_first")),
         oriented=bool(attributes.get("after_pgo")),
         distance_scale=scale,

@@ -2,7 +2,7 @@
 
 The two trainers write the same keys and shapes for different functions: nerfstudio multiplies the sines' argument by
 2 pi and contracts space for the grid alone. Only sdfstudio's field has a ``laplace_density``, which decides; the
-uploader may overrule. Training state, colour, background, proposal networks and image losses are left behind.
+uploader may overrule. Training state, color, background, proposal networks and image losses are left behind.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _VARIANTS = {
 def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
-    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNISED and what
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNIZED and what
     TensorSource raises.
     """
     pipeline = checkpoint.get("pipeline")

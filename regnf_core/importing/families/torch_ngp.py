@@ -37,7 +37,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE,
-    HASH_GRID_NOT_RECOGNISED and what TensorSource raises.
+    HASH_GRID_NOT_RECOGNIZED and what TensorSource raises.
     """
     state = below(checkpoint.get("model", checkpoint), "")
     own = all(name in state for name in _OWN)
@@ -81,7 +81,7 @@ def _read_own(state: dict[str, Any], source: TensorSource, wanted: GridDescripti
         raise tensor_error(f"{levels} levels of {features} features, but {layers.input_width} columns", "TENSOR_SHAPE")
     grids = [grid for grid in _own_grids(levels, features, max(entries), wanted) if grid.level_entries() == entries]
     if not grids:
-        raise _not_recognised(f"no usual hash grid has levels of {entries} entries")
+        raise _not_recognized(f"no usual hash grid has levels of {entries} entries")
     return table, layers, grids
 
 
@@ -89,7 +89,7 @@ def _own_grids(levels: int, features: int, most: int, wanted: GridDescription) -
     """Grids as the trainer lays them out: a level of resolution r has r + 1 nodes along an edge, and rows as long."""
     log2_size = math.ceil(math.log2(max(most, 8)))
     if log2_size > 24:
-        raise _not_recognised(f"a level of {most} entries is larger than any that is taken")
+        raise _not_recognized(f"a level of {most} entries is larger than any that is taken")
     bases = (16, 8, 32, 4, 64) if wanted.base_resolution is None else (wanted.base_resolution,)
     for base in bases:
         for top in _TOPS if wanted.top_resolution is None else (wanted.top_resolution,):
@@ -115,7 +115,7 @@ def _read_tcnn(state: dict[str, Any], source: TensorSource, wanted: GridDescript
         except FieldFormatError:
             continue
         return table, layers, [*_with_short_growth(exact), *exact]
-    raise _not_recognised(f"no usual grid and network have {table.size} and {network.size} parameters")
+    raise _not_recognized(f"no usual grid and network have {table.size} and {network.size} parameters")
 
 
 def _with_short_growth(grids: Sequence[HashGridConfig]) -> Iterator[HashGridConfig]:
@@ -146,5 +146,5 @@ def _split(network: Float32Array, width: int) -> Layers | None:
     return None
 
 
-def _not_recognised(message: str) -> FieldFormatError:
-    return FieldFormatError(f"{message}; describe it under 'hash'", reason="HASH_GRID_NOT_RECOGNISED")
+def _not_recognized(message: str) -> FieldFormatError:
+    return FieldFormatError(f"{message}; describe it under 'hash'", reason="HASH_GRID_NOT_RECOGNIZED")

@@ -1,4 +1,4 @@
-"""Families that are told apart but not taken yet: refused by name, which helps more than "not recognised"."""
+"""Families that are told apart but not taken yet: refused by name, which helps more than "not recognized"."""
 
 from __future__ import annotations
 

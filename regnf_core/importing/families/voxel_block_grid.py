@@ -1,4 +1,4 @@
-"""Open3D's VoxelBlockGrid as ``save`` writes it: truncated distances in blocks of voxels, with weights and colours."""
+"""Open3D's VoxelBlockGrid as ``save`` writes it: truncated distances in blocks of voxels, with weights and colors."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ PICTURE_NAME = "preview.png"
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MAX_BYTES = 4 << 20
 _MAX_EDGE = 4096
-_TRUE_COLOUR = b"\x08\x02\x00\x00\x00"
+_TRUE_COLOR = b"\x08\x02\x00\x00\x00"
 """Eight bits a channel, red, green and blue, not interlaced."""
 
 
@@ -46,4 +46,4 @@ def _holds_pixels_alone(data: bytes) -> bool:
 
 def _is_header(body: bytes) -> bool:
     width, height = int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big")
-    return 0 < width <= _MAX_EDGE and 0 < height <= _MAX_EDGE and body[8:] == _TRUE_COLOUR
+    return 0 < width <= _MAX_EDGE and 0 < height <= _MAX_EDGE and body[8:] == _TRUE_COLOR

@@ -60,8 +60,8 @@ class Accessors:
         return self._binary[start : start + size]
 
 
-def _scaled(items: Float64Array, component: str, normalised: bool) -> Float64Array:
-    if not normalised or component == "<f4":
+def _scaled(items: Float64Array, component: str, normalized: bool) -> Float64Array:
+    if not normalized or component == "<f4":
         return items
     top = float(np.iinfo(np.dtype(component)).max)
     return np.maximum(items / top, -1.0)

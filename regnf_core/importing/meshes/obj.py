@@ -43,7 +43,7 @@ def read_obj(data: memoryview) -> Geometry:
 
 def _place(words: list[bytes]) -> list[float]:
     try:
-        x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a colour
+        x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a color
     except ValueError as error:
         raise malformed("an OBJ vertex is not three numbers") from error
     return [x, y, z]

@@ -15,7 +15,7 @@ _MAX_NAMES = 64
 _OPSETS = range(13, 27)
 
 _OPSET_IMPORT, _GRAPH, _TRAINING, _FUNCTIONS = 8, 7, 20, 25
-_NODES, _INITIALISERS, _INPUTS, _OUTPUTS, _QUANTISATION, _SPARSE = 1, 5, 11, 12, 14, 15
+_NODES, _INITIALIZERS, _INPUTS, _OUTPUTS, _QUANTIZATION, _SPARSE = 1, 5, 11, 12, 14, 15
 _NODE_IN, _NODE_OUT, _OP_TYPE, _ATTRIBUTES, _DOMAIN = 1, 2, 4, 5, 7
 _ATTRIBUTE_NAME, _FLOAT, _INT, _STRING, _TENSOR, _FLOAT_LIST, _INT_LIST, _ATTRIBUTE_TYPE = 1, 2, 3, 4, 5, 7, 8, 20
 _PLAIN_DOMAINS = ("", "ai.onnx")
@@ -71,14 +71,14 @@ def read_model(data: memoryview) -> Model:
         raise unsupported("the model holds functions of its own or training steps: export it with them inlined")
     opset = _opset(message)
     graph = wire.read_message(graphs[0])
-    if graph.get(_QUANTISATION) or graph.get(_SPARSE):
-        raise unsupported("the model is quantised or sparse")
+    if graph.get(_QUANTIZATION) or graph.get(_SPARSE):
+        raise unsupported("the model is quantized or sparse")
     nodes = wire.messages(graph, _NODES)
-    initialisers = wire.messages(graph, _INITIALISERS)
-    if len(nodes) > MAX_NODES or len(initialisers) > _MAX_TENSORS:
-        raise unsupported(f"the model has {len(nodes)} nodes and {len(initialisers)} weights")
-    weights = dict(map(read_tensor, initialisers))
-    if len(weights) != len(initialisers):
+    initializers = wire.messages(graph, _INITIALIZERS)
+    if len(nodes) > MAX_NODES or len(initializers) > _MAX_TENSORS:
+        raise unsupported(f"the model has {len(nodes)} nodes and {len(initializers)} weights")
+    weights = dict(map(read_tensor, initializers))
+    if len(weights) != len(initializers):
         raise wire.malformed("two weights of one name")
     ports = [_port(data) for data in wire.messages(graph, _INPUTS)]
     inputs = [port for port in ports if port.name not in weights]  # old models list their weights among the inputs

@@ -17,7 +17,7 @@ DTYPES: dict[str, str] = {
     "ByteStorage": "uint8",
     "BoolStorage": "bool",
 }
-"""torch's storage classes and the element type of each. Others (complex, quantised) are read but never materialised."""
+"""torch's storage classes and the element type of each. Others (complex, quantized) are read but never materialized."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,7 +43,7 @@ class Placeholder:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StorageRef:
-    """A storage in the archive: entry ``data/<key>``. dtype is None for element types that are never materialised."""
+    """A storage in the archive: entry ``data/<key>``. dtype is None for element types that are never materialized."""
 
     key: str
     dtype: str | None

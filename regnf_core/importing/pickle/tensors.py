@@ -51,7 +51,7 @@ class Archive(Protocol):
 
 
 class TensorSource:
-    """Materialises tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
+    """Materializes tensors of one archive. Float32 tensors are views of the map where they lie aligned, as torch writes
     them; nothing else of the file is touched.
 
     ``budget`` caps the bytes of all tensors together, as float32.

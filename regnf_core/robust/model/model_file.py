@@ -23,7 +23,7 @@ from regnf_core.robust.working_frame import WorkingFrame
 MODEL_VERSION = "1"
 """Raised whenever models made by older code must be made again."""
 _SHAPES: dict[str, tuple[int | str, ...]] = {
-    "centre": (3,),
+    "center": (3,),
     "lengths": (2,),
     "points": ("N", 3),
     "values": ("N",),
@@ -42,7 +42,7 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
     """Write the model, whole or not at all."""
     axis = model.symmetry.axis
     tensors = {
-        "centre": model.frame.centre,
+        "center": model.frame.center,
         "lengths": torch.tensor([model.frame.length, model.spacing], dtype=torch.float64),
         "points": model.samples.points,
         "values": model.samples.values,
@@ -81,11 +81,11 @@ def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:
     if version != MODEL_VERSION:
         raise _invalid(f"version {json.dumps(version)[:20]}, expected {MODEL_VERSION}")
     _check(tensors)
-    centre, lengths = tensors["centre"].double(), tensors["lengths"].double()
+    center, lengths = tensors["center"].double(), tensors["lengths"].double()
     T = Sim3(*(tensors[f"symmetry.{part}"].double() for part in ("scale", "rotation", "translation")))
     axes = tensors["symmetry.axis"]
     return ObjectModel(
-        WorkingFrame(centre, float(lengths[0])),
+        WorkingFrame(center, float(lengths[0])),
         Samples(*(tensors[name].float() for name in ("points", "values", "normals"))),
         float(lengths[1]),
         tensors["extremes"].float(),

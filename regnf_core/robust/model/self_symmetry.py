@@ -10,7 +10,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.result import ObjectSymmetry
 from regnf_core.robust.poses import distinct, join, select
-from regnf_core.robust.refine.levenberg_marquardt import minimise
+from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Samples, residuals
 from regnf_core.robust.samples import some
 from regnf_core.robust.search.rotations import turns_about
@@ -67,7 +67,7 @@ def self_symmetry(
     start = _rigid(rotations)
     coarse = disagreement(residuals(obj, obj, some(few, 48, generator), some(few, 48, generator), start), 0.1)
     T = select(start, coarse.argsort()[:80])
-    refined = minimise(obj, obj, few, few, T, [0.1, 0.07, 0.05, 0.03, 0.02, 0.02], fix_scale=True)
+    refined = minimize(obj, obj, few, few, T, [0.1, 0.07, 0.05, 0.03, 0.02, 0.02], fix_scale=True)
     scores = disagreement(refined.residuals, _WIDTH)
     itself = float(disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None].double())), _WIDTH))
     alike = (scores <= itself + _ALIKE).nonzero().squeeze(-1)
@@ -92,7 +92,7 @@ def confirmed(
     if proposed.T.scale.numel() == 0:
         return proposed
     few = some(B, _CONFIRMING_POINTS, generator)
-    refined = minimise(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
+    refined = minimize(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
     deviation = (refined.residuals.values.abs() > _OFF).float().mean(1)
     kept = _distinct_turns(refined.T, deviation, extremes)
     T, deviation = select(refined.T, kept), deviation[kept]

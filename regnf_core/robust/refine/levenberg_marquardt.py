@@ -21,7 +21,7 @@ because up to two thirds of the samples may lie where the other field has nothin
 _WIDEST = 0.04  # object diameters: what the spread may widen the kernel to
 MOST_OFFSET = 0.04  # object diameters
 OFFSET_PRIOR = 0.02
-"""Of the weight of one direction's samples, in favour of no offset: round things may as well be larger as thicker."""
+"""Of the weight of one direction's samples, in favor of no offset: round things may as well be larger as thicker."""
 _LARGEST_STEP = 0.6  # of the rotation (radians), the shift (working units) and the log scale
 
 
@@ -70,7 +70,7 @@ def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
     return cost + prior
 
 
-def minimise(
+def minimize(
     scene: DistanceModel,
     obj: DistanceModel,
     A: Samples,
@@ -83,7 +83,7 @@ def minimise(
     offset: Tensor | None = None,
     most_offset: float = MOST_OFFSET,
 ) -> Refined:
-    """Minimise the robust cost of every pose in the batch T (H,), one iteration for each kernel width.
+    """Minimize the robust cost of every pose in the batch T (H,), one iteration for each kernel width.
 
     widths: kernel widths, object units; falling widths anneal. With ``adaptive`` they are
     the least, see :func:`fitting_width`. A step that raises the cost is undone and damped more.

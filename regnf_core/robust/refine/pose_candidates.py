@@ -10,7 +10,7 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import distinct, select
-from regnf_core.robust.refine.levenberg_marquardt import minimise
+from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples
 from regnf_core.robust.samples import some
 from regnf_core.robust.search.search import disagreement
@@ -112,7 +112,7 @@ def run_stage(
         )
         on_step()
 
-    refined = minimise(
+    refined = minimize(
         scene,
         obj,
         few_A,

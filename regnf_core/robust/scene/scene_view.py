@@ -28,7 +28,7 @@ _SMOOTH, _OFFSET_PER_INCOHERENCE = 0.012, 2.0
 
 @dataclass(frozen=True, eq=False)
 class SceneView:
-    """The surface in the detection box. Working frame: the box's centre at 0, its diagonal 1.
+    """The surface in the detection box. Working frame: the box's center at 0, its diagonal 1.
 
     foreground: the samples that stand in front of floors and walls · spacing: between samples · shadow_share: of the
     samples, set aside as the walls of shadows · evaluations: of the scene's field, that it took to make this.

@@ -1,4 +1,4 @@
-"""How rough a sampled surface is, and the samples without that roughness: normals and heights averaged over neighbours.
+"""How rough a sampled surface is, and the samples without that roughness: normals and heights averaged over neighbors.
 
 A fit stopped early, or one to noisy images, has bumps as wide as its cells. What asks for planes and sides needs the
 surface beneath them, and has to know how large they are.
@@ -14,16 +14,16 @@ from torch import Tensor
 
 from regnf_core.robust.residuals import Samples
 
-_NEIGHBOURS = 16
-_ROUNDS = 2  # of averaging the normals: the first leaves those of the roughest neighbours
+_NEIGHBORS = 16
+_ROUNDS = 2  # of averaging the normals: the first leaves those of the roughest neighbors
 _SAME_SHEET = 0.3  # least cosine: the far side of a thin part has no say
 
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """Points (N, 3) and unit normals (N, 3) averaged over neighbours on the same sheet.
+    """Points (N, 3) and unit normals (N, 3) averaged over neighbors on the same sheet.
 
-    roughness: median standard deviation of the neighbours' heights, the points' unit · incoherence: 1 - median cosine
+    roughness: median standard deviation of the neighbors' heights, the points' unit · incoherence: 1 - median cosine
     between a sample's own normal and the averaged one; 0 for a plane, about 0.01 for accurate fits.
     """
 
@@ -39,14 +39,14 @@ class Smoothed:
 def smoothed(samples: Samples) -> Smoothed:
     """The samples' surface without its roughness."""
     points = samples.on_surface()
-    count = min(_NEIGHBOURS, len(samples))
+    count = min(_NEIGHBORS, len(samples))
     array = points.numpy()
     near = torch.from_numpy(cKDTree(array).query(array, k=count)[1].reshape(len(samples), count))
     normals = samples.normals
     for _ in range(_ROUNDS):
-        neighbours = normals[near]
-        alike = (neighbours * normals[:, None]).sum(-1, keepdim=True).clamp_min(0.0)
-        normals = torch.nn.functional.normalize((alike * neighbours).sum(1), dim=-1)
+        neighbors = normals[near]
+        alike = (neighbors * normals[:, None]).sum(-1, keepdim=True).clamp_min(0.0)
+        normals = torch.nn.functional.normalize((alike * neighbors).sum(1), dim=-1)
     same = ((samples.normals[near] * normals[:, None]).sum(-1) > _SAME_SHEET).to(points)
     heights = ((points[near] - points[:, None]) * normals[:, None]).sum(-1)
     total = same.sum(1).clamp_min(1.0)

@@ -29,10 +29,10 @@ class ProxyField:
         self.counts = torch.full((3,), _CELLS)
         self.edge = (high - low) / self.counts
         axes = [low[k] + (torch.arange(_CELLS) + 0.5) * self.edge[k] for k in range(3)]
-        centres = torch.cartesian_prod(*axes)
-        value, gradient = nearest_sample_distance(points, normals, spacing, centres)
+        centers = torch.cartesian_prod(*axes)
+        value, gradient = nearest_sample_distance(points, normals, spacing, centers)
         self._table = torch.cat([value[:, None], gradient], 1).contiguous()  # (V, 4)
-        self._centres = centres
+        self._centers = centers
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3): the nearest cell's, carried on to the point."""
@@ -42,7 +42,7 @@ class ProxyField:
         index = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
         entry = self._table.index_select(0, index)
         gradient = entry[:, 1:]
-        offset = inside - self._centres.index_select(0, index)
+        offset = inside - self._centers.index_select(0, index)
         beyond = points - inside
         outside = beyond.norm(dim=-1)
         value = entry[:, 0] + (gradient * offset).sum(-1) + outside

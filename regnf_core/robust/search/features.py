@@ -15,11 +15,11 @@ from regnf_core.robust.poses import join
 from regnf_core.robust.residuals import Samples
 
 _VOXEL = 0.08  # root mean square radii
-_FEATURE_RADIUS, _NEIGHBOURS = 4.0, 100  # voxels, points
+_FEATURE_RADIUS, _NEIGHBORS = 4.0, 100  # voxels, points
 _INLIER = 1.5  # voxels
 _ITERATIONS, _CONFIDENCE = 20_000, 0.999
 _FEWEST = 30  # points a described cloud must have
-_SCALES = (0.2, 5.0)  # of the normalised clouds: what lies beyond is no match
+_SCALES = (0.2, 5.0)  # of the normalized clouds: what lies beyond is no match
 
 
 def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
@@ -31,7 +31,7 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
     from open3d.pipelines import registration
 
     found: list[Sim3] = []
-    to_scene, to_object = _normalising(scene), _normalising(obj)
+    to_scene, to_object = _normalizing(scene), _normalizing(obj)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         source, target = _described(scene, to_scene), _described(obj, to_object)
         for draw in range(count):
@@ -56,26 +56,26 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
     return join(found) if found else Sim3(*(torch.zeros(0, *shape).double() for shape in ((), (3, 3), (3,))))
 
 
-def _normalising(samples: Samples) -> Sim3:
+def _normalizing(samples: Samples) -> Sim3:
     """The similarity that moves the samples' centroid to 0 and makes their root mean square radius one."""
     points = samples.on_surface().double()
-    centre = points.mean(0)
-    scale = 1.0 / (points - centre).square().sum(-1).mean().sqrt().clamp_min(1e-9)
-    return Sim3(scale, torch.eye(3, dtype=torch.float64), -scale * centre)
+    center = points.mean(0)
+    scale = 1.0 / (points - center).square().sum(-1).mean().sqrt().clamp_min(1e-9)
+    return Sim3(scale, torch.eye(3, dtype=torch.float64), -scale * center)
 
 
-def _described(samples: Samples, normalise: Sim3) -> tuple[Any, Any] | None:
-    """The normalised cloud, one point a voxel, and its descriptors; None when it is too small to be described."""
+def _described(samples: Samples, normalize: Sim3) -> tuple[Any, Any] | None:
+    """The normalized cloud, one point a voxel, and its descriptors; None when it is too small to be described."""
     import open3d
     from open3d.pipelines import registration
 
-    points = normalise.apply(samples.on_surface().double())
+    points = normalize.apply(samples.on_surface().double())
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.numpy()))
     cloud.normals = open3d.utility.Vector3dVector(samples.normals.double().numpy())
     cloud = cloud.voxel_down_sample(_VOXEL)
     if len(cloud.points) < _FEWEST:
         return None
-    reach = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS * _VOXEL, _NEIGHBOURS)
+    reach = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS * _VOXEL, _NEIGHBORS)
     return cloud, registration.compute_fpfh_feature(cloud, reach)
 
 

@@ -19,7 +19,7 @@ def seeds(
 ) -> Sim3:
     """Poses T_object_scene (H,), working frames, float64: every rotation (K, 3, 3) with every way to scale and shift.
 
-    scene_points (N, 3): what may be the object, the box's centre at 0 · box_axes (3, 3): columns, scene frame ·
+    scene_points (N, 3): what may be the object, the box's center at 0 · box_axes (3, 3): columns, scene frame ·
     box_size (3,): full edges · scales: factors (L,) tried about the ratio of the radii.
     """
     scene_points, object_points = scene_points.double(), object_points.double()
@@ -42,11 +42,11 @@ def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
 
 
 def _from_moments(scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor) -> Sim3:
-    scene_centre, object_centre = scene_points.mean(0), object_points.mean(0)
-    ratio = _radius(object_points, object_centre) / _radius(scene_points, scene_centre)
+    scene_center, object_center = scene_points.mean(0), object_points.mean(0)
+    ratio = _radius(object_points, object_center) / _radius(scene_points, scene_center)
     s = (ratio * scales.double())[:, None].expand(-1, rotations.shape[0]).reshape(-1)
     R = rotations.repeat(scales.shape[0], 1, 1)
-    return Sim3(s, R, object_centre - s[:, None] * (R @ scene_centre))
+    return Sim3(s, R, object_center - s[:, None] * (R @ scene_center))
 
 
 def _from_extents(
@@ -71,5 +71,5 @@ def _extremes(points: Tensor) -> tuple[Tensor, Tensor]:
     return points.amin(1), points.amax(1)
 
 
-def _radius(points: Tensor, centre: Tensor) -> Tensor:
-    return (points - centre).square().sum(-1).mean().sqrt()
+def _radius(points: Tensor, center: Tensor) -> Tensor:
+    return (points - center).square().sum(-1).mean().sqrt()

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import distinct, select
-from regnf_core.robust.refine.levenberg_marquardt import minimise
+from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, residuals
 from regnf_core.robust.samples import some
 
@@ -79,7 +79,7 @@ def _refine(
     scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3, one: Round
 ) -> tuple[Sim3, Tensor]:
     if one.widths:
-        refined = minimise(scene, obj, A, B, T, list(one.widths))
+        refined = minimize(scene, obj, A, B, T, list(one.widths))
         return refined.T, disagreement(refined.residuals, one.score_width)
     return T, disagreement(residuals(scene, obj, A, B, T), one.score_width)
 

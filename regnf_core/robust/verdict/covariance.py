@@ -1,6 +1,6 @@
 """The pose's 7x7 covariance, from what the residuals tell of the fields' errors.
 
-A field's errors are alike in neighbouring points: thousands of samples of a surface that is bent as a whole say no more
+A field's errors are alike in neighboring points: thousands of samples of a surface that is bent as a whole say no more
 than a handful. So the residuals along the surface are taken for one smooth random function (a Gaussian process with a
 squared exponential kernel and a nugget), its size and correlation length are weighed by their restricted likelihood
 (Patterson & Thompson 1971; so that what the pose itself absorbed is not missed), and the covariance is what such a
@@ -139,7 +139,7 @@ def in_object_units(cov: Tensor, T_work: Sim3, scene: WorkingFrame, obj: Working
     A perturbation moves y to t + dt + e^sigma exp(omega)(y - t), t the image of the scene frame's origin: another
     frame, another t.
     """
-    origin = ((torch.zeros(3, dtype=torch.float64) - scene.centre) / scene.length)[None]
+    origin = ((torch.zeros(3, dtype=torch.float64) - scene.center) / scene.length)[None]
     arm = T_work.apply(origin)[0] - T_work.translation
     L = torch.eye(7, dtype=torch.float64)
     L[3:6, 3:6] *= obj.length

@@ -1,4 +1,4 @@
-"""What the held-out samples say of poses, in numbers; :mod:`regnf_core.robust.verdict.judgment` makes a verdict of them.
+"""What the held-out samples say of poses, in numbers; ``judgment`` makes a verdict of them.
 
 Two-sided: how much of the object's surface the scene confirms, and how much of the scene's surface the object explains.
 Where the scene is free although the object should be there, the pose is wrong; where the scene holds matter instead,

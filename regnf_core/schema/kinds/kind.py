@@ -24,7 +24,7 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 @dataclass(frozen=True, kw_only=True)
 class FieldDescription(ABC):
-    """Which function a file's tensors parametrise. A kind adds entries of its own and the two methods.
+    """Which function a file's tensors parametrize. A kind adds entries of its own and the two methods.
 
     A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale).
     """

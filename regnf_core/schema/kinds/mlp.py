@@ -33,8 +33,8 @@ class MlpDescription(FieldDescription):
     """None: the network sees the position alone."""
     input_at: LayerNumbers = ()
     """Layers, not the first, that see [hidden, input]."""
-    normalised: LayerNumbers = ()
-    """Layers whose result goes through a layer normalisation before the activation."""
+    normalized: LayerNumbers = ()
+    """Layers whose result goes through a layer normalization before the activation."""
     output_tanh: Annotated[int, Ge(0), Le(2)] = 0
     """How often tanh is applied to the last layer's result."""
 
@@ -48,9 +48,9 @@ class MlpDescription(FieldDescription):
         layers = count_layers(tensors)
         require(1 <= layers <= MAX_LAYERS, f"the field has {layers} layers, expected 1 to {MAX_LAYERS}")
         require(all(0 < i < layers for i in self.input_at), "input_at names a layer that is not there, or the first")
-        require(all(i < layers - 1 for i in self.normalised), "normalised names a layer that is not there, or the last")
+        require(all(i < layers - 1 for i in self.normalized), "normalized names a layer that is not there, or the last")
         names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
-        require_names(tensors, names | {f"norms.{i}.{part}" for i in self.normalised for part in ("weight", "bias")})
+        require_names(tensors, names | {f"norms.{i}.{part}" for i in self.normalized for part in ("weight", "bias")})
         width = self.input_width
         for layer in range(layers):
             if layer in self.input_at:
@@ -58,7 +58,7 @@ class MlpDescription(FieldDescription):
             rows = count_rows(tensors, f"layers.{layer}.weight")
             require_shape(tensors, f"layers.{layer}.weight", (rows, width))
             require_shape(tensors, f"layers.{layer}.bias", (rows,))
-            if layer in self.normalised:
+            if layer in self.normalized:
                 require_shape(tensors, f"norms.{layer}.weight", (rows,))
                 require_shape(tensors, f"norms.{layer}.bias", (rows,))
             width = rows

@@ -33,7 +33,7 @@ class NeuralPointsDescription(FieldDescription):
     """Points are looked for in cells less than this many cells away."""
     max_distance: Length
     """Points farther away than this do not count."""
-    neighbours: Annotated[int, Ge(1), Le(64)]
+    neighbors: Annotated[int, Ge(1), Le(64)]
     """How many of the nearest points count."""
     blend_first: bool
     """True: features are blended, then decoded; false: the other way round."""

@@ -42,24 +42,24 @@ class Upload:
         self._hash = hashlib.sha256()
         self._bytes = 0
         self._pending = bytearray()
-        self._recognised = False
+        self._recognized = False
 
     async def feed(self, data: bytes) -> None:
-        """Take the next bytes. Raises Problem UPLOAD_TOO_LARGE, FIELD_NOT_RECOGNISED as soon as the bytes show it."""
+        """Take the next bytes. Raises Problem UPLOAD_TOO_LARGE, FIELD_NOT_RECOGNIZED as soon as the bytes show it."""
         if self._bytes + len(self._pending) + len(data) > self._limit:
             raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)
         self._pending += data
-        if not self._recognised and len(self._pending) >= HEAD_BYTES:
-            self._recognise()
+        if not self._recognized and len(self._pending) >= HEAD_BYTES:
+            self._recognize()
         if len(self._pending) >= _BLOCK_BYTES:
             await self._flush()
 
     async def finish(self) -> Received:
-        """Write what is left. Raises Problem UPLOAD_EMPTY, FIELD_NOT_RECOGNISED."""
+        """Write what is left. Raises Problem UPLOAD_EMPTY, FIELD_NOT_RECOGNIZED."""
         if not self._bytes and not self._pending:
             raise Problem("UPLOAD_EMPTY")
-        if not self._recognised:
-            self._recognise()
+        if not self._recognized:
+            self._recognize()
         await self._flush()
         return Received(self._hash.hexdigest(), self._bytes)
 
@@ -67,12 +67,12 @@ class Upload:
         """Name the bytes, whole and at once."""
         await self._in_thread(lambda: self._writer.commit(key))
 
-    def _recognise(self) -> None:
+    def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
         if sniff_format(head) is None:
             _, sentence = explain_refusal(head)
-            raise Problem("FIELD_NOT_RECOGNISED", f"The file is {sentence}.", headers=CLOSE)
-        self._recognised = True
+            raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.", headers=CLOSE)
+        self._recognized = True
 
     async def _flush(self) -> None:
         block, self._pending = self._pending, bytearray()

@@ -1,4 +1,4 @@
-"""Byte ranges (RFC 9110, section 14): one range is honoured, several are answered with the whole."""
+"""Byte ranges (RFC 9110, section 14): one range is honored, several are answered with the whole."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ def rotation_columns(xyzw: Sequence[float]) -> tuple[Vector, Vector, Vector]:
 
 
 def boxes_overlap(
-    centre: Sequence[float],
+    center: Sequence[float],
     size: Sequence[float],
     xyzw: Sequence[float],
     lower: Sequence[float],
@@ -40,10 +40,10 @@ def boxes_overlap(
 ) -> bool:
     """Whether an oriented box meets the axis-aligned box lower..upper: the separating axis theorem, all fifteen axes.
 
-    centre, size (full edges), lower, upper: three numbers each, scene frame.
+    center, size (full edges), lower, upper: three numbers each, scene frame.
     """
     columns = rotation_columns(xyzw)
-    offset = tuple(c - (low + high) / 2 for c, low, high in zip(centre, lower, upper, strict=True))
+    offset = tuple(c - (low + high) / 2 for c, low, high in zip(center, lower, upper, strict=True))
     half_bounds = tuple((high - low) / 2 for low, high in zip(lower, upper, strict=True))
     world: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     crosses = (_cross(a, b) for a, b in itertools.product(world, columns))

@@ -37,7 +37,7 @@ def check_fields(services: Services, caller: str, request: dict[str, Any], named
     _require_usable({pointer: field(sha256) for pointer, sha256 in named.items()})
     bounds = _bounds(field(request["scene"]))
     box = request["detection"]
-    if bounds is None or boxes_overlap(box["centre"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
+    if bounds is None or boxes_overlap(box["center"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
         return
     raise Problem("DETECTION_OUTSIDE_SCENE", errors=[{"pointer": "/detection", "detail": "outside the scene's bounds"}])
 

@@ -40,8 +40,8 @@ def test_object_lies_in_the_scene_where_the_truth_says(name: str, suffix: str) -
     residual = scale * scene.signed_distance(in_scene.float()).abs() / truth["object_diameter"]
     assert residual.mean() < 0.003
     assert residual.quantile(0.95) < 0.01
-    centre, size = torch.tensor(detection["centre"]), torch.tensor(detection["size"])
-    assert ((in_scene - centre).abs() <= 0.51 * size + 0.005).all()
+    center, size = torch.tensor(detection["center"]), torch.tensor(detection["size"])
+    assert ((in_scene - center).abs() <= 0.51 * size + 0.005).all()
     assert points.abs().max() <= 0.5
 
 

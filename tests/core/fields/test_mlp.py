@@ -37,7 +37,7 @@ CASES: dict[str, dict[str, Any]] = {
         "positional_encoding": {"degree": 2, "two_pi": True, "used": False},
         "input_at": [1],
     },
-    "normalised": {"activation": "relu", "normalised": [0, 1, 3], "input_at": [2], "output_tanh": 1},
+    "normalized": {"activation": "relu", "normalized": [0, 1, 3], "input_at": [2], "output_tanh": 1},
     "tanh twice": {"activation": "sine", "output_tanh": 2},
 }
 
@@ -59,7 +59,7 @@ def tensors(values: dict[str, Any]) -> dict[str, Array]:
         columns += inputs if i in values.get("input_at", ()) else 0
         made[f"layers.{i}.weight"] = (1.5 * rng.normal(size=(rows, columns)) / math.sqrt(columns)).astype(np.float32)
         made[f"layers.{i}.bias"] = (0.2 * rng.normal(size=rows)).astype(np.float32)
-        if i in values.get("normalised", ()):
+        if i in values.get("normalized", ()):
             made[f"norms.{i}.weight"] = rng.uniform(0.5, 1.5, rows).astype(np.float32)
             made[f"norms.{i}.bias"] = (0.2 * rng.normal(size=rows)).astype(np.float32)
         columns = rows
@@ -85,7 +85,7 @@ def slowly(values: dict[str, Any], stored: dict[str, Array], point: Array) -> fl
         if i in values.get("input_at", ()):
             h = np.concatenate((h, inputs))
         h = stored[f"layers.{i}.weight"].astype(np.float64) @ h + stored[f"layers.{i}.bias"]
-        if i in values.get("normalised", ()):
+        if i in values.get("normalized", ()):
             h = (h - h.mean()) / np.sqrt(h.var() + 1e-5) * stored[f"norms.{i}.weight"] + stored[f"norms.{i}.bias"]
         if i < 4:
             h = activations[values["activation"]](h)
@@ -131,11 +131,11 @@ def test_is_an_sdf_field_that_survives_its_file(case: str, tmp_path: Path) -> No
 
 
 def without(name: str) -> dict[str, Array]:
-    return {key: array for key, array in tensors(CASES["normalised"]).items() if key != name}
+    return {key: array for key, array in tensors(CASES["normalized"]).items() if key != name}
 
 
 def cut(name: str) -> dict[str, Array]:
-    return tensors(CASES["normalised"]) | {name: tensors(CASES["normalised"])[name][:-1]}
+    return tensors(CASES["normalized"]) | {name: tensors(CASES["normalized"])[name][:-1]}
 
 
 @pytest.mark.parametrize(
@@ -147,18 +147,18 @@ def cut(name: str) -> dict[str, Array]:
         ({}, cut("norms.1.bias")),
         ({}, cut("layers.2.weight")),
         ({}, cut("layers.3.bias")),
-        ({"input_at": []}, tensors(CASES["normalised"])),
-        ({"input_at": [0, 2]}, tensors(CASES["normalised"])),
-        ({"input_at": [2, 5]}, tensors(CASES["normalised"])),
-        ({"normalised": [0, 1, 4]}, tensors(CASES["normalised"])),
-        ({"normalised": [0, 1]}, tensors(CASES["normalised"])),
-        ({"positional_encoding": {"degree": 1}}, tensors(CASES["normalised"])),
+        ({"input_at": []}, tensors(CASES["normalized"])),
+        ({"input_at": [0, 2]}, tensors(CASES["normalized"])),
+        ({"input_at": [2, 5]}, tensors(CASES["normalized"])),
+        ({"normalized": [0, 1, 4]}, tensors(CASES["normalized"])),
+        ({"normalized": [0, 1]}, tensors(CASES["normalized"])),
+        ({"positional_encoding": {"degree": 1}}, tensors(CASES["normalized"])),
         ({}, {}),
     ],
 )
 def test_tensors_that_do_not_fit(changes: dict[str, Any], stored: dict[str, Array], tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError) as caught:
-        write_safe_field(tmp_path / "f", description(**CASES["normalised"] | changes), stored)
+        write_safe_field(tmp_path / "f", description(**CASES["normalized"] | changes), stored)
     assert caught.value.reason == "FIELD_SHAPES_MISMATCH"
 
 

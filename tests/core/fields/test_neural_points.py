@@ -32,7 +32,7 @@ def description(**changes: Any) -> dict[str, Any]:
         "buffer_size": 50_000_000,
         "reach": REACH,
         "max_distance": MOST,
-        "neighbours": 6,
+        "neighbors": 6,
         "blend_first": True,
         "oriented": False,
     }
@@ -87,7 +87,7 @@ class Slow:
             distance = float(np.linalg.norm(place - self.p["points"][row]))
             if distance <= MOST:
                 found.append((distance, row))
-        return sorted(found)[: self.values["neighbours"]]
+        return sorted(found)[: self.values["neighbors"]]
 
     def decode(self, features: Array) -> float:
         hidden = np.maximum(self.p["layers.0.weight"] @ features + self.p["layers.0.bias"], 0.0)
@@ -116,7 +116,7 @@ CASES: dict[str, dict[str, Any]] = {
     "turned": {"oriented": True},
     "turned, decoded first": {"oriented": True, "blend_first": False},
     "a buffer too small": {"buffer_size": 97},
-    "two neighbours": {"neighbours": 2},
+    "two neighbors": {"neighbors": 2},
 }
 
 
@@ -132,7 +132,7 @@ def test_values_and_gradients_are_those_of_a_slow_evaluation(case: str) -> None:
     expected = np.array([slow(place) for place in places])
     slopes = np.array([numeric_gradient(slow, place) for place in places])
     np.testing.assert_allclose(distance.numpy()[known], expected[known], rtol=0, atol=2e-5)
-    # A kink of the network, or a change of neighbours, may lie between the two ends of a difference.
+    # A kink of the network, or a change of neighbors, may lie between the two ends of a difference.
     wrong = np.abs(gradient.numpy() - slopes).max(axis=1)[known] > 2e-3
     assert wrong.mean() < 0.05
 

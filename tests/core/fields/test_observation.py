@@ -76,9 +76,9 @@ def test_a_file_keeps_it(tmp_path: Path) -> None:
     assert read_description(path)["observation"]["counts"] == [3, 2, 4]
     seen = observation_of(open_field(path))
     assert seen is not None
-    centres = torch.cartesian_prod(*(torch.arange(n) + 0.5 for n in GRID.counts)) * GRID.voxel + torch.tensor(GRID.low)
+    centers = torch.cartesian_prod(*(torch.arange(n) + 0.5 for n in GRID.counts)) * GRID.voxel + torch.tensor(GRID.low)
     # The grid is told in the function's coordinates; the field's are twice as large.
-    np.testing.assert_array_equal(seen.at(2.0 * centres).numpy(), some_states().ravel())
+    np.testing.assert_array_equal(seen.at(2.0 * centers).numpy(), some_states().ravel())
 
 
 @pytest.mark.parametrize(

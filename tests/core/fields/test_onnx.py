@@ -18,7 +18,7 @@ from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.description import description_to_dict, parse_description
 from regnf_core.schema.kinds.onnx_operators import OPERATORS, SHAPE_ONLY
-from tests.core.importing.onnx_models import Initialisers, model, nodes, sphere
+from tests.core.importing.onnx_models import Initializers, model, nodes, sphere
 
 RNG = np.random.default_rng(0)
 W = RNG.normal(size=(3, 5)).astype(np.float32)
@@ -81,10 +81,10 @@ BINARY = {
     op: (f"h = {op} x row" + SUM, {"row": W[:, 0]})
     for op in ("Add", "Sub", "Mul", "Div", "Max", "Min", "Sum", "Mean", "PRelu")
 }
-REDUCTIONS: dict[str, tuple[str, Initialisers]] = {
+REDUCTIONS: dict[str, tuple[str, Initializers]] = {
     op: (f"y = {op} x axes keepdims:1", {}) for op in OPERATORS if op.startswith("Reduce")
 }
-GRAPHS: dict[str, tuple[str, Initialisers]] = {
+GRAPHS: dict[str, tuple[str, Initializers]] = {
     **BINARY,
     **REDUCTIONS,
     "Pow": ("h = Pow x two" + SUM, {"two": scalar(2.0)}),
@@ -174,8 +174,8 @@ GRAPHS: dict[str, tuple[str, Initialisers]] = {
 
 @pytest.mark.parametrize("name", GRAPHS)
 def test_graphs_agree_with_onnxruntime(name: str) -> None:
-    text, initialisers = GRAPHS[name]
-    agrees(model(text, initialisers | {"axes": AXES}))
+    text, initializers = GRAPHS[name]
+    agrees(model(text, initializers | {"axes": AXES}))
 
 
 def test_constants_with_values_of_their_own() -> None:
@@ -195,8 +195,8 @@ def test_every_operator_is_tried() -> None:
 
 
 def test_the_gradient_is_the_slope() -> None:
-    text, initialisers = GRAPHS["Gemm"]
-    field = field_of(model("z = Sin x;" + text.replace("Gemm x", "Gemm z"), initialisers))
+    text, initializers = GRAPHS["Gemm"]
+    field = field_of(model("z = Sin x;" + text.replace("Gemm x", "Gemm z"), initializers))
     at, step = points(50).double(), 1e-3
     distance, gradient = field.signed_distance_and_gradient(at)
     torch.testing.assert_close(distance, field.signed_distance(at))
@@ -234,7 +234,7 @@ def test_other_precisions_are_evaluated_in_single() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "initialisers"),
+    ("text", "initializers"),
     [
         ("y = MatMul x w", {"w": W[:2, :1]}),
         ("y = MatMul x w", {"w": W}),  # five numbers a point
@@ -247,8 +247,8 @@ def test_other_precisions_are_evaluated_in_single() -> None:
         ("h = Cast x to:8" + SUM, {"axes": AXES}),  # text
     ],
 )
-def test_graphs_that_contradict_themselves(text: str, initialisers: Initialisers) -> None:
-    field = field_of(model(text, initialisers, made=None))
+def test_graphs_that_contradict_themselves(text: str, initializers: Initializers) -> None:
+    field = field_of(model(text, initializers, made=None))
     with pytest.raises(FieldFormatError) as caught:
         field.signed_distance(points(2000) * 50)
     assert caught.value.reason == "ONNX_GRAPH_INVALID"

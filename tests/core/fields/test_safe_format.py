@@ -111,7 +111,7 @@ def without_tensor(name: str) -> Tensors:
         with_tensor("layers.1.bias", tensors()["layers.1.bias"][:-1]),
         with_tensor("layers.2.weight", tensors()["layers.2.weight"][:0]),
         with_tensor("layers.1.weight", tensors()["layers.1.weight"][0, 0]),
-        with_tensor("colour.weight", tensors()["layers.1.weight"]),
+        with_tensor("color.weight", tensors()["layers.1.weight"]),
         without_tensor("hash_table"),
         without_tensor("layers.1.bias"),
         without_tensor("layers.1.weight"),

@@ -69,7 +69,7 @@ def test_mssd_by_hand() -> None:
     # Half a turn carries each corner of the square to the opposite one, a diagonal (2 sqrt 2) away.
     assert mssd(turn_z(math.pi), Sim3.identity(), SQUARE) == pytest.approx(2 * math.sqrt(2))
     assert mssd(turn_z(math.pi), Sim3.identity(), SQUARE, HALF_TURN) == pytest.approx(0.0, abs=1e-12)
-    # A scale too large by a quarter puts the corners, sqrt 2 from the centre, at 1 / 1.25 of that.
+    # A scale too large by a quarter puts the corners, sqrt 2 from the center, at 1 / 1.25 of that.
     assert mssd(turn_z(0, 1.25), Sim3.identity(), SQUARE) == pytest.approx(0.2 * math.sqrt(2))
 
 

@@ -18,9 +18,9 @@ LEVELS, FEATURES = 16, 2
 Change = Callable[[dict[str, Any]], None]
 
 
-def write_full_size_checkpoint(path: Path, log2_size: int = 19, optimiser: bool = True) -> None:
+def write_full_size_checkpoint(path: Path, log2_size: int = 19, optimizer: bool = True) -> None:
     """A checkpoint of a real run's size: 2^log2_size entries a level, 256 wide; with Adam's state about 150 MB."""
-    torch.save(checkpoint(log2_size, hidden=256, optimiser=optimiser), path)
+    torch.save(checkpoint(log2_size, hidden=256, optimizer=optimizer), path)
 
 
 def write_small_checkpoint(
@@ -39,7 +39,7 @@ def write_small_checkpoint(
 
 
 def checkpoint(
-    log2_size: int = 8, hidden: int = 64, radius: float = 0.5, prefix: str = "_model.field.", optimiser: bool = True
+    log2_size: int = 8, hidden: int = 64, radius: float = 0.5, prefix: str = "_model.field.", optimizer: bool = True
 ) -> dict[str, Any]:
     """The dictionary that sdfstudio's trainer saves."""
     field = {prefix + name: value for name, value in field_state(log2_size, hidden, radius).items()}
@@ -51,14 +51,14 @@ def checkpoint(
     return {
         "step": 30000,
         "pipeline": pipeline,
-        "optimizers": {"fields": _adam(list(field.values()), rate)} if optimiser else {},
+        "optimizers": {"fields": _adam(list(field.values()), rate)} if optimizer else {},
         "schedulers": {"fields": {"base_lrs": [5e-4], "last_epoch": 30000, "_last_lr": [rate]}},
         "scalers": {"scale": 65536.0, "growth_factor": 2.0},
     }
 
 
 def field_state(log2_size: int, hidden: int, radius: float) -> dict[str, Tensor]:
-    """The field's own tensors: a geometric initialisation (Atzmon and Lipman 2020), so a sphere, and some noise."""
+    """The field's own tensors: a geometric initialization (Atzmon and Lipman 2020), so a sphere, and some noise."""
     generator = torch.Generator().manual_seed(7)
 
     def normal(rows: int, columns: int, mean: float, deviation: float) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-Initialisers = dict[str, np.ndarray[Any, Any]]
+Initializers = dict[str, np.ndarray[Any, Any]]
 N = "n"
 
 
@@ -31,7 +31,7 @@ def _node(line: str) -> onnx.NodeProto:
 
 def model(
     body: str | Sequence[onnx.NodeProto],
-    initialisers: Initialisers | None = None,
+    initializers: Initializers | None = None,
     given: Sequence[int | str] | None = (N, 3),
     made: Sequence[int | str] | None = (N, 1),
     opset: int = 20,
@@ -43,7 +43,7 @@ def model(
         "field",
         [helper.make_tensor_value_info("x", kind, given)],
         [helper.make_tensor_value_info("y", TensorProto.FLOAT, made)],
-        [numpy_helper.from_array(values, name) for name, values in (initialisers or {}).items()],
+        [numpy_helper.from_array(values, name) for name, values in (initializers or {}).items()],
     )
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=10)
 

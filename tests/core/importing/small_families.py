@@ -41,8 +41,8 @@ def linear(rng: np.random.Generator, rows: int, columns: int) -> tuple[Array, Ar
     return weight.astype(np.float32).astype(np.float64), (0.1 * rng.normal(size=rows)).astype(np.float32).astype(float)
 
 
-def normalised(name: str, weight: Array, bias: Array) -> dict[str, torch.Tensor]:
-    """A layer's three tensors under weight normalisation, the direction of some other length than 1."""
+def normalized(name: str, weight: Array, bias: Array) -> dict[str, torch.Tensor]:
+    """A layer's three tensors under weight normalization, the direction of some other length than 1."""
     return {
         f"{name}.bias": torch.from_numpy(bias).float(),
         f"{name}.weight_g": torch.from_numpy(np.linalg.norm(weight, axis=1, keepdims=True)).float(),
@@ -54,7 +54,7 @@ def plain(name: str, weight: Array, bias: Array) -> dict[str, torch.Tensor]:
     return {f"{name}.weight": torch.from_numpy(weight).float(), f"{name}.bias": torch.from_numpy(bias).float()}
 
 
-def centred(function: Function, last_bias: Array) -> None:
+def centered(function: Function, last_bias: Array) -> None:
     """Shift the last layer's bias so that about half of [-1, 1]^3 is inside: every sample has a surface."""
     points = _rng(1).uniform(-1.0, 1.0, (101, 3))
     last_bias[0] -= np.median([function(point) for point in points])
@@ -82,10 +82,10 @@ def neus(skip: int = 3, multires: int = 3) -> Sample:
                 h = softplus(h)
         return float(h[0])
 
-    centred(function, layers[-1][1])
+    centered(function, layers[-1][1])
     state = OrderedDict[str, torch.Tensor]()
     for i, (weight, bias) in enumerate(layers):
-        state |= normalised(f"lin{i}", weight, bias)
+        state |= normalized(f"lin{i}", weight, bias)
     beside = {"variance_network_fine": {"variance": torch.ones(())}, "iter_step": 300_000}
     return Sample(
         {"sdf_network_fine": state, "variance_network_fine": {"variance": torch.ones(())}, **beside}, function
@@ -107,7 +107,7 @@ def siren() -> Sample:
             h = np.sin(30.0 * (weight @ h + bias))
         return float((layers[-1][0] @ h + layers[-1][1])[0])
 
-    centred(function, layers[-1][1])
+    centered(function, layers[-1][1])
     state = OrderedDict[str, torch.Tensor]()
     for i, (weight, bias) in enumerate(layers):
         state |= plain(f"net.net.{i}.0", weight, bias)
@@ -142,10 +142,10 @@ def deepsdf(
         return math.tanh(h[0])
 
     layers[-1][1][0] = np.float32(-0.3)
-    centred(lambda x: math.atanh(function(x)), layers[-1][1])
+    centered(lambda x: math.atanh(function(x)), layers[-1][1])
     state = OrderedDict[str, torch.Tensor]()
     for i, (weight, bias) in enumerate(layers):
-        state |= (normalised if weight_norm and i < 4 else plain)(f"module.lin{i}", weight, bias)
+        state |= (normalized if weight_norm and i < 4 else plain)(f"module.lin{i}", weight, bias)
         if not weight_norm and i < 4:
             gain, shift = norms[i]
             state |= {f"module.bn{i}.weight": torch.from_numpy(gain).float()}
@@ -171,7 +171,7 @@ def _gridded(
         h = softplus(layers[0][0] @ h + layers[0][1])
         return float((layers[1][0] @ h + layers[1][1])[0])
 
-    centred(function, layers[1][1])
+    centered(function, layers[1][1])
     return function, table, layers
 
 
@@ -186,7 +186,7 @@ def instant_nsr_pl(step: int = 20_000, progressive: bool = False) -> Sample:
     state = OrderedDict({name: torch.from_numpy(table).float().flatten()})
     state["model.scene_aabb"] = torch.tensor([-1.5] * 3 + [1.5] * 3)
     for i, (weight, bias) in enumerate(layers):
-        state |= normalised(f"model.geometry.network.layers.{2 * i}", weight, bias)
+        state |= normalized(f"model.geometry.network.layers.{2 * i}", weight, bias)
     state["model.texture.network.params"] = torch.ones(4)
     return Sample({"state_dict": state, "epoch": 0, "global_step": step}, function)
 
@@ -201,8 +201,8 @@ def neuralangelo(iteration: int = 500_000, first_levels: int = 4) -> Sample:
     closed = sum(grid.level_entries()[:active])
     table[closed:] = _rng(9).uniform(-1e-4, 1e-4, table[closed:].shape)
     state = OrderedDict({"module.neural_sdf.tcnn_encoding.params": torch.from_numpy(table).float().flatten()})
-    state |= normalised("module.neural_sdf.mlp.linears.0", *layers[0])
-    state |= normalised("module.neural_sdf.mlp.linears.1", np.ones((4, 12)), np.zeros(4))
+    state |= normalized("module.neural_sdf.mlp.linears.0", *layers[0])
+    state |= normalized("module.neural_sdf.mlp.linears.1", np.ones((4, 12)), np.zeros(4))
     state |= plain("module.neural_sdf.mlp.linear_sdf", layers[1][0][:1], layers[1][1][:1])
     state["module.s_var"] = torch.ones(())
     return Sample({"model": state, "optim": {}, "epoch": 1, "iteration": iteration}, function)

@@ -110,7 +110,7 @@ def test_what_the_uploader_says_goes_before(tmp_path: Path) -> None:
         ({"sdf": np.where(BALL > 0.5, np.nan, BALL), "origin": LOW, "spacing": SPACING}, "TENSOR_NOT_FINITE"),
         ({"sdf": np.array([{}]), "origin": LOW, "spacing": SPACING}, "NPY_OBJECT_ARRAY"),
         ({"sdf": np.abs(BALL) + 1, "origin": LOW, "spacing": SPACING}, "NO_ZERO_LEVEL"),
-        ({"occupancy": BALL}, "FIELD_NOT_RECOGNISED"),
+        ({"occupancy": BALL}, "FIELD_NOT_RECOGNIZED"),
     ],
 )
 def test_what_breaks_the_convention_is_refused(tmp_path: Path, arrays: dict[str, Any], reason: str) -> None:

@@ -1,4 +1,4 @@
-"""Small checkpoints of every family: recognised without a hint, and evaluated as their papers say."""
+"""Small checkpoints of every family: recognized without a hint, and evaluated as their papers say."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def assert_is(folder: Path, function: small.Function, scale: float = 1.0, sign: 
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_recognised_and_evaluated(case: str, tmp_path: Path) -> None:
+def test_recognized_and_evaluated(case: str, tmp_path: Path) -> None:
     family, make, description = CASES[case]
     sample = make()
     report = imported(tmp_path, sample.checkpoint, **description)
@@ -115,7 +115,7 @@ def test_codes_saved_as_a_tensor(tmp_path: Path, shape: tuple[int, ...]) -> None
     [
         ("latent_codes", {}, "LATENT_MISSING"),
         ("latent_codes", {"latent_index": 1}, "LATENT_MISSING"),
-        ("model_state_dict", {}, "FIELD_NOT_RECOGNISED"),
+        ("model_state_dict", {}, "FIELD_NOT_RECOGNIZED"),
         ("epoch", {"latent_index": 3}, "INVALID_DESCRIPTION"),
         ("epoch", {"latent": [0.0] * 4}, "INVALID_DESCRIPTION"),
         ("epoch", {"latent": [0.0] * 5, "latent_index": 0}, "INVALID_DESCRIPTION"),
@@ -226,7 +226,7 @@ def test_faulty_weights_are_refused(
 ) -> None:
     values = make().checkpoint
     change(values)
-    reason = {"HASH_GRID": "HASH_GRID_NOT_RECOGNISED"}.get(reason, reason)
+    reason = {"HASH_GRID": "HASH_GRID_NOT_RECOGNIZED"}.get(reason, reason)
     assert_refused(lambda: imported(tmp_path, values), reason)
     assert not (tmp_path / FIELD_NAME).exists()
 

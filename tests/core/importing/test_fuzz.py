@@ -66,7 +66,7 @@ opcodes = st.one_of(
 @cache
 def sound_archive() -> bytes:
     buffer = io.BytesIO()
-    torch.save(checkpoint(log2_size=8, hidden=8, optimiser=False), buffer)
+    torch.save(checkpoint(log2_size=8, hidden=8, optimizer=False), buffer)
     return buffer.getvalue()
 
 

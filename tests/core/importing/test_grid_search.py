@@ -21,7 +21,7 @@ def only(parameters: int, width: int, **wanted: Any) -> HashGridConfig:
     return config
 
 
-def test_the_published_sizes_are_recognised() -> None:
+def test_the_published_sizes_are_recognized() -> None:
     """12 196 240 and 446 837 120 are what tiny-cuda-nn reports for neus-facto's and angelo's grids."""
     facto = only(12_196_240, 32)
     assert (facto.levels, facto.features_per_level, facto.log2_table_size) == (16, 2, 19)
@@ -74,9 +74,9 @@ def test_the_description_narrows_the_search() -> None:
 
 
 def test_no_usual_grid_is_a_refusal() -> None:
-    assert_refused(lambda: find(12_196_241, 32), "HASH_GRID_NOT_RECOGNISED")
-    assert_refused(lambda: find(12_196_240, 33), "HASH_GRID_NOT_RECOGNISED")
-    assert_refused(lambda: find(2, 1_000_000), "HASH_GRID_NOT_RECOGNISED")
+    assert_refused(lambda: find(12_196_241, 32), "HASH_GRID_NOT_RECOGNIZED")
+    assert_refused(lambda: find(12_196_240, 33), "HASH_GRID_NOT_RECOGNIZED")
+    assert_refused(lambda: find(2, 1_000_000), "HASH_GRID_NOT_RECOGNIZED")
 
 
 def test_levels_that_grow_faster_than_a_field_file_may_say_are_not_tried() -> None:

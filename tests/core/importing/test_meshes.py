@@ -72,7 +72,7 @@ def test_a_scene_graph_is_merged_at_its_poses() -> None:
 
 
 def test_binary_ply_with_everything_else_in_it() -> None:
-    """Big-endian, polygons of three, four and five corners, colours, another element before and one behind."""
+    """Big-endian, polygons of three, four and five corners, colors, another element before and one behind."""
     header = (
         "ply\r\nformat binary_big_endian 1.0\r\nelement note 2\r\nproperty list uchar short words\r\n"
         "element vertex 8\r\nproperty uchar red\r\nproperty double x\r\nproperty double y\r\nproperty double z\r\n"
@@ -92,7 +92,7 @@ def test_binary_ply_with_everything_else_in_it() -> None:
 
 def test_obj_counts_from_either_end_and_passes_over_the_rest() -> None:
     text = (
-        "# a tetrahedron\nmtllib colours.mtl\nv 0 0 0 1.0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\n"
+        "# a tetrahedron\nmtllib colors.mtl\nv 0 0 0 1.0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nusemtl red\n"
         "v 0 0 1\nf 1/1 3/1/1 2//1\nf -4 -3 \\\n -1\nf 2 3 4\nf 1 4 3\n"
     )
     found = converted(text.encode())

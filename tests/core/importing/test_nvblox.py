@@ -24,7 +24,7 @@ from tests.core.fields.grids import slow_trilinear
 from tests.core.importing.archives import assert_refused, patched
 
 SIZE, RADIUS, CUT = 0.05, 0.6, 0.2
-CENTRE = np.array([0.1, -0.2, 0.05])
+CENTER = np.array([0.1, -0.2, 0.05])
 TABLES = """
 CREATE TABLE tsdf_layer_metadata (param_name TEXT PRIMARY KEY, value_string TEXT, value_int INT, value_float REAL);
 CREATE TABLE tsdf_layer_data (index_x INT, index_y INT, index_z INT, data BLOB, UNIQUE (index_x, index_y, index_z));
@@ -34,7 +34,7 @@ CREATE TABLE color_layer_data (index_x INT, index_y INT, index_z INT, data BLOB)
 
 
 def true_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.norm(points - CENTRE, axis=-1) - RADIUS)
+    return np.asarray(np.linalg.norm(points - CENTER, axis=-1) - RADIUS)
 
 
 def ball_blocks() -> list[tuple[int, int, int, bytes]]:
@@ -74,7 +74,7 @@ def test_a_map_of_a_ball_through_the_gate(tmp_path: Path) -> None:
     rng = np.random.default_rng(8)
     direction = rng.normal(size=(80, 3))
     reach = RADIUS + SIZE * rng.uniform(-1, 1, (80, 1))
-    points = CENTRE + reach * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    points = CENTER + reach * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(points))
     expected = [
         slow_trilinear(lambda node: float(true_distance(SIZE * (np.array(node) + 0.5))), point / SIZE - 0.5)
@@ -159,8 +159,8 @@ def test_other_databases_are_refused(tmp_path: Path, more: str, reason: str) -> 
 
 def test_layers_of_other_things_are_told_apart(tmp_path: Path) -> None:
     for name, (drop, reason) in {
-        "colour": ("DROP TABLE tsdf_layer_data; DROP TABLE tsdf_layer_metadata;", "FAMILY_NOT_SUPPORTED"),
-        "none": ("DROP TABLE tsdf_layer_data; DROP TABLE color_layer_data;", "FIELD_NOT_RECOGNISED"),
+        "color": ("DROP TABLE tsdf_layer_data; DROP TABLE tsdf_layer_metadata;", "FAMILY_NOT_SUPPORTED"),
+        "none": ("DROP TABLE tsdf_layer_data; DROP TABLE color_layer_data;", "FIELD_NOT_RECOGNIZED"),
     }.items():
         connection = sqlite3.connect(tmp_path / name)
         connection.executescript(TABLES + drop)

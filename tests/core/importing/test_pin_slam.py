@@ -84,7 +84,7 @@ def test_what_the_settings_say_is_followed(tmp_path: Path) -> None:
 
     converted(tmp_path, floor(change))
     description = read_description(tmp_path / FIELD_NAME)
-    assert (description["oriented"], description["blend_first"], description["neighbours"]) == (True, False, 4)
+    assert (description["oriented"], description["blend_first"], description["neighbors"]) == (True, False, 4)
     assert (description["reach"], description["cell_size"], description["buffer_size"]) == (2.5, 0.3, 1000)
     assert description["max_distance"] == pytest.approx(3**0.5 * 3 * 0.3)
     distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.tensor([[0.4, 0.7, 0.2]]))
@@ -141,7 +141,7 @@ def test_maps_that_are_not_understood_are_refused(tmp_path: Path, change: Any, r
 
 
 def test_the_reference_map_is_reproduced(tmp_path: Path) -> None:
-    """About one point in a hundred may lie where the nearest neighbours change."""
+    """About one point in a hundred may lie where the nearest neighbors change."""
     folder = dev_data("formats", "pin_slam")
     (path,) = folder.rglob("pin_map.pth")
     report = convert_file(path, tmp_path, None, ImportLimits())

@@ -65,7 +65,7 @@ def test_sdfstudio_through_the_gate(tmp_path: Path) -> None:
         ("neuralangelo", None),
     ],
 )
-def test_every_variant_is_recognised_and_reproduced(
+def test_every_variant_is_recognized_and_reproduced(
     tmp_path: Path, family: str, description: dict[str, Any] | None
 ) -> None:
     folder = dev_data("formats", family)
@@ -132,7 +132,7 @@ def test_deepsdf_s_network_and_codes_in_one_file(tmp_path: Path, codes: str, ind
     assert_reproduces(tmp_path / FIELD_NAME, folder)
 
 
-@pytest.mark.parametrize(("file", "reason"), [("network", "LATENT_MISSING"), ("codes", "FIELD_NOT_RECOGNISED")])
+@pytest.mark.parametrize(("file", "reason"), [("network", "LATENT_MISSING"), ("codes", "FIELD_NOT_RECOGNIZED")])
 def test_half_of_deepsdf_is_refused(tmp_path: Path, file: str, reason: str) -> None:
     with pytest.raises(FieldFormatError) as caught:
         convert_file(deepsdf_run()[1][file], tmp_path, None, ImportLimits())

@@ -48,7 +48,7 @@ def test_only_the_distance_is_kept() -> None:
     np.testing.assert_array_equal(converted.tensors["hash_table"], table)
 
 
-def test_weight_normalisation_is_folded_in() -> None:
+def test_weight_normalization_is_folded_in() -> None:
     def scale(pipeline: dict[str, Any]) -> None:
         pipeline[F + "glin0.weight_v"] *= 3.0
         pipeline[F + "glin0.weight_g"] *= 2.0
@@ -181,7 +181,7 @@ class _Odd:
         (put("glin1.bias", torch.ones(65)), "TENSOR_SHAPE"),
         (put("aabb", torch.ones(6)), "TENSOR_SHAPE"),
         (put("encoding.params", torch.ones(8192, 1)), "TENSOR_SHAPE"),
-        (put("encoding.params", torch.ones(8190)), "HASH_GRID_NOT_RECOGNISED"),
+        (put("encoding.params", torch.ones(8190)), "HASH_GRID_NOT_RECOGNIZED"),
         (put("glin0.weight_v", torch.zeros(64, 71)), "TENSOR_NOT_FINITE"),
         (put("glin1.bias", torch.full((64,), float("nan"))), "TENSOR_NOT_FINITE"),
         (put("glin1.bias", torch.ones(64, dtype=torch.int64)), "TENSOR_DTYPE"),
@@ -210,16 +210,16 @@ def test_odd_objects_beside_the_weights_do_no_harm() -> None:
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({}, "FIELD_NOT_RECOGNISED"),
-        ([1, 2], "FIELD_NOT_RECOGNISED"),
-        ({"pipeline": {}}, "FIELD_NOT_RECOGNISED"),
-        ({"pipeline": [1]}, "FIELD_NOT_RECOGNISED"),
-        ({"pipeline": {F + "encoding.params": torch.ones(8)}}, "FIELD_NOT_RECOGNISED"),
+        ({}, "FIELD_NOT_RECOGNIZED"),
+        ([1, 2], "FIELD_NOT_RECOGNIZED"),
+        ({"pipeline": {}}, "FIELD_NOT_RECOGNIZED"),
+        ({"pipeline": [1]}, "FIELD_NOT_RECOGNIZED"),
+        ({"pipeline": {F + "encoding.params": torch.ones(8)}}, "FIELD_NOT_RECOGNIZED"),
         ({"pipeline": _Odd()}, "UNSAFE_GLOBAL_IN_WEIGHTS"),
         (_Odd(), "UNSAFE_GLOBAL_IN_WEIGHTS"),
         ({"neural_points": 1}, "FAMILY_NOT_SUPPORTED"),
         ({"model": {"encoder.embeddings": 1}}, "FAMILY_NOT_SUPPORTED"),
-        ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FIELD_NOT_RECOGNISED"),
+        ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FIELD_NOT_RECOGNIZED"),
     ],
 )
 def test_other_files_are_refused(values: object, reason: str) -> None:

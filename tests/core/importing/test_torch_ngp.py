@@ -139,7 +139,7 @@ def test_the_trainers_own_kernel(tmp_path: Path) -> None:
     torch.testing.assert_close(field.to("cpu").signed_distance(points), field.signed_distance(points))
 
 
-def test_a_ball_is_recognised_without_a_word(tmp_path: Path) -> None:
+def test_a_ball_is_recognized_without_a_word(tmp_path: Path) -> None:
     report = converted(tmp_path, own_checkpoint(ball=True))
     assert report["warnings"] == []
     assert read_description(tmp_path / FIELD_NAME)["hash"]["base_resolution"] == BASE
@@ -199,8 +199,8 @@ def test_unusual_grids_and_networks_are_refused(tmp_path: Path) -> None:
     checkpoint = own_checkpoint()
     checkpoint["model"]["encoder.offsets"] = torch.tensor(np.concatenate(([0], np.cumsum(sizes))))
     checkpoint["model"]["encoder.embeddings"] = torch.zeros(int(sizes.sum()), 2)
-    assert_refused(lambda: converted(tmp_path, checkpoint), "HASH_GRID_NOT_RECOGNISED")
+    assert_refused(lambda: converted(tmp_path, checkpoint), "HASH_GRID_NOT_RECOGNIZED")
     for name in ("encoder.params", "backbone.params"):
         odd = tcnn_checkpoint()
         odd["model"][name] = torch.zeros(1234)
-        assert_refused(lambda odd=odd: converted(tmp_path, odd), "HASH_GRID_NOT_RECOGNISED")
+        assert_refused(lambda odd=odd: converted(tmp_path, odd), "HASH_GRID_NOT_RECOGNIZED")

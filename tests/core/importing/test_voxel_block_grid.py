@@ -18,11 +18,11 @@ from tests.core.importing.archives import assert_refused
 from tests.devdata import dev_data
 
 EDGE, SIZE, RADIUS = 8, 0.05, 0.6
-CENTRE = np.array([0.1, -0.2, 0.05])
+CENTER = np.array([0.1, -0.2, 0.05])
 
 
 def true_distance(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.norm(points - CENTRE, axis=-1) - RADIUS)
+    return np.asarray(np.linalg.norm(points - CENTER, axis=-1) - RADIUS)
 
 
 def ball(voxels: float = 4.0, **changes: Any) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def near_surface(count: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(8)
     direction = rng.normal(size=(count, 3))
     reach = RADIUS + SIZE * rng.uniform(-1, 1, (count, 1))
-    points: NDArray[np.float64] = CENTRE + reach * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    points: NDArray[np.float64] = CENTER + reach * direction / np.linalg.norm(direction, axis=1, keepdims=True)
     return points
 
 
@@ -77,7 +77,7 @@ def test_the_truncation_is_told_by_the_slope_and_voxels_lie_where_they_should(tm
         slow_trilinear(lambda node: float(true_distance(SIZE * np.array(node))), point / size) for point in points
     ]
     np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5)
-    outward = (points - CENTRE) / np.linalg.norm(points - CENTRE, axis=1, keepdims=True)
+    outward = (points - CENTER) / np.linalg.norm(points - CENTER, axis=1, keepdims=True)
     assert np.abs(gradient.numpy() - outward).max() < 0.1
 
 
@@ -113,7 +113,7 @@ def test_a_map_with_the_other_sign_is_filled_the_other_way(tmp_path: Path) -> No
 
 def test_the_uploader_may_tell_the_truncation(tmp_path: Path) -> None:
     converted(tmp_path, ball(4.0), {"truncation": 0.1, "world_scale": 10.0})
-    surface = torch.from_numpy(10.0 * (CENTRE + np.array([RADIUS + 0.05, 0.0, 0.0])))[None]
+    surface = torch.from_numpy(10.0 * (CENTER + np.array([RADIUS + 0.05, 0.0, 0.0])))[None]
     assert float(open_field(tmp_path / FIELD_NAME).signed_distance(surface)) == pytest.approx(0.25, abs=0.02)
 
 
@@ -139,7 +139,7 @@ def test_a_doubtful_truncation_is_warned_of(tmp_path: Path) -> None:
         ({"attr_name_tsdf": np.array([-1])}, "TENSOR_SHAPE"),
         ({"attr_name_tsdf": np.array([2])}, "TENSOR_SHAPE"),
         ({"attr_name_tsdf": np.array([7])}, "TENSOR_MISSING"),
-        ({"attr_name_tsdf": None}, "FIELD_NOT_RECOGNISED"),
+        ({"attr_name_tsdf": None}, "FIELD_NOT_RECOGNIZED"),
     ],
 )
 def test_faulty_maps_are_refused(tmp_path: Path, changes: dict[str, Any], reason: str) -> None:

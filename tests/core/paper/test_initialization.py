@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.errors import InitialisationError
+from regnf_core.errors import InitializationError
 from regnf_core.geometry.metrics import rotation_error
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import InitialisationOptions, SamplingOptions
+from regnf_core.options import InitializationOptions, SamplingOptions
 from regnf_core.paper.initialization import initial_transform
 from regnf_core.paper.sampling import sample_object, sample_scene
 from regnf_core.result import SurfaceSamples
 from regnf_core.surface.agreement import disagreement
 from tests.core.analytic import chair, chair_box, chair_pose, room
 
-OPTIONS = InitialisationOptions()
+OPTIONS = InitializationOptions()
 
 
 def clouds(scale: float) -> tuple[Sim3, SurfaceSamples, SurfaceSamples]:
@@ -52,7 +52,7 @@ def test_of_several_draws_the_one_the_fields_agree_with_is_kept() -> None:
         seen.append(score(candidate))
         return seen[-1]
 
-    chosen = initial_transform(A, B, InitialisationOptions(draws=6), 0, remember)
+    chosen = initial_transform(A, B, InitializationOptions(draws=6), 0, remember)
     assert len(seen) == 6
     assert score(chosen) == min(seen)
     assert rotation_error(chosen, T) < 0.5
@@ -61,7 +61,7 @@ def test_of_several_draws_the_one_the_fields_agree_with_is_kept() -> None:
 def test_too_small_a_cloud_gives_no_transform() -> None:
     _, A, B = clouds(1.0)
     few = SurfaceSamples(A.points[:5], A.normals[:5])
-    with pytest.raises(InitialisationError) as caught:
+    with pytest.raises(InitializationError) as caught:
         initial_transform(few, B, OPTIONS, seed=0)
     assert caught.value.reason == "NO_INITIAL_TRANSFORM"
 
@@ -69,7 +69,7 @@ def test_too_small_a_cloud_gives_no_transform() -> None:
 def test_clouds_of_wholly_different_size_give_no_transform() -> None:
     _, A, B = clouds(1.0)
     giant = SurfaceSamples(A.points * 40, A.normals)
-    with pytest.raises(InitialisationError):
+    with pytest.raises(InitializationError):
         initial_transform(giant, B, OPTIONS, seed=0)
 
 

@@ -1,4 +1,4 @@
-"""Barron's kernel: hand-computed values, limits, the normaliser by an independent quadrature, what learning does."""
+"""Barron's kernel: hand-computed values, limits, the normalizer by an independent quadrature, what learning does."""
 
 from __future__ import annotations
 

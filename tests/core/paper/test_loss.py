@@ -7,7 +7,7 @@ import torch
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.paper.kernel import AdaptiveKernel, log_partition, robust_kernel
-from regnf_core.paper.loss import SampleSet, bidirectional_loss, regulariser, residuals
+from regnf_core.paper.loss import SampleSet, bidirectional_loss, regularizer, residuals
 from tests.core.analytic import chair, chair_pose, room, sphere
 
 DOUBLED = Sim3.from_quaternion(2.0, [0, 0, 0, 1], [0.1, 0.0, 0.0])
@@ -23,10 +23,10 @@ def test_residuals_as_published_leave_out_the_scale() -> None:
     assert float(residuals(back, small, DOUBLED.inverse())) == pytest.approx(0.1, abs=1e-6)
 
 
-def test_regulariser_is_the_mean_squared_distance_to_the_nearest_sample() -> None:
+def test_regularizer_is_the_mean_squared_distance_to_the_nearest_sample() -> None:
     target = SampleSet.of(sphere(0.4), torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
     moved = torch.tensor([[0.1, 0.0, 0.0], [0.9, 0.2, 0.0]])
-    assert float(regulariser(moved, target)) == pytest.approx((0.01 + 0.05) / 2)
+    assert float(regularizer(moved, target)) == pytest.approx((0.01 + 0.05) / 2)
 
 
 def test_loss_is_the_sum_of_its_parts() -> None:
@@ -37,12 +37,12 @@ def test_loss_is_the_sum_of_its_parts() -> None:
     terms = bidirectional_loss(small, large, A, B, DOUBLED, kernel, 3.0)
     shape = kernel.shape.detach()
     kappa = [robust_kernel(r.double(), shape, 1.0).mean() for r in (terms.residuals_scene, terms.residuals_object)]
-    normaliser = log_partition(shape)  # log p = 0 at the start
-    expected = sum(kappa) + 2 * normaliser + 3.0 * terms.regulariser
+    normalizer = log_partition(shape)  # log p = 0 at the start
+    expected = sum(kappa) + 2 * normalizer + 3.0 * terms.regularizer
     assert float(terms.total.detach()) == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_gradient_reaches_every_learnt_number_and_is_right() -> None:
+def test_gradient_reaches_every_learned_number_and_is_right() -> None:
     # Balls off the origin: smooth fields, so that finite differences mean something, and no free rotation.
     scene, obj = sphere(0.2, (0.1, 0.2, 0.0)), sphere(0.3, (-0.1, 0.05, 0.1))
     generator = torch.Generator().manual_seed(0)

@@ -33,9 +33,9 @@ def trace(field: AnalyticField, origins: list[list[float]], directions: list[lis
 
 
 def test_cameras_stand_on_the_upper_half_sphere_and_apart() -> None:
-    centre = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
+    center = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
     for axis, number in (("x", 0), ("y", 1), ("z", 2)):
-        offsets = camera_positions(centre, 0.9, 5, axis) - centre
+        offsets = camera_positions(center, 0.9, 5, axis) - center
         torch.testing.assert_close(offsets.norm(dim=1), torch.full((5,), 0.9, dtype=torch.float64))
         torch.testing.assert_close(
             offsets[:, number], 0.9 * torch.tensor([0.9, 0.7, 0.5, 0.3, 0.1], dtype=torch.float64)
@@ -50,7 +50,7 @@ def test_every_corner_of_the_box_is_in_view_and_the_view_is_no_wider() -> None:
     rays = cast_rays(position, torch.zeros(3, dtype=torch.float64), corners, 512, 8)
     assert rays.directions.shape == (64 * 64, 3)
     torch.testing.assert_close(rays.directions.norm(dim=1), torch.ones(64 * 64))
-    # The nearest corner is 0.5 and 0.2 off the axis at depth 1; pixel centres reach 63/64 of the way.
+    # The nearest corner is 0.5 and 0.2 off the axis at depth 1; pixel centers reach 63/64 of the way.
     slopes = (rays.directions[:, :2] / -rays.directions[:, 2:]).abs().amax(0)
     torch.testing.assert_close(slopes, torch.full((2,), 0.5 * 63 / 64), rtol=1e-4, atol=0)
 
@@ -126,7 +126,7 @@ def test_the_ground_follows_the_up_axis() -> None:
 def test_an_object_smaller_than_its_bounds_is_found_and_filled() -> None:
     small = sphere(0.1, (0.6, -0.5, 0.4), bounds=[[-1, -1, -1], [1, 1, 1]])
     extent = surface_extent(small)
-    torch.testing.assert_close(extent.centre, torch.tensor([0.6, -0.5, 0.4], dtype=torch.float64), rtol=0, atol=0.02)
+    torch.testing.assert_close(extent.center, torch.tensor([0.6, -0.5, 0.4], dtype=torch.float64), rtol=0, atol=0.02)
     torch.testing.assert_close(extent.size, torch.full((3,), 0.2, dtype=torch.float64), rtol=0.15, atol=0)
     assert len(sample_object(small, OPTIONS).points) > 1000
 

@@ -52,13 +52,13 @@ def residuals(near: int, far: int, distance: float) -> torch.Tensor:
         (torch.tensor([0.0, 0, 0, 0, 0, math.nan]), residuals(5, 0, 0), "LARGE_RESIDUAL"),
     ],
 )
-def test_judgement_by_hand(forth: torch.Tensor, back: torch.Tensor, expected: str) -> None:
+def test_judgment_by_hand(forth: torch.Tensor, back: torch.Tensor, expected: str) -> None:
     judged = judge(forth, back)
     assert judged.reason == expected
     assert judged.verdict == ("registered" if expected == "SURFACES_AGREE" else "rejected")
 
 
-def test_the_numbers_of_a_judgement() -> None:
+def test_the_numbers_of_a_judgment() -> None:
     metrics = judge(residuals(9, 1, 0.1), residuals(8, 2, -0.1)).metrics
     assert metrics["inlier_share_scene"] == pytest.approx(0.9)
     assert metrics["inlier_share_object"] == pytest.approx(0.8)

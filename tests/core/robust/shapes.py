@@ -76,7 +76,7 @@ def reframed(scene_pose: Sim3, object_pose: Sim3) -> tuple[TransformedField, Tra
     """
     old = detection()
     box = OrientedBox(
-        scene_pose.apply(old.centre[None])[0], old.size * scene_pose.scale, scene_pose.rotation @ old.rotation
+        scene_pose.apply(old.center[None])[0], old.size * scene_pose.scale, scene_pose.rotation @ old.rotation
     )
     scene = TransformedField(room(chair_pose()), scene_pose.inverse())
     obj = TransformedField(chair(), object_pose.inverse())

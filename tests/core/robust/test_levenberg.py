@@ -9,7 +9,7 @@ import torch
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.poses import displacement, perturb
-from regnf_core.robust.refine.levenberg_marquardt import geman_mcclure_weights, minimise, robust_cost
+from regnf_core.robust.refine.levenberg_marquardt import geman_mcclure_weights, minimize, robust_cost
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.samples import sample_object_surface, some
 from tests.core.analytic import chair, seen_from
@@ -33,7 +33,7 @@ def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
     step = torch.randn(24, 7, generator=generator, dtype=torch.float64) * torch.tensor([0.12] * 3 + [0.04] * 3 + [0.08])
     start = perturb(Sim3(*(v.expand(24, *v.shape) for v in (T_work.scale, T_work.rotation, T_work.translation))), step)
     A, B = some(source.samples, 300, generator), some(target.samples, 300, generator)
-    refined = minimise(
+    refined = minimize(
         source.field, target.field, A, B, start, [0.1, 0.1, 0.08, 0.06, 0.04, 0.03, 0.02, 0.01, 0.01, 0.01]
     )
     left = displacement(refined.T, T_work, target.samples.points)
@@ -51,7 +51,7 @@ def test_no_iteration_raises_the_cost() -> None:
     )
     before = robust_cost(residuals(target.field, target.field, target.samples, target.samples, start), 0.05)
     costs = [before]
-    minimise(
+    minimize(
         target.field, target.field, target.samples, target.samples, start, [0.05] * 6,
         on_iteration=lambda _i, _T, _r, cost: costs.append(cost),
     )  # fmt: skip

@@ -110,7 +110,7 @@ def test_a_faulty_model_file_is_refused(tmp_path: Path, fault: str) -> None:
     tensors = load_file(path)
     metadata = {"regnf_object_model": "0" if fault == "version" else "1"}
     if fault == "name":
-        tensors["other"] = tensors.pop("centre")
+        tensors["other"] = tensors.pop("center")
     if fault == "shape":
         tensors["normals"] = tensors["normals"][:, :2].contiguous()
     if fault == "count":

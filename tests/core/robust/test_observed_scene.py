@@ -27,10 +27,10 @@ def observed(scene: AnalyticField, part: tuple[list[float], list[float]]) -> Obs
     low, high = scene.bounds
     counts = ((high - low) / _VOXEL).round().long().tolist()
     axes = [low[k] + (torch.arange(counts[k]) + 0.5) * _VOXEL for k in range(3)]
-    centres = torch.cartesian_prod(*axes)
-    value = scene.signed_distance(centres)
+    centers = torch.cartesian_prod(*axes)
+    value = scene.signed_distance(centers)
     states = torch.where(value.abs() < 0.9 * _VOXEL, SURFACE, torch.where(value > 0, FREE, UNSEEN))
-    hidden = seen_from(boxes([part]), chair_pose()).signed_distance(centres) < 0.9 * _VOXEL
+    hidden = seen_from(boxes([part]), chair_pose()).signed_distance(centers) < 0.9 * _VOXEL
     states[hidden] = UNSEEN
     return ObservedField(scene, Observation(states.to(torch.uint8).view(counts), low, _VOXEL))
 
@@ -41,7 +41,7 @@ def test_an_invented_part_hinders_only_those_who_believe_it() -> None:
     T = random_pose(3, 2.5)
     moved = TransformedField(observed(scene, _UNDER_THE_SEAT), T.inverse())
     box = detection()
-    box = type(box)(T.apply(box.centre[None])[0], box.size * T.scale, T.rotation @ box.rotation)
+    box = type(box)(T.apply(box.center[None])[0], box.size * T.scale, T.rotation @ box.rotation)
     result = register(moved, chair(), box, ROBUST)
     assert result.verdict == "registered"
     assert placement_error(result, chair_pose() @ T.inverse()) < 0.01

@@ -11,7 +11,7 @@ from regnf_core.robust.poses import perturb
 from regnf_core.robust.refine.levenberg_marquardt import (
     MOST_OFFSET,
     OFFSET_PRIOR,
-    minimise,
+    minimize,
     normal_equations,
     robust_cost,
     with_offset,
@@ -83,8 +83,8 @@ def test_a_thick_copy_keeps_its_scale() -> None:
         torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D),
     )
     widths = [0.05, 0.04, 0.03, 0.02, *[0.01] * 8]
-    without = minimise(source.field, target.field, source.samples, target.samples, start, widths, adaptive=True)
-    free = minimise(
+    without = minimize(source.field, target.field, source.samples, target.samples, start, widths, adaptive=True)
+    free = minimize(
         source.field, target.field, source.samples, target.samples, start, widths, adaptive=True,
         offset=torch.zeros(1, dtype=D),
     )  # fmt: skip

@@ -56,7 +56,7 @@ def test_a_cavity_within_matter_is_not_sampled() -> None:
 def test_floor_and_walls_are_told_from_the_chair_in_any_orientation() -> None:
     turn = random_pose(4, 1.0)
     old = detection()
-    box = OrientedBox(turn.apply(old.centre[None])[0], old.size, turn.rotation @ old.rotation)
+    box = OrientedBox(turn.apply(old.center[None])[0], old.size, turn.rotation @ old.rotation)
     scene = TransformedField(room(chair_pose()), turn.inverse())
     found = sample_scene_surface(scene, box, 4000, generator())
     surface = turn.inverse().apply(found.frame.out_of(found.samples.on_surface()))

@@ -14,7 +14,7 @@ from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes.ply import read_ply
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.surface.exporting import write_grid, write_mesh
-from tests.core.test_isosurface import Formula, ball
+from tests.core.surface.test_isosurface import Formula, ball
 
 
 @pytest.mark.parametrize("kind", ["glb", "ply"])

@@ -19,7 +19,7 @@ from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, ObjectSymmetry
 from regnf_core.verdicts import VERDICT_REASONS
 from regnf_core.viewing import ranking_document, result_document, write_artifacts
-from regnf_core.viewing.preview import _up_axis, residual_colours
+from regnf_core.viewing.preview import _up_axis, residual_colors
 from regnf_core.viewing.splats import Surfels, View, nearest_surfels, render
 from tests.core.conftest import ChairRun
 
@@ -213,10 +213,10 @@ def test_a_disc_seen_from_the_side_is_narrow() -> None:
 
 
 def test_the_ramp_runs_from_dark_to_yellow_and_clips() -> None:
-    colours = residual_colours(np.array([0.0, 1.0, 7.0]))
-    np.testing.assert_allclose(colours[0], [0.18, 0.20, 0.46])
-    np.testing.assert_allclose(colours[1], [0.98, 0.88, 0.18])
-    np.testing.assert_allclose(colours[2], colours[1])
+    colors = residual_colors(np.array([0.0, 1.0, 7.0]))
+    np.testing.assert_allclose(colors[0], [0.18, 0.20, 0.46])
+    np.testing.assert_allclose(colors[1], [0.98, 0.88, 0.18])
+    np.testing.assert_allclose(colors[2], colors[1])
 
 
 @pytest.mark.parametrize(

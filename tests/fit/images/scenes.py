@@ -9,27 +9,27 @@ from regnf_data.posed_images import PosedImages
 
 Floats = NDArray[np.float64]
 
-BALL_CENTRE, BALL_RADIUS = np.array([0.25, 0.0, 0.0]), 0.25
-BOX_CENTRE, BOX_HALF = np.array([-0.3, 0.0, 0.0]), np.array([0.15, 0.2, 0.25])
+BALL_CENTER, BALL_RADIUS = np.array([0.25, 0.0, 0.0]), 0.25
+BOX_CENTER, BOX_HALF = np.array([-0.3, 0.0, 0.0]), np.array([0.15, 0.2, 0.25])
 BOUNDS = np.array([[-0.6, -0.4, -0.4], [0.6, 0.4, 0.4]])
 SIZE = float(np.linalg.norm(BOUNDS[1] - BOUNDS[0]))
 
 
 def ball_distance(points: Floats) -> Floats:
     """(N,) of the ball alone."""
-    distance: Floats = np.linalg.norm(points - BALL_CENTRE, axis=-1) - BALL_RADIUS
+    distance: Floats = np.linalg.norm(points - BALL_CENTER, axis=-1) - BALL_RADIUS
     return distance
 
 
 def distance(points: Floats) -> Floats:
     """(N,) of ball and box."""
-    beyond = np.abs(points - BOX_CENTRE) - BOX_HALF
+    beyond = np.abs(points - BOX_CENTER) - BOX_HALF
     box = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
     return np.minimum(ball_distance(points), box)
 
 
 def images(count: int = 8, height: int = 36, width: int = 48, ball_alone: bool = False) -> PosedImages:
-    """Views from all sides, with exact depths; the colour tells the place."""
+    """Views from all sides, with exact depths; the color tells the place."""
     measured = ball_distance if ball_alone else distance
     steps = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1.0 - 2.0 * steps / count), np.pi * (1.0 + 5.0**0.5) * steps
@@ -38,19 +38,19 @@ def images(count: int = 8, height: int = 36, width: int = 48, ball_alone: bool =
     camera = np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
     rows, columns = np.indices((height, width)) + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T
-    poses, depths, colours = [], [], []
+    poses, depths, colors = [], [], []
     for outward in outwards:
         pose = _looking_back(1.6 * outward)
         directions = rays @ pose[:3, :3].T
         depth = _traced(measured, pose[:3, 3], directions)
         points = pose[:3, 3] + depth[..., None] * directions
-        shade = np.clip(0.5 + 0.8 * (points - BALL_CENTRE), 0.0, 1.0)
+        shade = np.clip(0.5 + 0.8 * (points - BALL_CENTER), 0.0, 1.0)
         poses.append(pose)
         depths.append(depth)
-        colours.append(np.where(depth[..., None] > 0.0, np.round(255.0 * shade), 0.0))
+        colors.append(np.where(depth[..., None] > 0.0, np.round(255.0 * shade), 0.0))
     stacked = np.stack(depths).astype(np.float32)
     return PosedImages(
-        colours=np.stack(colours).astype(np.uint8),
+        colors=np.stack(colors).astype(np.uint8),
         intrinsics=np.tile(camera, (count, 1, 1)),
         T_world_camera=np.stack(poses),
         bounds=BOUNDS,

@@ -23,7 +23,7 @@ SIZE = {"height": 72, "width": 96}
 """Pixels narrower than the voxels are wide."""
 
 
-def centres(shape: tuple[int, ...], voxel: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def centers(shape: tuple[int, ...], voxel: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     return (np.stack(np.indices(shape), axis=-1) + 0.5) * voxel + BOUNDS[0]
 
 
@@ -33,7 +33,7 @@ def test_states_agree_with_the_true_distance() -> None:
     states, voxel = seen.states.numpy(), seen.voxel
     assert voxel == 1.2 / VOXELS
     assert states.shape == (48, 32, 32)
-    true = distance(centres(states.shape, voxel).reshape(-1, 3)).reshape(states.shape)
+    true = distance(centers(states.shape, voxel).reshape(-1, 3)).reshape(states.shape)
     half_diagonal = 0.5 * 3.0**0.5 * voxel
     assert (true[states == FREE] > -voxel).all()
     # A few rays graze an edge, where tracing stops short.
@@ -48,7 +48,7 @@ def test_one_view_leaves_its_shadow_unseen() -> None:
     whole = images(**SIZE)
     one = replace(
         whole,
-        colours=whole.colours[:1],
+        colors=whole.colors[:1],
         intrinsics=whole.intrinsics[:1],
         T_world_camera=whole.T_world_camera[:1],
         depths=None if whole.depths is None else whole.depths[:1],
@@ -73,7 +73,7 @@ def test_one_view_leaves_its_shadow_unseen() -> None:
         assert float((states == wanted).float().mean()) > 0.85, step
 
 
-def test_background_is_looked_through_and_colours_alone_tell_nothing() -> None:
+def test_background_is_looked_through_and_colors_alone_tell_nothing() -> None:
     some = images(count=1)
     assert some.depths is not None
     nothing_there = replace(some, depths=np.zeros_like(some.depths), masks=np.zeros(some.depths.shape, bool))

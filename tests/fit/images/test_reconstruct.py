@@ -20,7 +20,7 @@ SMALL = ReconstructionOptions(
     surface_rays=192,
     free_points=384,
     eikonal_points=256,
-    colour_rays=24,
+    color_rays=24,
     rays_without_depth=128,
 )
 
@@ -58,7 +58,7 @@ def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
     assert early > 2.0 * error
 
 
-def test_colours_alone_find_the_ball(tmp_path):
+def test_colors_alone_find_the_ball(tmp_path):
     images = replace(scenes.images(count=12, ball_alone=True), depths=None)
     path = tmp_path / "field.safetensors"
     short, whole = replace(SMALL, iterations=5), replace(SMALL, iterations=200)
@@ -142,7 +142,7 @@ def test_the_exported_layout_reads_back_through_the_gate(tmp_path):
         ({"bounds": np.zeros((2, 3))}, "DATASET_BOUNDS_EMPTY"),
         ({"bounds": np.array([[-3.0] * 3, [3.0] * 3])}, "DATASET_OUTSIDE_GRID"),
         ({"depths": np.zeros((4, 36, 48), np.float32)}, "DATASET_DEPTH_MISSING"),
-        ({"depths": None, "colours": np.full((4, 36, 48, 3), 9, np.uint8)}, "DATASET_NO_COLOUR_VARIETY"),
+        ({"depths": None, "colors": np.full((4, 36, 48, 3), 9, np.uint8)}, "DATASET_NO_COLOR_VARIETY"),
         ({"bounds": np.array([[1.0, 1.0, 1.0], [1.1, 1.1, 1.1]])}, "DATASET_NOTHING_IN_BOUNDS"),
     ],
 )

@@ -61,7 +61,7 @@ def test_same_seed_same_field(tmp_path: Path) -> None:
 
 
 def test_starts_as_a_signed_distance() -> None:
-    # Geometric initialisation nears |x| - radius as the layers widen.
+    # Geometric initialization nears |x| - radius as the layers widen.
     wide = FitOptions(**(vars(OPTIONS) | {"hidden_width": 1024}))
     network = TrainableField(wide, radius=0.5, generator=torch.Generator().manual_seed(0))
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(1)))

@@ -23,7 +23,7 @@ REGISTER_EXAMPLES: dict[str, Any] = {
             "scene": {"field": SCENE},
             "object": {"field": OBJECT},
             "detection": {
-                "centre": [-0.15, -0.05, 0.2],
+                "center": [-0.15, -0.05, 0.2],
                 "size": [0.5, 0.5, 0.4],
                 "rotation_quaternion_xyzw": [0.0, 0.0, 0.38268343, 0.92387953],
                 "label": "chair",
@@ -39,7 +39,7 @@ REGISTER_EXAMPLES: dict[str, Any] = {
             "scene": SCENE,
             "object": OBJECT,
             "detection": {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]},
-            "options": {"preset": "paper", "sampling": {"views": 8}, "optimisation": {"iterations": 300}},
+            "options": {"preset": "paper", "sampling": {"views": 8}, "optimization": {"iterations": 300}},
         },
     },
     "library search": {

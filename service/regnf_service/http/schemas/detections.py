@@ -16,14 +16,14 @@ Component = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
 _LEAST_NORM_SQUARED = 1e-12
 
 
-class _Labelled(Incoming):
+class _Labeled(Incoming):
     label: Label | None = Field(None, description="What the detector took it for. Not used by the registration.")
     score: Annotated[float, Field(ge=0, le=1)] | None = Field(None, description="The detector's confidence.")
 
-    def _as_record(self, centre: Sequence[float], size: Sequence[float], xyzw: Sequence[float]) -> dict[str, Any]:
+    def _as_record(self, center: Sequence[float], size: Sequence[float], xyzw: Sequence[float]) -> dict[str, Any]:
         return {
             # adding zero turns -0.0 into 0.0: one value, one spelling
-            "centre": [float(value) + 0.0 for value in centre],
+            "center": [float(value) + 0.0 for value in center],
             "size": [float(value) for value in size],
             "rotation_quaternion_xyzw": list(normal_quaternion(xyzw)),
             "label": self.label,
@@ -31,25 +31,25 @@ class _Labelled(Incoming):
         }
 
 
-class CentredDetection(_Labelled):
-    """A box by centre, full edge lengths and rotation (identity when left out), scene frame and units."""
+class CenteredDetection(_Labeled):
+    """A box by center, full edge lengths and rotation (identity when left out), scene frame and units."""
 
-    centre: Point
+    center: Point
     size: Annotated[list[Edge], Field(min_length=3, max_length=3)]
     rotation_quaternion_xyzw: Annotated[list[Component], Field(min_length=4, max_length=4)] = Field(list(IDENTITY))
 
     @model_validator(mode="after")
-    def _rotates(self) -> CentredDetection:
+    def _rotates(self) -> CenteredDetection:
         if sum(value * value for value in self.rotation_quaternion_xyzw) < _LEAST_NORM_SQUARED:
             raise ValueError("rotation_quaternion_xyzw must not be zero")
         return self
 
     def canonical(self) -> dict[str, Any]:
         """The box as a job record holds it."""
-        return self._as_record(self.centre, self.size, self.rotation_quaternion_xyzw)
+        return self._as_record(self.center, self.size, self.rotation_quaternion_xyzw)
 
 
-class CornerDetection(_Labelled):
+class CornerDetection(_Labeled):
     """An axis-aligned box by its lowest and its highest corner, scene frame and units."""
 
     min: Point
@@ -62,7 +62,7 @@ class CornerDetection(_Labelled):
         return self
 
     def canonical(self) -> dict[str, Any]:
-        """The same box by centre and size."""
+        """The same box by center and size."""
         corners = list(zip(self.min, self.max, strict=True))
         return self._as_record(
             [(low + high) / 2 for low, high in corners], [high - low for low, high in corners], IDENTITY
@@ -72,10 +72,10 @@ class CornerDetection(_Labelled):
 def _spelling(value: Any) -> str:
     if isinstance(value, CornerDetection):
         return "corners"
-    return "corners" if isinstance(value, dict) and value.keys() & {"min", "max"} else "centred"
+    return "corners" if isinstance(value, dict) and value.keys() & {"min", "max"} else "centered"
 
 
 Detection = Annotated[
-    Annotated[CentredDetection, Tag("centred")] | Annotated[CornerDetection, Tag("corners")], Discriminator(_spelling)
+    Annotated[CenteredDetection, Tag("centered")] | Annotated[CornerDetection, Tag("corners")], Discriminator(_spelling)
 ]
-SPELLINGS = frozenset({"centred", "corners"})
+SPELLINGS = frozenset({"centered", "corners"})

@@ -35,7 +35,7 @@ class JobDocument(Outgoing):
     kind: Literal["registration"]
     status: Status
     phase: str | None = Field(
-        None, description="loading, sampling, initialising, optimising, verifying or exporting: where it is, or ended."
+        None, description="loading, sampling, initializing, optimizing, verifying or exporting: where it is, or ended."
     )
     progress: float = Field(0.0, ge=0, le=1)
     queue_position: int | None = Field(None, description="1 is next; null for a job that does not wait.")

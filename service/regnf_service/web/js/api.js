@@ -68,8 +68,8 @@ export class JobApi {
   }
 
   async request(address, { method = 'GET', headers = {}, signal } = {}) {
-    const authorised = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
-    const response = await fetch(address, { method, headers: authorised, signal, cache: 'no-cache' });
+    const authorized = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
+    const response = await fetch(address, { method, headers: authorized, signal, cache: 'no-cache' });
     if (response.ok) return response;
     throw new ApiProblem(response.status, await problemOf(response));
   }

@@ -3,7 +3,7 @@
 import {
   BufferAttribute, BufferGeometry, Color, PLYLoader, Points, ShaderMaterial, Sphere,
 } from '../vendor/three.bundle.min.js';
-import { rampStops } from './colours.js';
+import { rampStops } from './colors.js';
 import { FRAGMENT, VERTEX } from './shaders.js';
 
 const MODES = { layer: 0, residual: 1, file: 2 };
@@ -12,8 +12,8 @@ const MODES = { layer: 0, residual: 1, file: 2 };
 export function geometryFromPly(buffer) {
   const geometry = new PLYLoader().parse(buffer);
   if (!geometry.getAttribute('position')?.count) throw new Error('the file holds no points');
-  const colour = geometry.getAttribute('color');
-  if (colour) geometry.setAttribute('aColour', displayColours(colour));
+  const color = geometry.getAttribute('color');
+  if (color) geometry.setAttribute('aColor', displayColors(color));
   geometry.computeBoundingSphere();
   return geometry;
 }
@@ -36,11 +36,11 @@ function samePoints(flat, attribute) {
   return probes.every((i) => [0, 1, 2].every((k) => Math.abs(flat[i * 3 + k] - attribute.array[i * 3 + k]) < tolerance));
 }
 
-/** True when the file's colours say more than one tint would. */
-export function isColourful(geometry) {
-  const colours = geometry.getAttribute('aColour')?.array ?? [];
-  for (let i = 3; i < colours.length; i += 1) {
-    if (Math.abs(colours[i] - colours[i % 3]) > 0.02) return true;
+/** True when the file's colors say more than one tint would. */
+export function isColorful(geometry) {
+  const colors = geometry.getAttribute('aColor')?.array ?? [];
+  for (let i = 3; i < colors.length; i += 1) {
+    if (Math.abs(colors[i] - colors[i % 3]) > 0.02) return true;
   }
   return false;
 }
@@ -87,8 +87,8 @@ export class Cloud {
     this.points.matrixWorldNeedsUpdate = true;
   }
 
-  tint(colour) {
-    this.material.uniforms.uTint.value.copy(colour);
+  tint(color) {
+    this.material.uniforms.uTint.value.copy(color);
   }
 
   /** `factor` scales the discs; 1 just covers the gaps between the samples. */
@@ -98,14 +98,14 @@ export class Cloud {
     this.material.uniforms.uMinPixels.value = 1.4 * factor * pixelRatio;
   }
 
-  colourBy(mode) {
-    const has = mode !== 'file' || this.geometry.getAttribute('aColour');
+  colorBy(mode) {
+    const has = mode !== 'file' || this.geometry.getAttribute('aColor');
     this.material.uniforms.uMode.value = has ? MODES[mode] : 0;
   }
 }
 
 /**
- * The typical distance between neighbours, in the cloud's units: the median over some points of the distance to the
+ * The typical distance between neighbors, in the cloud's units: the median over some points of the distance to the
  * fourth nearest, which tells an even cloud's density from a random one's far better than the nearest does.
  */
 function spacingOf(geometry) {
@@ -136,13 +136,13 @@ function fourNearest(array, count, stride, i) {
   return squares;
 }
 
-// The loader takes colours to three.js's linear working space; the shader writes display colours.
-function displayColours(attribute) {
+// The loader takes colors to three.js's linear working space; the shader writes display colors.
+function displayColors(attribute) {
   const display = new Float32Array(attribute.count * 3);
-  const colour = new Color();
+  const color = new Color();
   for (let i = 0; i < attribute.count; i += 1) {
-    colour.setRGB(attribute.getX(i), attribute.getY(i), attribute.getZ(i)).convertLinearToSRGB();
-    display.set([colour.r, colour.g, colour.b], i * 3);
+    color.setRGB(attribute.getX(i), attribute.getY(i), attribute.getZ(i)).convertLinearToSRGB();
+    display.set([color.r, color.g, color.b], i * 3);
   }
   return new BufferAttribute(display, 3);
 }

@@ -2,25 +2,25 @@
 
 import { readSim3 } from './sim3.js';
 
-export const PHASES = ['loading', 'sampling', 'initialising', 'optimising', 'verifying', 'exporting'];
+export const PHASES = ['loading', 'sampling', 'initializing', 'optimizing', 'verifying', 'exporting'];
 
 // What a registration may leave behind, for services whose result does not list it.
 const KNOWN_ARTIFACTS = ['scene_points.ply', 'object_points.ply', 'trace.json', 'residuals.npz', 'preview.png'];
 
 export const isActive = (job) => job.status === 'accepted' || job.status === 'running';
 
-/** The detection box { centre, size, quaternion } in the scene frame, or null. */
+/** The detection box { center, size, quaternion } in the scene frame, or null. */
 export function detectionOf(job, result) {
   const sources = [job?.inputs, job?.request, result?.inputs, result, job];
   const box = sources.map((source) => source?.detection).find((value) => value && typeof value === 'object');
   if (!box) return null;
   if (isVector(box.min, 3) && isVector(box.max, 3)) {
-    const centre = box.min.map((low, i) => (low + box.max[i]) / 2);
-    return { centre, size: box.max.map((high, i) => high - box.min[i]), quaternion: [0, 0, 0, 1] };
+    const center = box.min.map((low, i) => (low + box.max[i]) / 2);
+    return { center, size: box.max.map((high, i) => high - box.min[i]), quaternion: [0, 0, 0, 1] };
   }
-  if (!isVector(box.centre, 3) || !isVector(box.size, 3)) return null;
+  if (!isVector(box.center, 3) || !isVector(box.size, 3)) return null;
   const turn = box.rotation_quaternion_xyzw;
-  return { centre: box.centre, size: box.size, quaternion: isVector(turn, 4) ? turn : [0, 0, 0, 1] };
+  return { center: box.center, size: box.size, quaternion: isVector(turn, 4) ? turn : [0, 0, 0, 1] };
 }
 
 /** The axis of the scene that points up, as far as the options say. */

@@ -46,19 +46,19 @@ export class Floor {
     this.mesh.visible = false;
   }
 
-  /** Lies under the box, reaching `reach` to every side of its centre. */
+  /** Lies under the box, reaching `reach` to every side of its center. */
   place(box, reach) {
-    const centre = box.getCenter(new Vector3());
+    const center = box.getCenter(new Vector3());
     this.mesh.geometry.dispose();
     this.mesh.geometry = new PlaneGeometry(2 * reach, 2 * reach);
-    this.mesh.position.set(centre.x, box.min.y - reach * 2e-3, centre.z);
+    this.mesh.position.set(center.x, box.min.y - reach * 2e-3, center.z);
     this.material.uniforms.uReach.value = reach;
     this.material.uniforms.uCell.value = roundCell(reach / 10);
     this.mesh.visible = true;
   }
 
-  tint(colour) {
-    this.material.uniforms.uTint.value.copy(colour);
+  tint(color) {
+    this.material.uniforms.uTint.value.copy(color);
   }
 }
 

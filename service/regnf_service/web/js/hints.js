@@ -15,7 +15,7 @@ const HINTS = {
   WORKER_LOST: 'The worker died twice while on this job, most often for want of memory. Posting the same request starts it anew.',
   JOB_TIMEOUT: 'The job ran into its time limit. Fewer samples make it quicker; the service’s limit is a setting.',
   OUT_OF_MEMORY: 'The worker ran out of memory. Fewer samples need less; a worker with more memory is the other way.',
-  FIELD_NOT_RECOGNISED: 'The file was not recognised as a signed distance field. See the list of formats in the documentation.',
+  FIELD_NOT_RECOGNIZED: 'The file was not recognized as a signed distance field. See the list of formats in the documentation.',
 };
 
 export const hintFor = (reason) => HINTS[reason] ?? '';

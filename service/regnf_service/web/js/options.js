@@ -3,7 +3,7 @@
 import { byId, el, show } from './dom.js';
 import { number, words } from './format.js';
 
-const GROUPS = { robust: ['robust'], paper: ['sampling', 'initialisation', 'optimisation', 'resampling'] };
+const GROUPS = { robust: ['robust'], paper: ['sampling', 'initialization', 'optimization', 'resampling'] };
 
 export function showOptions(options) {
   const preset = options?.preset;

@@ -1,4 +1,4 @@
-// The slider and the play button: which frame of the optimiser's path is shown, fractions between frames included.
+// The slider and the play button: which frame of the optimizer's path is shown, fractions between frames included.
 
 import { byId, show } from './dom.js';
 import { number } from './format.js';
@@ -70,7 +70,7 @@ export class Playback {
   }
 
   showState() {
-    this.button.setAttribute('aria-label', this.playing ? 'Pause' : "Play the optimiser's iterations");
+    this.button.setAttribute('aria-label', this.playing ? 'Pause' : "Play the optimizer's iterations");
     this.button.toggleAttribute('data-playing', Boolean(this.playing));
   }
 }

@@ -1,6 +1,6 @@
 // The page's two small plots, as SVG: the loss over the iterations and the histogram of the residuals.
 
-import { cssColour, rampColour } from './colours.js';
+import { cssColor, rampColor } from './colors.js';
 import { svg } from './dom.js';
 import { number } from './format.js';
 
@@ -111,7 +111,7 @@ export class LossPlot {
   }
 }
 
-/** A histogram whose bars carry the ramp's colours, so that it is the legend as well. values >= 0. */
+/** A histogram whose bars carry the ramp's colors, so that it is the legend as well. values >= 0. */
 export function residualHistogram(values, top) {
   const [width, height, bins] = [200, 56, 25];
   const counts = new Array(bins).fill(0);
@@ -120,7 +120,7 @@ export function residualHistogram(values, top) {
   const step = width / bins;
   const bars = counts.map((count, bin) => {
     const tall = Math.max((count / tallest) * (height - 16), 1.5);
-    const fill = cssColour(rampColour((bin + 0.5) / bins));
+    const fill = cssColor(rampColor((bin + 0.5) / bins));
     return svg('rect', { x: bin * step + 0.5, y: height - 14 - tall, width: step - 1, height: tall, rx: 1, fill });
   });
   const label = `Histogram of ${values.length} residuals from 0 to ${number(top, 3)} and above`;

@@ -1,4 +1,4 @@
-// The residuals of both surfaces' samples, as clouds coloured along a ramp.
+// The residuals of both surfaces' samples, as clouds colored along a ramp.
 
 import { Cloud, geometryFromArrays } from './cloud.js';
 import { readNpz } from './npz.js';
@@ -20,7 +20,7 @@ export async function readResiduals(buffer, plain) {
     const values = absolute(arrays[`${side}_residuals`]);
     if (!points || values.length === 0 || points.data.length !== values.length * 3) return null;
     const made = new Cloud(geometryFromArrays(points.data, values.map((value) => value / top), like.geometry), like.style);
-    made.colourBy('residual');
+    made.colorBy('residual');
     return made;
   };
   return { scene: cloud('scene', plain.scene), object: cloud('object', plain.after), sizes, top };

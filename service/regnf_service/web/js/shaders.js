@@ -4,30 +4,30 @@ export const VERTEX = /* glsl */ `
   uniform float uWorldSize;   // diameter of a disc in the cloud's own units
   uniform float uPixels;      // pixels a unit length covers at distance one
   uniform float uMinPixels;
-  uniform int uMode;          // 0 one tint, 1 the ramp, 2 the file's colours
+  uniform int uMode;          // 0 one tint, 1 the ramp, 2 the file's colors
   uniform vec3 uTint;
   uniform vec3 uRamp[5];
   uniform bool uLit;
   uniform bool uSeeThrough;   // leave out what is seen from inside matter: walls seen from behind
   uniform float uNearer;      // towards the camera, in discs: which of two surfaces in one place is seen
   attribute float aValue;     // 0..1 along the ramp
-  attribute vec3 aColour;
-  varying vec3 vColour;
+  attribute vec3 aColor;
+  varying vec3 vColor;
   varying vec3 vNormal;
 
   vec3 ramp(float share) {
     float at = clamp(share, 0.0, 1.0) * 4.0;
-    vec3 colour = uRamp[0];
-    for (int i = 0; i < 4; i++) colour = mix(colour, uRamp[i + 1], clamp(at - float(i), 0.0, 1.0));
-    return colour;
+    vec3 color = uRamp[0];
+    for (int i = 0; i < 4; i++) color = mix(color, uRamp[i + 1], clamp(at - float(i), 0.0, 1.0));
+    return color;
   }
 
   void main() {
     vec4 view = modelViewMatrix * vec4(position, 1.0);
     float scale = length(modelMatrix[0].xyz);
-    vec3 base = uMode == 1 ? ramp(aValue) : (uMode == 2 ? aColour : uTint);
+    vec3 base = uMode == 1 ? ramp(aValue) : (uMode == 2 ? aColor : uTint);
     vNormal = vec3(0.0, 0.0, 1.0);
-    vColour = base;
+    vColor = base;
     if (uLit) {
       vNormal = normalize(normalMatrix * normal);
       vec3 eye = normalize(-view.xyz);
@@ -36,7 +36,7 @@ export const VERTEX = /* glsl */ `
       float fill = max(dot(vNormal, normalize(vec3(-0.7, 0.1, 0.5))), 0.0);
       float rim = pow(1.0 - max(facing, 0.0), 3.0);
       float light = 0.64 + 0.40 * key + 0.12 * fill;
-      vColour = base * (facing < 0.0 ? 0.5 : light) + 0.06 * rim * step(0.0, facing);
+      vColor = base * (facing < 0.0 ? 0.5 : light) + 0.06 * rim * step(0.0, facing);
       if (facing < 0.0) vNormal = -vNormal;
     }
     gl_Position = projectionMatrix * view;
@@ -51,7 +51,7 @@ export const VERTEX = /* glsl */ `
 
 export const FRAGMENT = /* glsl */ `
   uniform float uOpacity;
-  varying vec3 vColour;
+  varying vec3 vColor;
   varying vec3 vNormal;
 
   void main() {
@@ -61,6 +61,6 @@ export const FRAGMENT = /* glsl */ `
     float depth = -dot(n.xy, at) / max(n.z, 0.3);   // where the disc's plane lies under this pixel
     float reach = dot(at, at) + depth * depth;
     if (reach > 1.0) discard;
-    gl_FragColor = vec4(vColour, uOpacity);
+    gl_FragColor = vec4(vColor, uOpacity);
   }
 `;

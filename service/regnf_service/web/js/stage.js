@@ -1,6 +1,6 @@
 // The 3D view of one result: loads its clouds, wires the view's own controls, moves the object.
 
-import { Cloud, geometryFromPly, isColourful } from './cloud.js';
+import { Cloud, geometryFromPly, isColorful } from './cloud.js';
 import { wireBox } from './box.js';
 import { detectionOf, upAxisOf } from './documents.js';
 import { byId, el, show } from './dom.js';
@@ -100,24 +100,24 @@ export class Stage {
     byId('size').oninput = (event) => this.viewer.setPointFactor(Number(event.target.value));
     byId('frame-object').onclick = () => this.viewer.look(FOCUS);
     byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'before', 'scene', 'context']);
-    byId('colour').onchange = (event) => this.colourBy(event.target.value);
+    byId('color').onchange = (event) => this.colorBy(event.target.value);
     this.offer('residual', this.names.includes('residuals.npz'));
-    this.offer('file', Object.values(this.plain).some((cloud) => isColourful(cloud.geometry)));
+    this.offer('file', Object.values(this.plain).some((cloud) => isColorful(cloud.geometry)));
   }
 
   offer(value, available) {
-    const option = byId('colour').querySelector(`option[value="${value}"]`);
+    const option = byId('color').querySelector(`option[value="${value}"]`);
     option.hidden = !available;
     option.disabled = !available;
   }
 
-  async colourBy(mode) {
+  async colorBy(mode) {
     const residuals = mode === 'residual' ? await this.loadResiduals() : null;
     if (mode === 'residual' && !residuals) return;
     const clouds = residuals ? { scene: residuals.scene, after: residuals.object } : this.plain;
     for (const [name, cloud] of Object.entries(clouds)) {
       if (!cloud) continue;
-      if (!residuals) cloud.colourBy(mode);
+      if (!residuals) cloud.colorBy(mode);
       this.addCloud(name, cloud, `cloud-${name}`);
     }
     this.place(this.pose);
@@ -132,8 +132,8 @@ export class Stage {
       return this.residuals;
     } catch (error) {
       this.offer('residual', false);
-      byId('colour').value = 'layer';
-      byId('colour').after(el('span', { className: 'note', role: 'status' }, `No residuals: ${error.message}`));
+      byId('color').value = 'layer';
+      byId('color').after(el('span', { className: 'note', role: 'status' }, `No residuals: ${error.message}`));
       return null;
     }
   }

@@ -4,7 +4,7 @@ import {
   Box3, Group, OrbitControls, PerspectiveCamera, Quaternion, Scene, Sphere, Vector3, WebGLRenderer,
 } from '../vendor/three.bundle.min.js';
 import { clearestDirection, frameSphere, moveByKey } from './camera.js';
-import { onThemeChange, themeColour } from './colours.js';
+import { onThemeChange, themeColor } from './colors.js';
 import { Floor } from './floor.js';
 import { Gizmo } from './gizmo.js';
 import { prefersStillness } from './motion.js';
@@ -118,11 +118,11 @@ export class Viewer {
 
   retint() {
     for (const { object, cloud, tint } of this.layers.values()) {
-      const colour = themeColour(tint);
-      if (cloud) cloud.tint(colour);
-      else object.material.color.copy(colour).convertSRGBToLinear();
+      const color = themeColor(tint);
+      if (cloud) cloud.tint(color);
+      else object.material.color.copy(color).convertSRGBToLinear();
     }
-    this.floor.tint(themeColour('grid'));
+    this.floor.tint(themeColor('grid'));
     this.invalidate();
   }
 

@@ -45,21 +45,21 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
     ("head", "reason"),
     [
         (b"", "FILE_EMPTY"),
-        (b"x", "FORMAT_NOT_RECOGNISED"),
-        (PNG, "FORMAT_NOT_RECOGNISED"),
+        (b"x", "FORMAT_NOT_RECOGNIZED"),
+        (PNG, "FORMAT_NOT_RECOGNIZED"),
         (LEGACY_TORCH[:10], "RAW_PICKLE"),
         (LEGACY_TAR, "LEGACY_TORCH_FILE"),
         (b"\x80\x04\x95\x05", "RAW_PICKLE"),
         (b'{"asset": {"version": "2.0"}, "buffers": []}', "FORMAT_NOT_SUPPORTED"),
-        (b"v is for vertex", "FORMAT_NOT_RECOGNISED"),
-        (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNISED"),
-        (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNISED"),  # an STL file's facets have corners
-        (b"x" * 512, "FORMAT_NOT_RECOGNISED"),
+        (b"v is for vertex", "FORMAT_NOT_RECOGNIZED"),
+        (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNIZED"),
+        (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNIZED"),  # an STL file's facets have corners
+        (b"x" * 512, "FORMAT_NOT_RECOGNIZED"),
         (zip_bytes([("points.txt", b"1 2 3")]), "FORMAT_NOT_SUPPORTED"),
         (b" BDV\0\0\0\0\xe0\0\0\0", "FORMAT_NOT_SUPPORTED"),
         (b"NanoVDB2" + bytes(40), "FORMAT_NOT_SUPPORTED"),
-        (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNISED"),
-        (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNISED"),
+        (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNIZED"),
+        (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNIZED"),
     ],
 )
 def test_everything_else_is_named_none_and_explained(head: bytes, reason: str) -> None:

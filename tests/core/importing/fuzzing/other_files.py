@@ -37,7 +37,7 @@ def make_others() -> dict[str, dict[str, bytes]]:
 
 
 def _legacy_files() -> dict[str, bytes]:
-    files = {"neus_facto": _saved(checkpoint(log2_size=8, hidden=6, optimiser=False), legacy=True)}
+    files = {"neus_facto": _saved(checkpoint(log2_size=8, hidden=6, optimizer=False), legacy=True)}
     return files | {make.__name__: _saved(make().checkpoint, legacy=True) for make in (small.siren, small.deepsdf)}
 
 

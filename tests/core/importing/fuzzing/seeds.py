@@ -62,7 +62,7 @@ def make_seeds(folder: Path) -> Seeds:
     from tests.core.importing.checkpoints import checkpoint
     from tests.core.importing.fuzzing.other_files import make_others
 
-    values = checkpoint(log2_size=8, hidden=6, optimiser=False)
+    values = checkpoint(log2_size=8, hidden=6, optimizer=False)
     upload = folder / "seed.ckpt"
     torch.save(values, upload)
     convert_file(upload, folder, None, ImportLimits())

@@ -28,7 +28,7 @@ def _changed(random: Random, message: bytes, depth: int) -> bytes:
     key, wire, value = fields[at]
     if isinstance(value, bytes) and wire == _BYTES and depth and random.random() < 0.8 and _fields(value):
         fields[at] = (key, wire, _changed(random, value, depth - 1))
-        return b"".join(map(_spelt, fields))
+        return b"".join(map(_spelled, fields))
     match random.randrange(6):
         case 0:
             del fields[at]
@@ -40,7 +40,7 @@ def _changed(random: Random, message: bytes, depth: int) -> bytes:
             fields[at] = (random.choice((1, 2, 3, 4, 5, 7, 8, 13, 14, 20, 1 << 28)), wire, value)
         case _:
             fields[at] = (key, wire, _other_value(random, value))
-    return b"".join(map(_spelt, fields))
+    return b"".join(map(_spelled, fields))
 
 
 def _other_value(random: Random, value: int | bytes) -> int | bytes:
@@ -81,7 +81,7 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
     return value | message[at] << shift, at + 1
 
 
-def _spelt(field: Field) -> bytes:
+def _spelled(field: Field) -> bytes:
     key, wire, value = field
     tag = _number(key << 3 | wire)
     if isinstance(value, int):

@@ -48,7 +48,7 @@ def test_the_stride_it_was_trained_with_is_found(truth: HashGridConfig) -> None:
     assert chosen.readings == ()
     assert "2 layouts" in chosen.why[-1]
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
-    points = points[points.norm(dim=-1) > 0.3]  # nearer to the centre cells of 0.065 do not follow the distance
+    points = points[points.norm(dim=-1) > 0.3]  # nearer to the center cells of 0.065 do not follow the distance
     tensors = {name: torch.from_numpy(array) for name, array in chosen.tensors.items()}
     distance = build_field(parse_description(chosen.description), tensors).signed_distance(points)
     torch.testing.assert_close(distance, points.norm(dim=-1) - 0.5, rtol=0, atol=5e-3)

@@ -64,7 +64,7 @@ def test_a_checkpoint_becomes_a_field(upload: Path, tmp_path: Path) -> None:
 
 def test_an_import_after_a_refused_one_works(upload: Path, tmp_path: Path) -> None:
     assert_refused(
-        lambda: import_field(saved(tmp_path, b"\x89PNG"), tmp_path / "out", None, SHORT), "FORMAT_NOT_RECOGNISED"
+        lambda: import_field(saved(tmp_path, b"\x89PNG"), tmp_path / "out", None, SHORT), "FORMAT_NOT_RECOGNIZED"
     )
     assert_nothing_left(tmp_path / "out")
     import_field(upload, tmp_path / "out", None, SHORT)

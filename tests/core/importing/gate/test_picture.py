@@ -18,7 +18,7 @@ from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.picture import PICTURE_NAME, is_sound_picture
 from regnf_core.viewing.field_picture import PANEL, field_picture
 from tests.core.importing.archives import saved
-from tests.core.test_isosurface import Formula, ball
+from tests.core.surface.test_isosurface import Formula, ball
 
 
 def png(mode: str = "RGB", size: tuple[int, int] = (8, 4)) -> bytes:

@@ -18,7 +18,7 @@ from tests.core.importing.archives import assert_refused, patched, tensor, torch
 SIX = struct.pack("<6f", *range(6))
 
 
-def materialise(data: bytes, budget: int = 1 << 20) -> Any:
+def materialize(data: bytes, budget: int = 1 << 20) -> Any:
     """The single tensor that is an archive's whole value."""
     archive = read_archive(memoryview(data))
     return TensorSource(archive, budget).array("w", read_pickle(archive.read("data.pkl")))
@@ -37,7 +37,7 @@ def saved(value: object) -> bytes:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.float16, torch.bfloat16])
 def test_values_come_back_as_float32(dtype: torch.dtype) -> None:
     original = torch.linspace(-3, 3, 24).reshape(2, 3, 4).to(dtype)
-    array = materialise(saved(original))
+    array = materialize(saved(original))
     assert array.dtype == np.float32
     np.testing.assert_array_equal(array, original.float().numpy())
 
@@ -45,15 +45,15 @@ def test_values_come_back_as_float32(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("axes", [(1, 0, 2), (2, 1, 0), (2, 0, 1)])
 def test_axes_stored_in_another_order_come_back_in_place(axes: tuple[int, int, int]) -> None:
     original = torch.arange(24.0).reshape(2, 3, 4).permute(axes)
-    np.testing.assert_array_equal(materialise(saved(original)), original.numpy())
+    np.testing.assert_array_equal(materialize(saved(original)), original.numpy())
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (0,), (0, 3), (5, 1), (1, 5), (1, 1, 1)])
 def test_small_and_empty_shapes(shape: tuple[int, ...]) -> None:
     original = torch.ones(shape)
-    np.testing.assert_array_equal(materialise(saved(original)), original.numpy())
+    np.testing.assert_array_equal(materialize(saved(original)), original.numpy())
     np.testing.assert_array_equal(
-        materialise(saved(original.t() if len(shape) == 2 else original)).size, original.numel()
+        materialize(saved(original.t() if len(shape) == 2 else original)).size, original.numel()
     )
 
 
@@ -71,7 +71,7 @@ def test_tensors_at_odd_places_are_moved_where_wide_loads_may_read_them(shift: i
     name = ("x" * shift, b"")
     pickle = b"\x80\x02" + tensor("0", (1, 4), (4, 1)) + b"."
     entries = [(f"archive/{part}", data) for part, data in (name, ("data.pkl", pickle), ("data/0", bytes(16)))]
-    assert materialise(zip_bytes(entries)).ctypes.data % 16 == 0
+    assert materialize(zip_bytes(entries)).ctypes.data % 16 == 0
 
 
 @pytest.mark.parametrize(
@@ -102,46 +102,46 @@ def test_tensors_at_odd_places_are_moved_where_wide_loads_may_read_them(shift: i
     ],
 )
 def test_tensors_that_lie_are_refused(body: bytes, reason: str) -> None:
-    assert_refused(lambda: materialise(made_by_hand(body, s0=SIX)), reason)
+    assert_refused(lambda: materialize(made_by_hand(body, s0=SIX)), reason)
 
 
 @pytest.mark.parametrize("shape", [(0, 1 << 47, 1 << 47), (1 << 47, 0, 1 << 47), (0, *[1 << 47] * 15)])
 def test_an_empty_tensor_too_wide_for_any_array_is_refused(shape: tuple[int, ...]) -> None:
     for strides in (shape, (1,) * len(shape)):
-        assert_refused(partial(materialise, made_by_hand(tensor("0", shape, strides), s0=b"")), "TENSOR_SHAPE")
+        assert_refused(partial(materialize, made_by_hand(tensor("0", shape, strides), s0=b"")), "TENSOR_SHAPE")
 
 
 def test_real_odd_tensors_are_refused() -> None:
     sparse = torch.eye(3).to_sparse()
-    assert_refused(lambda: materialise(saved(sparse)), "UNSAFE_GLOBAL_IN_WEIGHTS")
-    assert_refused(lambda: materialise(saved(torch.empty(3, device="meta"))), "UNSAFE_GLOBAL_IN_WEIGHTS")
-    assert_refused(lambda: materialise(saved(torch.ones(4, 4)[:, :2])), "TENSOR_STORAGE_MISMATCH")
-    assert_refused(lambda: materialise(saved(torch.ones(3, 1).expand(3, 4))), "TENSOR_STORAGE_MISMATCH")
+    assert_refused(lambda: materialize(saved(sparse)), "UNSAFE_GLOBAL_IN_WEIGHTS")
+    assert_refused(lambda: materialize(saved(torch.empty(3, device="meta"))), "UNSAFE_GLOBAL_IN_WEIGHTS")
+    assert_refused(lambda: materialize(saved(torch.ones(4, 4)[:, :2])), "TENSOR_STORAGE_MISMATCH")
+    assert_refused(lambda: materialize(saved(torch.ones(3, 1).expand(3, 4))), "TENSOR_STORAGE_MISMATCH")
 
 
 def test_the_refusal_names_the_global() -> None:
     with pytest.raises(FieldFormatError, match=r"evil\.loader"):
-        materialise(made_by_hand(b"cevil\nloader\n)R"))
+        materialize(made_by_hand(b"cevil\nloader\n)R"))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
 def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
     for dtype in (torch.float32, torch.float64, torch.float16, torch.bfloat16):
         data = saved(torch.tensor([1.0, value, 2.0], dtype=dtype))
-        assert_refused(partial(materialise, data), "TENSOR_NOT_FINITE")
+        assert_refused(partial(materialize, data), "TENSOR_NOT_FINITE")
 
 
 def test_a_double_too_large_for_float32_is_refused() -> None:
-    assert_refused(lambda: materialise(saved(torch.tensor([1e300], dtype=torch.float64))), "TENSOR_NOT_FINITE")
+    assert_refused(lambda: materialize(saved(torch.tensor([1e300], dtype=torch.float64))), "TENSOR_NOT_FINITE")
 
 
-def test_damaged_storages_are_refused_and_undamaged_neighbours_are_not() -> None:
+def test_damaged_storages_are_refused_and_undamaged_neighbors_are_not() -> None:
     data = made_by_hand(tensor("0", (6,), (1,)), s0=SIX, s1=SIX)
     archive = read_archive(memoryview(data))
     other = archive.entries["data/1"].offset
-    materialise(patched(data, other, b"\xff"))
+    materialize(patched(data, other, b"\xff"))
     mine = archive.entries["data/0"].offset
-    assert_refused(lambda: materialise(patched(data, mine, b"\xff")), "ARCHIVE_CRC_MISMATCH")
+    assert_refused(lambda: materialize(patched(data, mine, b"\xff")), "ARCHIVE_CRC_MISMATCH")
 
 
 def test_all_tensors_share_one_budget() -> None:
