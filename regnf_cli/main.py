@@ -14,6 +14,7 @@ import typer
 
 from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
 from regnf_cli.convert import convert
+from regnf_cli.demo import demo
 from regnf_cli.fit import fit
 from regnf_cli.inspect import inspect
 from regnf_cli.register import register
@@ -43,7 +44,7 @@ def root(
         raise typer.Exit
 
 
-for command in (register, search, serve, worker, inspect, convert, fit):
+for command in (demo, register, search, serve, worker, inspect, convert, fit):
     app.command(command.__name__)(command)
 app.command("render-dataset")(render_dataset)
 

@@ -1,0 +1,138 @@
+"""``regnf demo``: registers a library armchair with the armchair in a room, through the real service.
+
+Starts `regnf serve`, uploads two fields that ship with regnf, posts a detection, follows the job, and prints the
+transform, its error against the known true transform and the address of the page.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from regnf_cli.console import EXIT_NOT_REGISTERED, EXIT_UNAVAILABLE, err, fail, out, phase_progress
+from regnf_cli.demo_data import demo_folder
+from regnf_cli.extras import require
+from regnf_cli.local_service import running_service
+from regnf_cli.remote import RemoteService
+
+MAX_ROTATION_RAD = 0.03
+MAX_TRANSLATION_SHARE = 0.03
+MAX_SCALE_SHARE = 0.02
+
+
+def demo(
+    state_dir: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the demo's service; emptied first, kept afterwards. [default: a temporary folder]"
+        ),
+    ] = None,
+    keep_running: Annotated[
+        bool | None,
+        typer.Option(
+            "--keep-running/--exit",
+            help="Wait for Enter at the end, so that the page can be looked at. [default: in a terminal only]",
+        ),
+    ] = None,
+) -> None:
+    """Run a complete registration on this machine: service, upload, job, result.
+
+    The exit code is 0 if the result is registered and its errors are within the demo's bounds, and 1 otherwise.
+
+    Example: **regnf demo**
+    """
+    require("service", "engine", "embedded")
+    started = time.monotonic()
+    waits = sys.stdin.isatty() if keep_running is None else keep_running
+    with _state_folder(state_dir) as folder:
+        try:
+            with running_service(folder) as address:
+                out.print(f"service      {address}  (log: {folder / 'serve.log'})")
+                job, result = _register(address)
+                good = _show(result)
+                out.print(f"page         [bold]{address}/jobs/{job['id']}/view[/]", soft_wrap=True)
+                out.print(f"total        {time.monotonic() - started:.1f} s")
+                if waits:
+                    _wait_for_enter()
+        except RuntimeError as error:  # the service did not start
+            err.print((folder / "serve.log").read_text(errors="replace")[-2000:], markup=False, soft_wrap=True)
+            raise typer.Exit(fail("SERVICE_NOT_STARTED", str(error), EXIT_UNAVAILABLE)) from error
+    if not good:
+        raise typer.Exit(EXIT_NOT_REGISTERED)
+
+
+@contextmanager
+def _state_folder(chosen: Path | None) -> Iterator[Path]:
+    """An empty folder: the chosen one, which stays, or a temporary one, which goes."""
+    if chosen is None:
+        with tempfile.TemporaryDirectory(prefix="regnf-demo-", ignore_cleanup_errors=True) as folder:
+            yield Path(folder)
+        return
+    if chosen.exists() and any(chosen.iterdir()) and not (chosen / "serve.log").exists():
+        message = f"{chosen} holds files that are not the demo's; name an empty folder or one of an earlier demo"
+        raise typer.Exit(fail("STATE_DIR_NOT_EMPTY", message))
+    shutil.rmtree(chosen, ignore_errors=True)
+    yield chosen
+
+
+def _register(address: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Upload, register, follow; returns the job and its result."""
+    data = demo_folder()
+    with RemoteService(address) as service, phase_progress() as bar:
+        task = bar.add_task("uploading", total=1.0)
+
+        def report(phase: str, share: float) -> None:
+            bar.update(task, description=phase, completed=share)
+
+        truth = json.loads((data / "truth.json").read_text(encoding="utf-8"))
+        job = service.submit(
+            {
+                "scene": service.upload_field(data / "mix-room.safetensors", report),
+                "object": service.upload_field(data / "armchair.safetensors", report),
+                "detection": json.loads((data / "detection.json").read_text(encoding="utf-8")),
+                "ground_truth": {"T_object_scene": truth["T_object_scene"]["matrix"]},
+                "seed": 0,
+            }
+        )
+        service.follow(job["id"], report)
+        return job, service.result(job["id"])
+
+
+def _show(result: dict[str, Any]) -> bool:
+    """Print the transform and its errors; whether they are within the demo's bounds."""
+    out.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
+    out.print(f"             {result['verdict_detail']}")
+    out.print("T_object_scene, from the scene's coordinates to the library object's:")
+    for row in result["T_object_scene"]["matrix"]:
+        out.print("   " + " ".join(f"{value:10.6f}" for value in row))
+    metrics = result["metrics"]
+    errors = [
+        ("rotation", metrics["rotation_error_rad"], MAX_ROTATION_RAD, "rad"),
+        ("translation", 100 * metrics["translation_error_share"], 100 * MAX_TRANSLATION_SHARE, "% of the diameter"),
+        ("scale", 100 * metrics["scale_error_share"], 100 * MAX_SCALE_SHARE, "%"),
+    ]
+    sigma = result["uncertainty"]
+    out.print(
+        f"uncertainty  {max(sigma['rotation_deg']):.2g} degrees, {sigma['scale_percent']:.2g} % in scale (1 sigma)"
+    )
+    out.print("error against the true transform")
+    for name, value, bound, unit in errors:
+        color = "green" if value <= bound else "red"
+        out.print(f"   {name:<12} [{color}]{value:.4f}[/] {unit} (at most {bound:g})")
+    return result["verdict"] == "registered" and all(value <= bound for _, value, bound, _ in errors)
+
+
+def _wait_for_enter() -> None:
+    out.print("\nOpen the page; press Enter here to stop the service.")
+    with contextlib.suppress(KeyboardInterrupt, EOFError):
+        input()
