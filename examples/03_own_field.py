@@ -48,7 +48,7 @@ class BoxesField:
 
 
 cube = torch.tensor([[-1.0] * 3, [1.0] * 3], dtype=torch.float64)
-T_object_scene = Sim3.exp(torch.tensor([0.05, -0.08, 0.02, 0.0, 0.0, 0.4, 0.2], dtype=torch.float64))
+T_object_scene = Sim3.exp(torch.tensor([0.0, 0.0, 0.4, 0.05, -0.08, 0.02, 0.2], dtype=torch.float64))
 chair = BoxesField(Sim3.identity(), cube)
 scene = BoxesField(T_object_scene, cube)
 

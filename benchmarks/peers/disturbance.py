@@ -19,7 +19,7 @@ def disturbed(truth: Sim3, about: Tensor, degrees: float, shift: float, seed: in
     generator = torch.Generator().manual_seed(seed)
     axis, direction = (_unit(torch.randn(3, generator=generator, dtype=torch.float64)) for _ in range(2))
     center = about.double().cpu()
-    tangent = torch.cat([torch.zeros(3), math.radians(degrees) * axis, torch.zeros(1)]).double()
+    tangent = torch.cat([math.radians(degrees) * axis, torch.zeros(4)]).double()
     turn = Sim3.from_translation(center) @ Sim3.exp(tangent) @ Sim3.from_translation(-center)
     return Sim3.from_translation(shift * direction) @ turn @ truth
 

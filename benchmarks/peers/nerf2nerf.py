@@ -37,7 +37,7 @@ from benchmarks.peers.disturbance import keypoints, rigid_fit
 from benchmarks.peers.interface import PeerCase, PeerResult
 from regnf_core import SdfField, Sim3
 from regnf_core.fields.base import CountingField, differentiable_signed_distance
-from regnf_core.geometry.sim3_tangent import exp_parts
+from regnf_core.geometry.exponential_map import rotation_exp
 from regnf_core.paper.kernel import AdaptiveKernel
 from regnf_core.paper.sampling import thin_out
 
@@ -96,8 +96,7 @@ class RigidMotion:
 
     def transform(self) -> Sim3:
         """The transform; differentiable in ``turn`` and ``shift``."""
-        nothing = torch.zeros(3, dtype=torch.float64)
-        _, R, _ = exp_parts(torch.cat([nothing, self.turn, nothing[:1]]))
+        R = rotation_exp(self.turn)
         offset = R @ (self.start.translation - self.center) + self.center + self.unit * self.shift
         return Sim3(self.start.scale, R @ self.start.rotation, offset)
 

@@ -23,7 +23,7 @@ def pose_error(estimate: Sim3, truth: Sim3) -> Tensor:
     s e^(d log s), exp(omega) R, t + dt, as RegistrationResult.covariance has it; radians and object units.
     """
     turn = Sim3(torch.ones(()).double(), truth.rotation @ estimate.rotation.mT, torch.zeros(3).double())
-    omega = turn.log()[3:6]
+    omega = turn.log()[:3]
     shift = truth.translation - estimate.translation
     return torch.cat([omega, shift, (truth.scale / estimate.scale).log().reshape(1)])
 

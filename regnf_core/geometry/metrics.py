@@ -42,7 +42,7 @@ def rotation_error(estimate: Sim3, truth: Sim3, symmetries: Symmetries | None = 
     """The angle, radians, of the turn between estimate and truth; the least over the symmetries."""
     S = (symmetries or Symmetries()).transforms()
     difference = Sim3(torch.ones_like(S.scale), estimate.rotation @ (S.rotation @ truth.rotation).mT, S.translation)
-    return float(difference.log()[:, 3:6].norm(dim=-1).min())
+    return float(difference.log()[:, :3].norm(dim=-1).min())
 
 
 def surface_displacement(estimate: Sim3, truth: Sim3, points: Tensor, symmetries: Symmetries) -> Tensor:
@@ -54,8 +54,8 @@ def surface_displacement(estimate: Sim3, truth: Sim3, points: Tensor, symmetries
     S = symmetries.transforms()
     true_back = truth.inverse()
     rows = []
-    for start in range(0, S.scale.shape[0], _CHUNK):
-        part = Sim3(*(value[start : start + _CHUNK] for value in (S.scale, S.rotation, S.translation)))
+    for start in range(0, len(S), _CHUNK):
+        part = S[start : start + _CHUNK]
         rows.append((placed - true_back.apply(part.apply(points.double()))).norm(dim=-1))  # (k, N)
     return float(truth.scale) * torch.cat(rows)
 

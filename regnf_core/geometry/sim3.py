@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
-from regnf_core.geometry.sim3_tangent import exp_parts, log_parts, matrix_from_quaternion, quaternion_from_matrix
+from regnf_core.geometry.exponential_map import exp_parts, log_parts, rotation_exp, split_tangent
+from regnf_core.geometry.quaternions import matrix_from_quaternion, quaternion_from_matrix
 
 _SIMILARITY_TOLERANCE = 1e-4  # float32 matrices from other tools come with about 1e-6
 
@@ -33,6 +34,7 @@ class Sim3:
 
     scale: (...) > 0 · rotation: (..., 3, 3) proper · translation: (..., 3). float64 unless made otherwise.
     Products read like the paper's: ``(T_c_b @ T_b_a)`` maps frame a to frame c. Autograd flows through everything.
+    A batch is indexed like a tensor: ``T[i]``, ``T[mask]``, and ``T[None]`` makes a batch of one transform.
     """
 
     scale: Tensor
@@ -105,12 +107,56 @@ class Sim3:
 
     @classmethod
     def exp(cls, tangent: Tensor) -> Sim3:
-        """The exponential of (..., 7): translation part rho (3), rotation omega (3, radians), log scale (1)."""
+        """The exponential of (..., 7): rotation omega (3, radians), translation part rho (3), log scale (1)."""
         return cls(*exp_parts(tangent))
+
+    @classmethod
+    def cat(cls, parts: Sequence[Sim3]) -> Sim3:
+        """All transforms of several batches or single transforms, one after the other: a batch (H,), H >= 0."""
+        if not parts:
+            return cls.identity()[None][:0]
+        return cls(
+            torch.cat([T.scale.reshape(-1) for T in parts]),
+            torch.cat([T.rotation.reshape(-1, 3, 3) for T in parts]),
+            torch.cat([T.translation.reshape(-1, 3) for T in parts]),
+        )
+
+    @classmethod
+    def where(cls, mask: Tensor, first: Sim3, second: Sim3) -> Sim3:
+        """Batches of equal shape: ``first`` where ``mask`` (...) is True, else ``second``."""
+        return cls(
+            torch.where(mask, first.scale, second.scale),
+            torch.where(mask[..., None, None], first.rotation, second.rotation),
+            torch.where(mask[..., None], first.translation, second.translation),
+        )
+
+    def __len__(self) -> int:
+        """How many transforms a batch holds."""
+        return len(self.scale)
+
+    def __getitem__(self, index: Tensor | slice | int | None) -> Sim3:
+        """The transforms that ``index`` (numbers, bools or a slice) names, in its order."""
+        return Sim3(self.scale[index], self.rotation[index], self.translation[index])
+
+    def __iter__(self) -> Iterator[Sim3]:
+        return (self[i] for i in range(len(self)))
+
+    def expand(self, count: int) -> Sim3:
+        """One transform ``count`` times, as a batch."""
+        return Sim3(*(part.expand(count, *part.shape) for part in (self.scale, self.rotation, self.translation)))
 
     def log(self) -> Tensor:
         """The tangent (..., 7) whose :meth:`exp` is this transform; its rotation angle is at most pi."""
         return log_parts(self.scale, self.rotation, self.translation)
+
+    def perturb(self, step: Tensor) -> Sim3:
+        """s e^sigma, exp(omega) R, t + dt for steps (..., 7) = (omega, dt, sigma).
+
+        A left perturbation that pivots on t: the rotation and the scale leave the translation as it is. It agrees with
+        ``Sim3.exp(step) @ T`` to first order where t = 0.
+        """
+        omega, dt, sigma = split_tangent(step)
+        return Sim3(self.scale * sigma.exp(), rotation_exp(omega) @ self.rotation, self.translation + dt)
 
     def __matmul__(self, other: Sim3) -> Sim3:
         """The transform that applies ``other`` first."""

@@ -56,12 +56,7 @@ class Symmetries:
         turned = [Sim3.identity()]
         for symmetry in self.continuous:
             turned += [_turn(symmetry, 2 * math.pi * k / steps) for k in range(1, steps)]
-        every = [turn @ fixed for fixed in discrete for turn in turned]
-        return Sim3(
-            torch.stack([T.scale for T in every]),
-            torch.stack([T.rotation for T in every]),
-            torch.stack([T.translation for T in every]),
-        )
+        return Sim3.cat([turn @ fixed for fixed in discrete for turn in turned])
 
 
 def _turn(symmetry: ContinuousSymmetry, angle: float) -> Sim3:
@@ -69,7 +64,7 @@ def _turn(symmetry: ContinuousSymmetry, angle: float) -> Sim3:
     offset: Tensor = torch.tensor(list(symmetry.offset), dtype=torch.float64)
     if not axis.norm() > 1e-9:
         raise InvalidInputError("a symmetry axis must not vanish", reason="INVALID_SYMMETRY")
-    tangent = torch.cat([torch.zeros(3, dtype=torch.float64), angle * axis / axis.norm(), torch.zeros(1).double()])
+    tangent = torch.cat([angle * axis / axis.norm(), torch.zeros(4, dtype=torch.float64)])
     return Sim3.from_translation(offset) @ Sim3.exp(tangent) @ Sim3.from_translation(-offset)
 
 

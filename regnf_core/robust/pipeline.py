@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.geometry.pose_distance import displacement
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
-from regnf_core.robust.poses import displacement, join, select
 from regnf_core.robust.refine.pose_candidates import LAST, STAGES, Finalists, Trail, run_stage
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.samples import split
@@ -103,7 +103,7 @@ def find_candidates(
             torch.tensor(SCALE_FACTORS),
         )
     if more_seeds is not None:
-        T = join([T, more_seeds])
+        T = Sim3.cat([T, more_seeds])
     return search(view.proxy, model.proxy, view.foreground, model.samples, T, model.extremes, generator, rounds)
 
 
@@ -131,7 +131,18 @@ def refine_candidates(
     descent = torch.cat([torch.arange(T.scale.numel()), torch.zeros(twins.scale.numel(), dtype=torch.long)])
     trail = found.trail.keep(descent)
     last = run_stage(
-        scene, obj, problem.A, problem.B, join([T, twins]), LAST, ex, generator, trail, on_step, offsets[descent], most
+        scene,
+        obj,
+        problem.A,
+        problem.B,
+        Sim3.cat([T, twins]),
+        LAST,
+        ex,
+        generator,
+        trail,
+        on_step,
+        offsets[descent],
+        most,
     )
     evidence = gather_evidence(scene, obj, problem.A_held, problem.B_held, last.T, options, last.offsets)
     T_initial = last.trail.steps[0].T
@@ -141,12 +152,10 @@ def refine_candidates(
 def _missing_twins(T: Sim3, symmetry: SelfSymmetry, extremes: Tensor) -> Sim3:
     """The best pose (the first of T) turned by each of the object's symmetries, without those that T holds already."""
     if symmetry.T.scale.numel() == 0:
-        return select(T, torch.tensor([], dtype=torch.long))
-    twins = symmetry.T @ select(T, torch.tensor([0]))
-    nearest = torch.stack(
-        [displacement(twins, select(T, torch.tensor(i)), extremes) for i in range(T.scale.numel())]
-    ).amin(0)
-    return select(twins, nearest > _SAME_POSE)
+        return T[:0]
+    twins = symmetry.T @ T[:1]
+    nearest = torch.stack([displacement(twins, T[i], extremes) for i in range(T.scale.numel())]).amin(0)
+    return twins[nearest > _SAME_POSE]
 
 
 def _rotations(options: RobustOptions) -> Tensor:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
-
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import IterationRecord, RegistrationResult, SurfaceSamples
 from regnf_core.robust.pipeline import Outcome, Problem
-from regnf_core.robust.poses import select
 from regnf_core.robust.refine.pose_candidates import Trail
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.verdict.conclusion import Conclusion, pose_covariance
@@ -27,7 +24,7 @@ def result_of(
 ) -> RegistrationResult:
     """The result in the fields' own frames. evaluations: of both fields, all told."""
     view, model = problem.view, problem.model
-    initial = select(outcome.T_initial, torch.tensor(conclusion.winner))
+    initial = outcome.T_initial[conclusion.winner]
     return RegistrationResult(
         verdict=conclusion.verdict,
         verdict_reason=conclusion.reason,
@@ -54,7 +51,7 @@ def _trace(problem: Problem, trail: Trail, winner: int) -> list[IterationRecord]
     size = problem.model.frame.length
     records = []
     for iteration, step in enumerate(trail.steps):
-        T = problem.in_field_frames(select(step.T, torch.tensor(winner)))
+        T = problem.in_field_frames(step.T[winner])
         records.append(
             IterationRecord(
                 iteration=iteration,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.result import ObjectSymmetry
-from regnf_core.robust.poses import distinct, join, select
 from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Samples, residuals
 from regnf_core.robust.samples import some
@@ -46,8 +46,8 @@ class SelfSymmetry:
 
     def group(self) -> ObjectSymmetry:
         """What the object's field calls its symmetries: exact turns alone."""
-        exact = select(self.T, self.deviation <= _EXACT)
-        omega = exact.log()[:, 3:6]
+        exact = self.T[self.deviation <= _EXACT]
+        omega = exact.log()[:, :3]
         if self.axis is not None:
             across = int((~_about(exact, self.axis)).sum())
             return ObjectSymmetry(1 + min(across, 1), _tuple(self.axis), True)
@@ -66,19 +66,19 @@ def self_symmetry(
     few = some(B, _POINTS, generator)
     start = _rigid(rotations)
     coarse = disagreement(residuals(obj, obj, some(few, 48, generator), some(few, 48, generator), start), 0.1)
-    T = select(start, coarse.argsort()[:80])
+    T = start[coarse.argsort()[:80]]
     refined = minimize(obj, obj, few, few, T, [0.1, 0.07, 0.05, 0.03, 0.02, 0.02], fix_scale=True)
     scores = disagreement(refined.residuals, _WIDTH)
     itself = float(disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None].double())), _WIDTH))
     alike = (scores <= itself + _ALIKE).nonzero().squeeze(-1)
-    T, scores = select(refined.T, alike), scores[alike]
+    T, scores = refined.T[alike], scores[alike]
     kept = _distinct_turns(T, scores, extremes)
-    T, scores = select(T, kept), scores[kept]
+    T, scores = T[kept], scores[kept]
     axis = _continuous_axis(obj, few, T, itself)
     if axis is not None:
         across = ~_about(T, axis)
         turns = _rigid(turns_about(axis, 8)[1:])
-        T = join([select(T, across), turns])
+        T = Sim3.cat([T[across], turns])
     return SelfSymmetry(T, axis, torch.zeros(T.scale.numel()))
 
 
@@ -95,7 +95,7 @@ def confirmed(
     refined = minimize(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
     deviation = (refined.residuals.values.abs() > _OFF).float().mean(1)
     kept = _distinct_turns(refined.T, deviation, extremes)
-    T, deviation = select(refined.T, kept), deviation[kept]
+    T, deviation = refined.T[kept], deviation[kept]
     axis = proposed.axis
     if axis is not None and bool((deviation[_about(T, axis)] > _EXACT).any()):
         axis = None
@@ -116,7 +116,7 @@ def _rigid(rotations: Tensor) -> Sim3:
 
 def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> Tensor | None:
     """An axis (3,) about which every turn is a symmetry, if one of the symmetries' axes is such."""
-    for omega in T.log()[:, 3:6]:
+    for omega in T.log()[:, :3]:
         angle = float(omega.norm())
         if angle < 0.1 or angle > 3.0:  # half turns say little: what is round has others too
             continue
@@ -135,6 +135,6 @@ def _tuple(axis: Tensor) -> tuple[float, float, float]:
 
 def _about(T: Sim3, axis: Tensor) -> Tensor:
     """(K,) bool: which of the transforms turn about the axis."""
-    omega = T.log()[:, 3:6]
+    omega = T.log()[:, :3]
     about: Tensor = (omega @ axis).abs() >= 0.97 * omega.norm(dim=-1)
     return about

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import perturb
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, residuals
 
 _UNSEEN_WIDTH = 0.3  # of the others' kernel
@@ -97,11 +96,11 @@ def minimize(
     for iteration, least in enumerate(widths):
         width = fitting_width(now, least) if adaptive else least
         step = _step(now, width, damping, fix_scale, most_offset == 0.0)
-        T_tried = perturb(T, step)
+        T_tried = T.perturb(step)
         shifted = None if now.offset is None else (now.offset + step[:, 7]).clamp(-most_offset, most_offset)
         tried = residuals(scene, obj, A, B, T_tried, shifted)
         better = robust_cost(tried, width) < robust_cost(now, width)
-        T, now = _choose(better, T_tried, T), _choose_residuals(better, tried, now)
+        T, now = Sim3.where(better, T_tried, T), _choose_residuals(better, tried, now)
         damping = torch.where(better, damping / 6.0, damping * 5.0).clamp(*_DAMPING_RANGE)
         if on_iteration is not None:
             on_iteration(iteration, T, now, robust_cost(now, width))
@@ -144,14 +143,6 @@ def _step(r: Residuals, width: Tensor | float, damping: Tensor, fix_scale: bool,
     longest = step.abs().amax(-1, keepdim=True)
     short: Tensor = step * (_LARGEST_STEP / longest.clamp_min(_LARGEST_STEP))
     return short
-
-
-def _choose(better: Tensor, first: Sim3, second: Sim3) -> Sim3:
-    return Sim3(
-        torch.where(better, first.scale, second.scale),
-        torch.where(better[:, None, None], first.rotation, second.rotation),
-        torch.where(better[:, None], first.translation, second.translation),
-    )
 
 
 def _choose_residuals(better: Tensor, first: Residuals, second: Residuals) -> Residuals:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples
 from regnf_core.robust.samples import some
@@ -60,7 +60,7 @@ class Trail:
         return Trail(
             [
                 Step(
-                    select(s.T, index),
+                    s.T[index],
                     s.costs[index],
                     s.residual_scene[index],
                     s.residual_object[index],
@@ -129,4 +129,4 @@ def run_stage(
     kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]
     r = refined.residuals.of(kept)
     assert r.offset is not None
-    return Finalists(select(refined.T, kept), scores[kept], r, trail.keep(kept), r.offset)
+    return Finalists(refined.T[kept], scores[kept], r, trail.keep(kept), r.offset)

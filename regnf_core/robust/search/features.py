@@ -11,7 +11,6 @@ from typing import Any
 import torch
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import join
 from regnf_core.robust.residuals import Samples
 
 _VOXEL = 0.08  # root mean square radii
@@ -53,7 +52,7 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
             T = _similarity(matched)
             if T is not None:
                 found.append(to_object.inverse() @ T @ to_scene)
-    return join(found) if found else Sim3(*(torch.zeros(0, *shape).double() for shape in ((), (3, 3), (3,))))
+    return Sim3.cat(found)
 
 
 def _normalizing(samples: Samples) -> Sim3:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import join, perturb
 
 
 def seeds(
@@ -29,7 +28,7 @@ def seeds(
     low, high = _object_extents(object_points, rotations, box_axes)
     by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
     by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
-    return join([by_moments, by_points, by_box])
+    return Sim3.cat([by_moments, by_points, by_box])
 
 
 def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
@@ -37,8 +36,7 @@ def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
     spread = torch.tensor([0.17] * 3 + [0.05] * 3 + [0.10], dtype=torch.float64)
     steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
     steps[0] = 0.0
-    same = [v.expand(count + 1, *v.shape) for v in (T_start.scale, T_start.rotation, T_start.translation)]
-    return perturb(Sim3(*same), steps)
+    return T_start.expand(count + 1).perturb(steps)
 
 
 def _from_moments(scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor) -> Sim3:

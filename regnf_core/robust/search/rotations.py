@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.sim3_tangent import matrix_from_quaternion
+from regnf_core.geometry.quaternions import matrix_from_quaternion
 
 _PHI = math.sqrt(2.0)
 _PSI = 1.533751168755204288118041

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.refine.levenberg_marquardt import minimize
 from regnf_core.robust.residuals import DistanceModel, Residuals, Samples, residuals
 from regnf_core.robust.samples import some
@@ -68,10 +68,10 @@ def search(
     for one in rounds:
         few_A, few_B = some(A, one.points, generator), some(B, one.points, generator)
         parts = [_refine(scene, obj, few_A, few_B, part, one) for part in _chunks(T)]
-        T = Sim3(*(torch.cat([getattr(p[0], n) for p in parts]) for n in ("scale", "rotation", "translation")))
+        T = Sim3.cat([p[0] for p in parts])
         scores = torch.cat([p[1] for p in parts])
         kept = distinct(T, scores, extremes, one.apart, one.keep) if one.widths else scores.argsort()[: one.keep]
-        T, scores = select(T, kept), scores[kept]
+        T, scores = T[kept], scores[kept]
     return T, scores
 
 
@@ -85,4 +85,4 @@ def _refine(
 
 
 def _chunks(T: Sim3) -> list[Sim3]:
-    return [select(T, part) for part in torch.split(torch.arange(T.scale.shape[0]), _CHUNK)]
+    return [T[part] for part in torch.split(torch.arange(T.scale.shape[0]), _CHUNK)]

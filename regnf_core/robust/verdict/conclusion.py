@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, Verdict
 from regnf_core.robust.pipeline import Outcome, Problem
-from regnf_core.robust.poses import distinct, select
 from regnf_core.robust.refine.levenberg_marquardt import fitting_width
 from regnf_core.robust.refine.pose_candidates import LAST
 from regnf_core.robust.residuals import residuals
@@ -50,7 +50,7 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     best = float(evidence.scores[winner])
     close = evidence.scores <= best + options.robust.rival_margin + _MARGIN_PER_SCORE * best
     rivals = [i for i in ranked.tolist() if i != winner and close[i]]
-    T_work = select(poses, torch.tensor(winner))
+    T_work = poses[winner]
     extra = extra_share(
         problem.scene_field, problem.object_field, problem.A_held, T_work, evidence.offsets[winner], options.robust
     )
@@ -59,7 +59,7 @@ def conclude(problem: Problem, outcome: Outcome, options: RegistrationOptions) -
     alternatives = []
     axis = problem.model.symmetry.axis
     for i in rivals if decision.verdict != "rejected" else []:
-        other = problem.in_field_frames(select(poses, torch.tensor(i)))
+        other = problem.in_field_frames(poses[i])
         alternatives.append(Alternative(other, float(evidence.scores[i]), relation(other, T, axis)))
     diameter = problem.model.frame.length
     metrics = {
@@ -80,10 +80,8 @@ def pose_covariance(problem: Problem, T_work: Sim3, offset: Tensor) -> Tensor:
     offset: of the surfaces, object diameters, a single number.
     """
     A, B = problem.A, problem.B
-    batch = Sim3(T_work.scale[None], T_work.rotation[None], T_work.translation[None])
-    r = residuals(
-        problem.scene_field, problem.object_field, A, B, batch, offset[None] if problem.view.most_offset > 0.0 else None
-    )
+    offsets = offset[None] if problem.view.most_offset > 0.0 else None
+    r = residuals(problem.scene_field, problem.object_field, A, B, T_work[None], offsets)
     places = torch.cat([T_work.apply(A.points.double()), B.points.double()])
     cov = covariance(r, fitting_width(r, LAST.widths[-1]), places)
     return in_object_units(cov, T_work, problem.view.frame, problem.model.frame)

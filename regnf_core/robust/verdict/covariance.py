@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.geometry.sim3_tangent import skew
 from regnf_core.robust.refine.levenberg_marquardt import (
     OFFSET_PRIOR,
     geman_mcclure_weights,

@@ -16,8 +16,8 @@ def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> st
 
     free_axis: (3,), object frame, about which any turn would do as well.
     """
-    rho_omega = (T_other @ T_best.inverse()).log()
-    omega, factor = rho_omega[3:6], math.exp(float(rho_omega[6]))
+    difference = (T_other @ T_best.inverse()).log()
+    omega, factor = difference[:3], math.exp(float(difference[6]))
     angle = float(omega.norm())
     words = []
     if angle > math.radians(2.0):

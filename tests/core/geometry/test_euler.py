@@ -17,7 +17,7 @@ _angle = st.floats(-3.1, 3.1)
 
 def _about(axis: int, angle: float) -> torch.Tensor:
     tangent = torch.zeros(7, dtype=torch.float64)
-    tangent[3 + axis] = angle
+    tangent[axis] = angle
     return Sim3.exp(tangent).rotation
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
+from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.geometry.sim3_tangent import skew
 
 _unit = st.floats(-1.0, 1.0, allow_nan=False)
 _vector = st.tuples(_unit, _unit, _unit)
@@ -28,13 +29,13 @@ def tangents(draw: st.DrawFn) -> Tensor:
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     angle = draw(st.one_of(st.floats(0, math.pi - 1e-6), st.sampled_from([0.0, 1e-12, 1e-6, 1e-4, math.pi - 1e-7])))
     sigma = draw(st.one_of(st.floats(-3, 3), st.sampled_from([0.0, 1e-12, -1e-6, 1e-3, -0.5, 0.5])))
-    return torch.cat([rho, angle * axis / axis.norm(), torch.tensor([sigma], dtype=torch.float64)])
+    return torch.cat([angle * axis / axis.norm(), rho, torch.tensor([sigma], dtype=torch.float64)])
 
 
 def generator_matrix(tangent: Tensor) -> Tensor:
     M = torch.zeros(4, 4, dtype=torch.float64)
-    M[:3, :3] = skew(tangent[3:6]) + tangent[6] * torch.eye(3, dtype=torch.float64)
-    M[:3, 3] = tangent[:3]
+    M[:3, :3] = skew(tangent[:3]) + tangent[6] * torch.eye(3, dtype=torch.float64)
+    M[:3, 3] = tangent[3:6]
     return M
 
 
@@ -47,7 +48,7 @@ def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
 
 @settings(deadline=None, max_examples=200)
 @given(tangents())
-@example(torch.tensor([0.3, -0.2, 0.9, math.pi - 1e-9, 0.0, 0.0, 0.7], dtype=torch.float64))
+@example(torch.tensor([math.pi - 1e-9, 0.0, 0.0, 0.3, -0.2, 0.9, 0.7], dtype=torch.float64))
 def test_log_undoes_exp(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(tangent).log(), tangent, rtol=1e-7, atol=1e-7)
 
@@ -56,7 +57,7 @@ def test_log_undoes_exp(tangent: Tensor) -> None:
 @given(tangents())
 def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
     half_turn = tangent.clone()
-    half_turn[3:6] = tangent[3:6] / tangent[3:6].norm().clamp_min(1e-12) * math.pi
+    half_turn[:3] = tangent[:3] / tangent[:3].norm().clamp_min(1e-12) * math.pi
     T = Sim3.exp(half_turn)
     torch.testing.assert_close(Sim3.exp(T.log()).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
 
@@ -105,7 +106,7 @@ def test_batches_broadcast_over_points() -> None:
 
 
 def test_a_float32_matrix_is_accepted_and_cleaned() -> None:
-    T = Sim3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6, 0.3], dtype=torch.float64))
+    T = Sim3.exp(torch.tensor([0.4, -0.5, 0.6, 0.1, 0.2, 0.3, 0.3], dtype=torch.float64))
     cleaned = Sim3.from_matrix(T.matrix().float())
     R = cleaned.rotation
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
@@ -124,7 +125,7 @@ def test_a_float32_matrix_is_accepted_and_cleaned() -> None:
     ],
 )
 def test_what_is_no_similarity_is_refused(spoil, what) -> None:  # type: ignore[no-untyped-def]
-    good = Sim3.exp(torch.tensor([0.1, 0.2, 0.3, 0.4, -0.5, 0.6, 0.3], dtype=torch.float64)).matrix()
+    good = Sim3.exp(torch.tensor([0.4, -0.5, 0.6, 0.1, 0.2, 0.3, 0.3], dtype=torch.float64)).matrix()
     with pytest.raises(InvalidInputError) as caught:
         Sim3.from_matrix(spoil(good))
     assert caught.value.reason == "INVALID_TRANSFORM", what
@@ -157,7 +158,79 @@ def test_faulty_parts_are_refused(values: dict[str, object]) -> None:
 def test_gradients_flow_through_exp_at_zero() -> None:
     zero = torch.zeros(7, dtype=torch.float64, requires_grad=True)
     points = torch.tensor([[1.0, 2.0, 3.0]], dtype=torch.float64)
-    # Moving by rho, turning (omega x p) and scaling (sigma p), to first order.
+    # Turning (omega x p), moving by rho and scaling (sigma p), to first order.
     jacobian = torch.autograd.functional.jacobian(lambda v: Sim3.exp(v).apply(points)[0], zero)
-    expected = torch.cat([torch.eye(3), -skew(points[0].float()), points[0, :, None]], dim=1).double()
+    expected = torch.cat([-skew(points[0].float()), torch.eye(3), points[0, :, None]], dim=1).double()
     torch.testing.assert_close(jacobian, expected, rtol=1e-9, atol=1e-9)
+
+
+def rotation_part(step: Tensor) -> Sim3:
+    return Sim3.exp(torch.cat([step[:3], torch.zeros(4, dtype=torch.float64)]))
+
+
+def test_one_order_of_the_seven_numbers() -> None:
+    """Rotation, translation, log scale: in exp, log and perturb alike, as the public covariance has them."""
+    step = torch.tensor([0.3, -0.1, 0.2, 1.0, 2.0, 3.0, 0.5], dtype=torch.float64)
+    identity = Sim3.identity()
+    assert torch.equal(identity.perturb(step).translation, step[3:6])
+    assert torch.equal(identity.perturb(step).scale, step[6].exp())
+    torch.testing.assert_close(identity.perturb(step).log()[:3], step[:3])
+    torch.testing.assert_close(Sim3.exp(step).log(), step)
+    torch.testing.assert_close(Sim3.exp(step).rotation, identity.perturb(step).rotation)
+    torch.testing.assert_close(Sim3.exp(step).scale, identity.perturb(step).scale)
+
+
+@pytest.mark.parametrize("k", range(7))
+def test_perturbing_the_identity_is_exp_to_first_order(k: int) -> None:
+    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    direction = torch.zeros(7, dtype=torch.float64)
+    direction[k] = 1.0
+
+    def slope(move: Callable[[Tensor], Sim3]) -> Tensor:
+        h = 1e-5
+        return (move(h * direction).apply(points) - move(-h * direction).apply(points)) / (2 * h)
+
+    by_perturbing = slope(Sim3.identity().perturb)
+    torch.testing.assert_close(by_perturbing, slope(Sim3.exp), rtol=1e-8, atol=1e-8)
+    assert by_perturbing.abs().amax() > 0.5
+    mixed = torch.randn(7, generator=torch.Generator().manual_seed(k), dtype=torch.float64)
+    for size in (1e-2, 1e-3, 1e-4):  # the difference is of second order
+        apart = (Sim3.identity().perturb(size * mixed).matrix() - Sim3.exp(size * mixed).matrix()).abs().amax()
+        assert apart < 20.0 * size**2
+
+
+def test_perturb_pivots_on_the_translation() -> None:
+    T = Sim3.exp(torch.tensor([0.4, -0.5, 0.6, 0.1, 0.2, 0.3, 0.3], dtype=torch.float64))
+    step = torch.tensor([0.3, -0.1, 0.2, 1.0, 2.0, 3.0, 0.5], dtype=torch.float64)
+    moved = T.perturb(step)
+    torch.testing.assert_close(moved.translation, T.translation + step[3:6])
+    torch.testing.assert_close(moved.rotation, rotation_part(step).rotation @ T.rotation)
+    torch.testing.assert_close(moved.scale, T.scale * step[6].exp())
+
+
+def some_batch(count: int) -> Sim3:
+    return Sim3.exp(torch.randn(count, 7, generator=torch.Generator().manual_seed(count), dtype=torch.float64))
+
+
+def test_batches_are_indexed_like_tensors() -> None:
+    T = some_batch(5)
+    M = T.matrix()
+    assert len(T) == 5
+    assert T[2].scale.shape == ()
+    for index in (2, slice(1, 4), torch.tensor([4, 0, 0]), torch.tensor([True, False, True, False, False])):
+        assert torch.equal(T[index].matrix(), M[index])
+    assert torch.equal(T[2][None].matrix(), M[2:3])
+    assert [one.matrix().shape for one in T] == [(4, 4)] * 5
+    assert torch.equal(T[3].expand(4).matrix(), M[3].expand(4, 4, 4))
+    with pytest.raises(TypeError):
+        iter(T[0])
+
+
+def test_batches_are_joined_and_chosen_from() -> None:
+    T, other = some_batch(3), some_batch(4)
+    joined = Sim3.cat([T, other[1], other[:0]])
+    assert torch.equal(joined.matrix(), torch.cat([T.matrix(), other.matrix()[1:2]]))
+    assert Sim3.cat([]).matrix().shape == (0, 4, 4)
+    mask = torch.tensor([True, False, True])
+    chosen = Sim3.where(mask, T, other[:3])
+    assert torch.equal(chosen.matrix(), torch.where(mask[:, None, None], T.matrix(), other.matrix()[:3]))

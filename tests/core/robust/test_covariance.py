@@ -10,7 +10,6 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import perturb
 from regnf_core.robust.residuals import Residuals, residuals
 from regnf_core.robust.samples import sample_object_surface
 from regnf_core.robust.verdict.covariance import covariance, in_object_units
@@ -26,7 +25,7 @@ def at_the_truth(count: int) -> tuple[Residuals, Tensor]:
     found = sample_object_surface(chair(), 2000, torch.Generator().manual_seed(0))
     one = found.samples[torch.randperm(len(found.samples), generator=torch.Generator().manual_seed(1))[:count]]
     two = found.samples[torch.randperm(len(found.samples), generator=torch.Generator().manual_seed(2))[:count]]
-    identity = Sim3(*(v[None] for v in (torch.ones(()).double(), torch.eye(3).double(), torch.zeros(3).double())))
+    identity = Sim3.identity()[None]
     r = residuals(found.field, found.field, one, two, identity)
     return r, torch.cat([one.points, two.points]).double()
 
@@ -103,7 +102,7 @@ def test_units_and_frames_by_moving_a_point() -> None:
         return obj.to_field() @ T @ scene.to_field().inverse()
 
     def moved(T: Sim3, by: Tensor) -> Sim3:
-        batch = perturb(Sim3(T.scale[None], T.rotation[None], T.translation[None]), by[None])
+        batch = T[None].perturb(by[None])
         return Sim3(batch.scale[0], batch.rotation[0], batch.translation[0])
 
     points = torch.randn(5, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64)

@@ -35,7 +35,9 @@ def samples(*rows: tuple[float, float, float]) -> Samples:
 
 def share(A: Samples, right: float, T: Sim3 | None = None) -> float:
     """Of the plane z = 0 as object, in a scene whose matter reaches to ``right`` above x = 5."""
-    return extra_share(Floor(0.0, right), Floor(0.0, 0.0), A, T or Sim3.identity(), NONE, RobustOptions())
+    return extra_share(
+        Floor(0.0, right), Floor(0.0, 0.0), A, Sim3.identity() if T is None else T, NONE, RobustOptions()
+    )
 
 
 def test_what_lies_on_the_object_is_extra() -> None:

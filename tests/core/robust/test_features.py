@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.pose_distance import displacement
 from regnf_core.robust.model.object_model import model_object
-from regnf_core.robust.poses import displacement
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.search.features import feature_seeds
 from tests.core.analytic import AnalyticField, sphere, union

@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 import torch
 
+from regnf_core.geometry.pose_distance import displacement
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import displacement, perturb
 from regnf_core.robust.refine.levenberg_marquardt import geman_mcclure_weights, minimize, robust_cost
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.samples import sample_object_surface, some
@@ -31,7 +31,7 @@ def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
     source = sample_object_surface(seen, 800, generator)
     T_work = target.frame.to_field().inverse() @ truth @ source.frame.to_field()
     step = torch.randn(24, 7, generator=generator, dtype=torch.float64) * torch.tensor([0.12] * 3 + [0.04] * 3 + [0.08])
-    start = perturb(Sim3(*(v.expand(24, *v.shape) for v in (T_work.scale, T_work.rotation, T_work.translation))), step)
+    start = T_work.expand(24).perturb(step)
     A, B = some(source.samples, 300, generator), some(target.samples, 300, generator)
     refined = minimize(
         source.field, target.field, A, B, start, [0.1, 0.1, 0.08, 0.06, 0.04, 0.03, 0.02, 0.01, 0.01, 0.01]
@@ -45,10 +45,7 @@ def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
 def test_no_iteration_raises_the_cost() -> None:
     generator = torch.Generator().manual_seed(1)
     target = sample_object_surface(chair(), 400, generator)
-    start = perturb(
-        Sim3(torch.ones(5).double(), torch.eye(3).double().expand(5, 3, 3), torch.zeros(5, 3).double()),
-        0.2 * torch.randn(5, 7, generator=generator, dtype=torch.float64),
-    )
+    start = Sim3.identity().expand(5).perturb(0.2 * torch.randn(5, 7, generator=generator, dtype=torch.float64))
     before = robust_cost(residuals(target.field, target.field, target.samples, target.samples, start), 0.05)
     costs = [before]
     minimize(

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.poses import perturb
 from regnf_core.robust.refine.levenberg_marquardt import (
     MOST_OFFSET,
     OFFSET_PRIOR,
@@ -78,10 +77,7 @@ def test_a_thick_copy_keeps_its_scale() -> None:
     by = 0.015 * target.frame.length
     source = sample_object_surface(thickened(chair(), by), 900, generator)
     truth = target.frame.to_field().inverse() @ source.frame.to_field()
-    start = perturb(
-        Sim3(truth.scale[None], truth.rotation[None], truth.translation[None]),
-        torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D),
-    )
+    start = truth[None].perturb(torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D))
     widths = [0.05, 0.04, 0.03, 0.02, *[0.01] * 8]
     without = minimize(source.field, target.field, source.samples, target.samples, start, widths, adaptive=True)
     free = minimize(

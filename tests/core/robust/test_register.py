@@ -11,7 +11,6 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
-from regnf_core.robust.poses import perturb
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import (
     ROBUST,
@@ -144,5 +143,5 @@ def test_with_an_up_axis_only_turns_about_it_are_searched() -> None:
 
 
 def perturbed(T: Sim3, step: torch.Tensor) -> Sim3:
-    moved = perturb(Sim3(T.scale[None], T.rotation[None], T.translation[None]), step[None].double())
+    moved = T[None].perturb(step[None].double())
     return Sim3(moved.scale[0], moved.rotation[0], moved.translation[0])

@@ -1,6 +1,9 @@
-"""The exponential and logarithm of Sim(3), and quaternions: plain batched formulas on tensors.
+"""The exponential and logarithm of Sim(3): plain batched formulas on tensors.
 
-The tangent (rho, omega, sigma) stands for the 4x4 matrix [[skew(omega) + sigma I, rho], [0, 0]]. Its exponential has
+Seven numbers of a pose always stand in one order: rotation vector omega (3, radians), translation part (3), log scale
+sigma (1). The covariance of a result has this order too.
+
+The tangent (omega, rho, sigma) stands for the 4x4 matrix [[skew(omega) + sigma I, rho], [0, 0]]. Its exponential has
 scale exp(sigma), rotation exp(skew(omega)) and translation W rho with
 
     W = integral over u in [0, 1] of exp(u (skew(omega) + sigma I)) = C I + A skew(omega) + B skew(omega)^2.
@@ -10,6 +13,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from regnf_core.geometry.quaternions import matrix_from_quaternion, quaternion_from_matrix
 
 _SMALL_ANGLE = 1e-4  # below it, terms of third order in the angle are under 1e-12
 _SMALL_EXPONENT = 0.5  # below it the power series needs fewer than 20 terms for full precision
@@ -23,64 +28,34 @@ def skew(vectors: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*vectors.shape[:-1], 3, 3)
 
 
+def split_tangent(step: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rotation vector (..., 3), translation part (..., 3) and log scale (...) of (..., 7)."""
+    return step[..., :3], step[..., 3:6], step[..., 6]
+
+
 def exp_parts(tangent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Scale (...), rotation (..., 3, 3) and translation (..., 3) of the tangents (..., 7)."""
-    rho, omega, sigma = tangent[..., :3], tangent[..., 3:6], tangent[..., 6]
+    """Scale (...), rotation (..., 3, 3) and translation (..., 3) of the tangents (omega, rho, sigma), (..., 7)."""
+    omega, rho, sigma = split_tangent(tangent)
     translation = (_w_matrix(omega, sigma) @ rho.unsqueeze(-1)).squeeze(-1)
-    return sigma.exp(), _rotation_exp(omega), translation
+    return sigma.exp(), rotation_exp(omega), translation
 
 
 def log_parts(scale: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """The tangent (..., 7) of a similarity; the inverse of :func:`exp_parts` for angles up to pi."""
-    omega = _rotation_log(rotation)
+    """The tangent (omega, rho, sigma), (..., 7), of a similarity; inverse of :func:`exp_parts` for angles up to pi."""
+    omega = rotation_log(rotation)
     sigma = scale.log()
     rho = torch.linalg.solve(_w_matrix(omega, sigma), translation.unsqueeze(-1)).squeeze(-1)
-    return torch.cat([rho, omega, sigma.unsqueeze(-1)], dim=-1)
+    return torch.cat([omega, rho, sigma.unsqueeze(-1)], dim=-1)
 
 
-def matrix_from_quaternion(q: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), ordered (x, y, z, w)."""
-    x, y, z, w = q.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(*q.shape[:-1], 3, 3)
-
-
-def quaternion_from_matrix(R: Tensor) -> Tensor:
-    """Unit quaternions (..., 4), ordered (x, y, z, w), w >= 0, of rotation matrices (..., 3, 3).
-
-    The four rows below are all multiples of the quaternion; the longest is the well-conditioned one.
-    """
-    trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
-    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    a0, a1, a2 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    rows = torch.stack(
-        [
-            torch.stack([1 + d0 - d1 - d2, s01, s02, a0], -1),
-            torch.stack([s01, 1 - d0 + d1 - d2, s12, a1], -1),
-            torch.stack([s02, s12, 1 - d0 - d1 + d2, a2], -1),
-            torch.stack([a0, a1, a2, 1 + trace], -1),
-        ],
-        dim=-2,
-    )  # (..., 4, 4)
-    longest = rows.norm(dim=-1).argmax(-1)
-    q = rows.gather(-2, longest[..., None, None].expand(*longest.shape, 1, 4)).squeeze(-2)
-    q = q / q.norm(dim=-1, keepdim=True)
-    return torch.where(q[..., 3:] < 0, -q, q)
-
-
-def _rotation_exp(omega: Tensor) -> Tensor:
+def rotation_exp(omega: Tensor) -> Tensor:
     """Rotation vectors (..., 3) to matrices, through the quaternion: sinc has no trouble at zero."""
     angle = omega.norm(dim=-1, keepdim=True)
     vector = 0.5 * torch.sinc(angle / (2 * torch.pi)) * omega
     return matrix_from_quaternion(torch.cat([vector, (angle / 2).cos()], dim=-1))
 
 
-def _rotation_log(R: Tensor) -> Tensor:
+def rotation_log(R: Tensor) -> Tensor:
     """Rotation matrices to vectors (..., 3) of length at most pi; accurate near 0 and near pi alike."""
     q = quaternion_from_matrix(R)
     vector, w = q[..., :3], q[..., 3:]
