@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any, Literal
 
-ACCESS_LOGGER = "service.access"
+ACCESS_LOGGER = "regnf_service.access"
 _context: ContextVar[dict[str, Any]] = ContextVar("log_context")
 _PLAIN = "%(asctime)s %(levelname)-7s %(name)s %(message)s"
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}

@@ -23,7 +23,7 @@ def lines() -> Iterator[io.StringIO]:
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonFormatter())
-    logger = logging.getLogger("service")
+    logger = logging.getLogger("regnf_service")
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
@@ -58,7 +58,7 @@ def test_a_request_is_one_entry_with_its_id_caller_and_job(world: World, lines: 
     (entry,) = entries(lines)[before:]
     told = {name: entry[name] for name in ("logger", "method", "route", "status", "request_id", "caller", "job_id")}
     assert told == {
-        "logger": "service.access",
+        "logger": "regnf_service.access",
         "method": "GET",
         "route": "/jobs/{id}",
         "status": 200,
@@ -98,7 +98,7 @@ def test_probes_are_not_worth_a_line(world: World, lines: io.StringIO) -> None:
 
 
 def test_threads_bear_what_they_were_started_with(lines: io.StringIO) -> None:
-    logger = logging.getLogger("service.test")
+    logger = logging.getLogger("regnf_service.test")
 
     async def work() -> None:
         with log_context(job_id="j1", caller="alice"):
