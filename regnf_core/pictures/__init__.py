@@ -1,1 +1,0 @@
-"""Pictures of fields and of clouds, and the small renderer behind them. Loads little: the import gate draws too."""
