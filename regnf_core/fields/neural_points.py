@@ -11,6 +11,7 @@ from torch import Tensor
 from regnf_core.fields.cell_index import CellIndex
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
+from regnf_core.geometry.quaternions import matrix_from_quaternion
 from regnf_core.schema.kinds.mlp import count_layers
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
 
@@ -202,10 +203,5 @@ def _number(cell: Tensor, buffer_size: int) -> Tensor:
 
 def _to_own_frame(quaternions: Tensor) -> Tensor:
     """The rotations (P, 3, 3) by the conjugates of unit quaternions (P, 4), real part first."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-        (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-        (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+    real_last = torch.nn.functional.normalize(quaternions, dim=-1).roll(-1, dims=-1)
+    return matrix_from_quaternion(real_last).mT.contiguous()

@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.files import atomic_path
 from regnf_core.schema.description import description_to_dict, parse_description
 from regnf_core.schema.kinds.kind import FieldDescription
 from regnf_core.schema.tensor_check import TensorSpec
@@ -50,21 +49,12 @@ def write_safe_field(
     # The table first: its rows are read as wide elements, which asks for an aligned start.
     order = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name != "hash_table", name))
     header = _header(description_to_dict(parsed), specs, order, tensors)
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.part")
-    try:
-        with open(temporary, "xb") as file:
-            file.write(len(header).to_bytes(8, "little") + header)
-            for name in order:
-                file.write(
-                    np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<"), copy=False).data
-                )
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:
+        file.write(len(header).to_bytes(8, "little") + header)
+        for name in order:
+            file.write(
+                np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<"), copy=False).data
+            )
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.geometry.quaternions import matrix_from_quaternion
 
 
 @dataclass(frozen=True)
@@ -66,19 +67,10 @@ class OrientedBox:
         norm = q.norm()
         if q.shape != (4,) or not torch.isfinite(q).all() or norm < 1e-9:
             raise InvalidDetectionError("box rotation quaternion must be four finite numbers, not all zero")
-        x, y, z, w = (q / norm).tolist()
-        rotation = torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ],
-            dtype=torch.float64,
-        )
         return cls(
             torch.as_tensor(center, dtype=torch.float64),
             torch.as_tensor(size, dtype=torch.float64),
-            rotation,
+            matrix_from_quaternion(q / norm),
             label,
             score,
         )

@@ -5,16 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.quaternion_formula import rotation_rows
+
 
 def matrix_from_quaternion(q: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), ordered (x, y, z, w)."""
     x, y, z, w = q.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(*q.shape[:-1], 3, 3)
+    rows = rotation_rows(x, y, z, w)
+    return torch.stack([entry for row in rows for entry in row], dim=-1).reshape(*q.shape[:-1], 3, 3)
 
 
 def quaternion_from_matrix(R: Tensor) -> Tensor:

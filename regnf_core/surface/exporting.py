@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from trimesh.exchange.ply import export_ply
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.files import atomic_path
 from regnf_core.surface.isosurface import Lattice, extract_surface
 
 MESH_FORMATS = ("glb", "ply")
@@ -41,7 +40,7 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     if kind == "ply":
         export = partial(export_ply, vertex_normal=True)
     data = export(mesh)
-    with _whole(path) as temporary:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return len(surface.faces)
 
@@ -67,17 +66,6 @@ def write_grid(field: SdfField, path: Path, resolution: int = 128, progress: Pro
             progress(values[: rows[-1] + 1].size)
     if not np.isfinite(values).all():
         raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    with _whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez(file, sdf=values, origin=lattice.low, spacing=np.full(3, lattice.step))
     return shape
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` that takes its name if all went well, and is gone otherwise."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    try:
-        yield temporary
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)

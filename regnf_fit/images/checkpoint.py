@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import secrets
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from regnf_core.errors import InvalidInputError
+from regnf_core.files import atomic_path
 
 _VERSION = 3
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:
     """Write a trainer's state, whole or not at all. key: of the data and options that it belongs to."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    try:
-        with temporary.open("xb") as file:
-            torch.save({"version": _VERSION, "key": key, "state": state}, file)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:
+        torch.save({"version": _VERSION, "key": key, "state": state}, file)
 
 
 def read_checkpoint(path: Path, key: str) -> dict[str, Any]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-import secrets
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from regnf_core.files import atomic_path
 from regnf_fit.images.network import RadianceField
 
 _EMBEDDING = 32
@@ -38,12 +38,8 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
     entries["laplace_density.beta_min"] = torch.tensor([1e-4])
     entries["embedding_appearance.embedding.weight"] = torch.zeros(1, _EMBEDDING)
     pipeline = {f"_model.field.{name}": value.detach().cpu().clone() for name, value in entries.items()}
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    try:
+    with atomic_path(path) as temporary:
         torch.save({"step": field.options.iterations, "pipeline": pipeline}, temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _normalized(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
-from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -13,6 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.files import atomic_path
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
@@ -58,13 +57,8 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
     content = save(
         {name: tensor.contiguous() for name, tensor in tensors.items()}, {"regnf_object_model": MODEL_VERSION}
     )
-    target = Path(path)
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.part")
-    try:
+    with atomic_path(path) as temporary:
         temporary.write_bytes(content)
-        os.replace(temporary, target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_object_model(path: str | os.PathLike[str]) -> ObjectModel:

@@ -6,6 +6,8 @@ import itertools
 import math
 from collections.abc import Sequence
 
+from regnf_core.geometry.quaternion_formula import rotation_rows
+
 Vector = tuple[float, float, float]
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _DIGITS = 12
@@ -24,11 +26,8 @@ def normal_quaternion(xyzw: Sequence[float]) -> tuple[float, ...]:
 def rotation_columns(xyzw: Sequence[float]) -> tuple[Vector, Vector, Vector]:
     """The box's axes in the scene's frame, from a unit quaternion."""
     x, y, z, w = xyzw
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-        (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-        (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-    )
+    first, second, third = zip(*rotation_rows(x, y, z, w), strict=True)
+    return first, second, third
 
 
 def boxes_overlap(
