@@ -19,9 +19,10 @@ from regnf_service.http.dependencies import (
     off_loop,
 )
 from regnf_service.http.digests import is_sha256
+from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.problems import Problem
-from regnf_service.http.routes.documentation import BINARY, get_and_head, refusals
+from regnf_service.http.routes.documentation import BINARY, NOT_MODIFIED, get_and_head, header, refusals
 from regnf_service.http.routes.uploads import field_etag
 from regnf_service.http.schemas.fields import FieldDocument, FieldPage, field_document
 from regnf_service.http.waiting import wait_for
@@ -44,22 +45,33 @@ def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
     "/fields/{sha256}",
     summary="A field's state and what its import found",
     response_model=FieldDocument,
-    responses=refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+    responses={
+        200: {"headers": {"ETag": header("For If-None-Match.")}},
+        304: NOT_MODIFIED,
+        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND"),
+    },
 )
 async def get_field(
-    sha256: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep, wait: WaitQuery = 0
-) -> JSONResponse:
-    """With `wait`, the answer comes as soon as the field is no longer `validating`.
+    sha256: str,
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    held: IfNoneMatchDep,
+    wait: WaitQuery = 0,
+) -> Response:
+    """With `wait`, the answer comes once the field is not `validating`; with `If-None-Match` too, at the first change.
 
     200 for every field that is known, a rejected one included: its bytes were dropped, and may be sent again.
     """
-    record = await wait_for(
-        lambda: _require(services, caller, sha256), lambda found: found.state != "validating", wait, services
-    )
+
+    def is_news(found: FieldRecord) -> bool:
+        return found.state != "validating" or held.differs(field_etag(found))
+
+    record = await wait_for(lambda: _require(services, caller, sha256), is_news, wait, services)
     headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
     if record.state == "validating":
         headers["Retry-After"] = "1"
-    return JSONResponse(field_document(record, prefix), headers=headers)
+    return held.apply(JSONResponse(field_document(record, prefix), headers=headers))
 
 
 @get_and_head(
@@ -69,10 +81,11 @@ async def get_field(
     response_class=Response,
     responses={
         200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
+        304: NOT_MODIFIED,
         **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
     },
 )
-def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
+def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
     """The surface from two sides, and its section with lines of equal distance: orange is inside."""
     record = _require(services, caller, sha256)
     if record.state != "ready":
@@ -83,7 +96,7 @@ def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep) -> 
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
     headers = {"ETag": field_etag(record), "Cache-Control": "private, max-age=3600"}
-    return Response(data, media_type="image/png", headers=headers)
+    return held.apply(Response(data, media_type="image/png", headers=headers))
 
 
 @router.get(

@@ -19,9 +19,10 @@ from regnf_service.http.dependencies import (
     WaitQuery,
     off_loop,
 )
+from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.problems import Problem
-from regnf_service.http.routes.documentation import header, refusals
+from regnf_service.http.routes.documentation import NOT_MODIFIED, header, refusals
 from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document
 from regnf_service.http.waiting import wait_for
 from regnf_service.jobs.canonical import digest
@@ -108,7 +109,7 @@ def list_jobs(
     response_model=JobDocument,
     responses={
         200: {"headers": {"ETag": header("For If-None-Match."), "Retry-After": header("While the job is active.")}},
-        304: {"description": "Nothing has changed since the ETag given."},
+        304: NOT_MODIFIED,
         **refusals("INVALID_QUERY", "JOB_NOT_FOUND", "JOB_EXPIRED"),
     },
 )
@@ -117,27 +118,24 @@ async def get_job(
     services: ServicesDep,
     caller: CallerDep,
     prefix: PrefixDep,
+    held: IfNoneMatchDep,
     wait: WaitQuery = 0,
-    if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
 ) -> Response:
     """With `wait`, the answer comes once the job has finished; with `If-None-Match` too, at the first change."""
 
     def look() -> _Seen:
         record = find_job(services, id, caller)
-        if if_none_match is None and wait:
+        if wait and not held.given:
             return _Seen(record, None, None)  # its state is all that is waited for
         return _seen(services, record)
 
     def is_news(seen: _Seen) -> bool:
-        return seen.record.status not in ACTIVE or (if_none_match is not None and _etag(seen) != if_none_match)
+        return seen.record.status not in ACTIVE or held.differs(_etag(seen))
 
     seen = await wait_for(look, is_news, wait, services)
-    if if_none_match is None and wait:
+    if wait and not held.given:
         seen = await off_loop(_seen, services, seen.record)
-    response = _answer(services, seen, prefix, 200)
-    if if_none_match is not None and response.headers["ETag"] == if_none_match:
-        return Response(status_code=304, headers={"ETag": if_none_match})
-    return response
+    return held.apply(_answer(services, seen, prefix, 200))
 
 
 @router.get(

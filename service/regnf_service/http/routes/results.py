@@ -10,9 +10,10 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.problems import Problem
 from regnf_service.http.ranges import ByteRange, parse_range
-from regnf_service.http.routes.documentation import BINARY, JSON, header, links, refusals
+from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
 from regnf_service.http.schemas.common import whole_problem
 from regnf_service.http.schemas.results import ResultDocument
 from regnf_service.jobs.lookup import find_job
@@ -94,7 +95,7 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
         "content": _FILES,
         "headers": {"Content-Range": header("Which bytes these are.")},
     },
-    304: {"description": "Nothing has changed since the ETag given."},
+    304: NOT_MODIFIED,
     **refusals(
         "JOB_NOT_FOUND",
         "ARTIFACT_NOT_FOUND",
@@ -123,9 +124,9 @@ async def get_artifact(
     name: str,
     services: ServicesDep,
     caller: CallerDep,
+    held: IfNoneMatchDep,
     range_: Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")] = None,
     if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
-    if_none_match: Annotated[str | None, Header(description="An ETag: 304 when nothing has changed.")] = None,
 ) -> Response:
     """The names are those of the result's `artifacts` list."""
     manifest = await off_loop(_manifest, services, id, caller)
@@ -133,7 +134,7 @@ async def get_artifact(
         raise Problem("ARTIFACT_NOT_FOUND")
     size, etag = manifest.artifacts[name].bytes, f'"{manifest.artifacts[name].sha256[:32]}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": _CACHE}
-    if if_none_match == etag:
+    if held.matches(etag):
         return Response(status_code=304, headers=headers)
     part = parse_range(range_, size) if if_range in (None, etag) else None
     if part is not None:
