@@ -7,9 +7,9 @@ Times are the store's own: one clock for every machine that shares it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from regnf_state.ownership import ANONYMOUS, owner_of
 
@@ -127,6 +127,13 @@ class JobEvent:
     data: dict[str, Any]
 
 
+class JobNews(NamedTuple):
+    """A job and its latest events. The record was read first: a finished record's events are all there."""
+
+    record: JobRecord | None
+    events: list[JobEvent]
+
+
 class RecordStore(Protocol):
     """Where records live. Every method is blocking; the API calls them off the event loop or through short threads."""
 
@@ -199,11 +206,12 @@ class RecordStore(Protocol):
         """1 for the accepted job that is next; None for a job that does not wait."""
         ...
 
-    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
-        """Events after the given id (None: from the start), waiting at most ``wait_s`` for the first.
+    def events(self, job_id: str, after: str | None) -> list[JobEvent]:
+        """Events after the given id (None: from the start). Raises ValueError when ``after`` is no event id."""
+        ...
 
-        Raises ValueError when ``after`` is no event id.
-        """
+    def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
+        """For each (job id, event id): the job, and its events after that one. One round trip for all of them."""
         ...
 
     # fields

@@ -16,7 +16,7 @@ from redis import Redis
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.generation import Epoch
 from regnf_state.journal.journal import Journal
-from regnf_state.records import FINISHED, NO_QUOTA, FieldRecord, JobRecord, Quota
+from regnf_state.records import FINISHED, NO_QUOTA, FieldRecord, JobNews, JobRecord, Quota
 from regnf_state.redis.documents import PREFIX
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.transitions import fields_of
@@ -54,6 +54,14 @@ class JournaledRecordStore(RedisRecordStore):
             self.recall_job(job_id)
             found = super().get_job(job_id)
         return found
+
+    def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
+        found = super().news(positions)
+        if all(one.record is not None for one in found) or self.epoch.stands():
+            return found
+        for job_id, _ in positions:
+            self.get_job(job_id)  # recalls the jobs that Redis has lost
+        return super().news(positions)
 
     def recall_job(self, job_id: str) -> JobRecord | None:
         """Make a lost record anew. The job as it is to go on, None when nothing was to be made."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from regnf_state.records import (
     NO_QUOTA,
     FieldRecord,
     JobEvent,
+    JobNews,
     JobRecord,
     QueueFullError,
     Quota,
@@ -165,16 +166,15 @@ class InMemoryRecordStore:
         with self._changed:
             return self._waiting.index(job_id) + 1 if job_id in self._waiting else None
 
-    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
+    def events(self, job_id: str, after: str | None) -> list[JobEvent]:
         bound = (0, 0) if after is None else transitions.parse_event_id(after)
-
-        def newer() -> list[JobEvent]:
+        with self._changed:
             stream = self._events.get(job_id, [])
             return [event for event in stream if transitions.parse_event_id(event.id) > bound]
 
+    def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
         with self._changed:
-            self._changed.wait_for(lambda: bool(newer()), timeout=wait_s)
-            return newer()
+            return [JobNews(self._live(job_id), self.events(job_id, after)) for job_id, after in positions]
 
     # fields
 

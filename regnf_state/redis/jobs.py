@@ -10,8 +10,7 @@ Keys:  regnf:job:{id}             hash: the record          regnf:jobs:created  
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -23,6 +22,7 @@ from regnf_state.records import (
     ACTIVE,
     NO_QUOTA,
     JobEvent,
+    JobNews,
     JobRecord,
     QueueFullError,
     Quota,
@@ -39,8 +39,6 @@ _ACTIVE = f"{PREFIX}jobs:active"
 _WAITING = f"{PREFIX}jobs:waiting"
 _EXPIRING = f"{PREFIX}jobs:expiring"
 _EVENTS_KEPT = "1000"
-_LONGEST_BLOCK_S = 2.0
-"""Waiting for events is cut into blocks well below any client's socket timeout."""
 
 _EXPIRE = """
 local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
@@ -227,26 +225,37 @@ class RedisRecordStore(RedisFieldRecords):
         rank: Any = self._redis.zrank(_WAITING, job_id)
         return None if rank is None else int(rank) + 1
 
-    def events(self, job_id: str, after: str | None, wait_s: float) -> list[JobEvent]:
-        start = "{}-{}".format(*transitions.parse_event_id(after)) if after is not None else "0-0"
-        deadline = time.monotonic() + wait_s
-        while True:
-            remaining = deadline - time.monotonic()
-            block = max(1, int(1000 * min(remaining, _LONGEST_BLOCK_S))) if remaining > 0 else None
-            answer: Any = self._redis.xread({_events_key(job_id): start}, block=block)
-            entries = [entry for entries in _streams(answer) for entry in entries]
-            if entries or block is None:
-                return [_event(entry) for entry in entries]
+    def events(self, job_id: str, after: str | None) -> list[JobEvent]:
+        return _events(self._redis.xread({_events_key(job_id): _start(after)}))
+
+    def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for job_id, after in positions:
+                pipeline.hget(_key(job_id), "document")
+                pipeline.xread({_events_key(job_id): _start(after)})
+            answers = pipeline.execute()
+        return [
+            JobNews(JobRecord(**json.loads(document)) if document is not None else None, _events(entries))
+            for document, entries in zip(answers[::2], answers[1::2], strict=True)
+        ]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
 
 
-def _streams(answer: Any) -> list[Any]:
-    """The entries of each stream in an answer to XREAD, in either protocol's shape."""
-    if isinstance(answer, dict):
-        return [entries for chunks in answer.values() for entries in chunks]
-    return [entries for _, entries in answer or []]
+def _start(after: str | None) -> str:
+    """Where XREAD begins. Raises ValueError when ``after`` is no event id."""
+    return "{}-{}".format(*transitions.parse_event_id(after)) if after is not None else "0-0"
+
+
+def _events(answer: Any) -> list[JobEvent]:
+    """The events in an answer to XREAD about one stream, in either protocol's shape."""
+    chunks = (
+        [chunk for chunks in answer.values() for chunk in chunks]
+        if isinstance(answer, dict)
+        else [chunk for _, chunk in answer or []]
+    )
+    return [_event(entry) for chunk in chunks for entry in chunk]
 
 
 def _event(entry: tuple[bytes | str, dict[bytes | str, bytes | str]]) -> JobEvent:

@@ -11,8 +11,8 @@ from fastapi import FastAPI
 from redis import Redis
 from redis.exceptions import RedisError
 
+from regnf_service.http.concurrency import pause
 from regnf_service.http.dependencies import Services, off_loop
-from regnf_service.http.waiting import pause
 from regnf_service.metrics import Metrics, served
 from regnf_service.shutdown import stopping_on_signals
 from regnf_service.upkeep.housekeeping import Housekeeper

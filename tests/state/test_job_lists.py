@@ -84,30 +84,31 @@ def test_events_tell_every_change_that_shows(store: RecordStore) -> None:
     store.update_job("j1", 1, engine={"version": "1"})
     store.heartbeat("j1", 1)
     store.update_job("j1", 1, status="failed", error={"reason": "NO_SURFACE_IN_OBJECT"})
-    events = store.events("j1", None, 0)
+    events = store.events("j1", None)
     assert [event.name for event in events] == ["status", "status", "progress", "progress", "status"]
     assert [event.data["phase"] for event in events] == [None, "loading", "sampling", "sampling", "sampling"]
     assert events[3].data["progress"] == 0.5
     assert events[-1].data["error"] == {"reason": "NO_SURFACE_IN_OBJECT"}
-    assert store.events("j1", events[1].id, 0) == events[2:]
-    assert store.events("j1", events[-1].id, 0) == []
+    assert store.events("j1", events[1].id) == events[2:]
+    assert store.events("j1", events[-1].id) == []
 
 
-def test_waiting_for_events(store: RecordStore) -> None:
+def test_news_of_several_jobs(store: RecordStore) -> None:
     started(store)
-    last = store.events("j1", None, 0)[-1].id
-    assert store.events("j1", last, 0.05) == []
-    with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(store.events, "j1", last, 30)
-        store.update_job("j1", 1, progress=0.5)
-        assert [event.data["progress"] for event in waiting.result()] == [0.5]
+    last = store.events("j1", None)[-1].id
+    store.update_job("j1", 1, progress=0.5)
+    new, whole, nobody = store.news([("j1", last), ("j1", None), ("j9", None)])
+    assert [event.data["progress"] for event in new.events] == [0.5]
+    assert whole.events == store.events("j1", None)
+    assert new.record == whole.record == store.get_job("j1")
+    assert (nobody.record, nobody.events) == (None, [])
 
 
 @pytest.mark.parametrize("after", ["", "x", "1-x", "-1", "1-2-3", "9" * 30, "1 ", "²"])
 def test_odd_event_ids_are_refused(store: RecordStore, after: str) -> None:
     started(store)
     with pytest.raises(ValueError):
-        store.events("j1", after, 0)
+        store.events("j1", after)
 
 
 # jobs: the end
@@ -120,7 +121,7 @@ def test_deleting(store: RecordStore) -> None:
     store.update_job("j1", 1, status="failed")
     assert store.delete_job("j1")
     assert store.get_job("j1") is None
-    assert store.events("j1", None, 0) == []
+    assert store.events("j1", None) == []
     assert store.list_jobs(None, 10, None) == []
     assert not store.job_expired("j1")
     assert store.create_job(job(store), 10)[0].attempt == 1

@@ -116,7 +116,7 @@ def test_unknown_jobs(store: RecordStore) -> None:
     assert not store.delete_job("j9")
     assert store.queue_position("j9") is None
     assert not store.job_expired("j9")
-    assert store.events("j9", None, 0) == []
+    assert store.events("j9", None) == []
     with pytest.raises(StaleAttemptError):
         store.update_job("j9", 1, phase="loading")
 

@@ -86,7 +86,7 @@ def test_progress_is_written_a_few_times_a_second_but_every_phase(context: Conte
             pulse.report("optimizing", step / 1000)
         for phase in ("verifying", "exporting"):
             pulse.report(phase, 0.999)
-    events = context.records.events("j1", None, 0)
+    events = context.records.events("j1", None)
     assert [event.data["phase"] for event in events][-2:] == ["verifying", "exporting"]
     assert len(events) < 50
 

@@ -43,7 +43,7 @@ def test_a_job_succeeds(table: Bench) -> None:
         assert file.read() == b"ab"
     with table.context.blobs.open("jobs/j1/1/result.json") as file:
         assert json.load(file)["pid"] not in (worker.pid, os.getpid()), "jobs have a process of their own"
-    phases = [event.data["phase"] for event in table.context.records.events("j1", None, 0)]
+    phases = [event.data["phase"] for event in table.context.records.events("j1", None)]
     assert phases == [None, "loading", "sampling", "optimizing", "exporting", "exporting"]
     eventually(lambda: not table.redis.keys("rq:job:*"), "the queue's forgetting the job")
     assert_next_job_runs(table)
@@ -185,7 +185,7 @@ def test_two_workers_one_job(table: Bench) -> None:
         done = table.finished(f"j{number}")
         assert (done.status, done.attempt) == ("successful", 1)
         assert (
-            len([e for e in table.context.records.events(f"j{number}", None, 0) if e.data["phase"] == "loading"]) == 1
+            len([e for e in table.context.records.events(f"j{number}", None) if e.data["phase"] == "loading"]) == 1
         )
 
 

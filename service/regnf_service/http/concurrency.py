@@ -15,6 +15,16 @@ from regnf_service.http.problems import RETRY_LATER, Problem
 _LOOK_EVERY_S = 0.02
 
 
+async def pause(seconds: float, stopping: asyncio.Event) -> bool:
+    """Sleep, or less if the service stops. Returns whether it does."""
+    try:
+        async with asyncio.timeout(seconds):
+            await stopping.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
 class Slots:
     """At most ``most`` for each caller; ``reason`` is what a caller that has as many is told. For one thread."""
 

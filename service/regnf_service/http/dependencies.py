@@ -15,6 +15,7 @@ from starlette.requests import Request
 
 from regnf_service.fields.uploads import Upload, open_upload
 from regnf_service.http.concurrency import Slots, Waiters
+from regnf_service.http.job_watch import JobWatch
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore
 from regnf_state.queue import JobQueue
@@ -56,6 +57,11 @@ class Services:
     def streams(self) -> Slots:
         """Event streams that are being read."""
         return Slots(self.settings.max_streams_per_caller, "TOO_MANY_STREAMS")
+
+    @cached_property
+    def job_watch(self) -> JobWatch:
+        """What all event streams look through."""
+        return JobWatch(self.records.news, self.stopping)
 
     @asynccontextmanager
     async def open_upload(self, caller: str) -> AsyncIterator[Upload]:

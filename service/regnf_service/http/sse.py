@@ -10,12 +10,10 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from regnf_service.http.concurrency import Slots
-from regnf_service.http.dependencies import Services, off_loop
-from regnf_service.http.waiting import pause
+from regnf_service.http.dependencies import Services
 from regnf_state.records import FINISHED, JobEvent
 
 MEDIA_TYPE = "text/event-stream"
-_POLL_S = 0.2
 _HEARTBEAT_S = 10.0
 _RECONNECT_MS = 2000
 
@@ -32,10 +30,8 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
     """
     yield f"retry: {_RECONNECT_MS}\n\n"
     last_sent = time.monotonic()
-    while True:
-        # the record first: what it says has finished has all its events in the stream read next
-        record = await off_loop(services.records.get_job, job_id)
-        events = await off_loop(services.records.events, job_id, after, 0.0)
+    while not services.stopping.is_set():
+        record, events = await services.job_watch.news(job_id, after)
         for event in events:
             yield format_event(event)
             after = event.id
@@ -46,8 +42,6 @@ async def event_stream(services: Services, job_id: str, after: str | None) -> As
         if time.monotonic() - last_sent >= _HEARTBEAT_S:
             yield ": still here\n\n"
             last_sent = time.monotonic()
-        if await pause(_POLL_S, services.stopping):
-            return
 
 
 class EventStream(StreamingResponse):

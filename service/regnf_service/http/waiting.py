@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
 from anyio import to_thread
 
+from regnf_service.http.concurrency import pause
 from regnf_service.http.dependencies import Services, off_loop
 
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.25
 _Value = TypeVar("_Value")
-
-
-async def pause(seconds: float, stopping: asyncio.Event) -> bool:
-    """Sleep, or less if the service stops. Returns whether it does."""
-    try:
-        async with asyncio.timeout(seconds):
-            await stopping.wait()
-    except TimeoutError:
-        return False
-    return True
 
 
 async def wait_for(

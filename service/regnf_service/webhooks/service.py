@@ -9,8 +9,8 @@ from anyio import CapacityLimiter, to_thread
 from redis import Redis
 from redis.exceptions import RedisError
 
+from regnf_service.http.concurrency import pause
 from regnf_service.http.dependencies import Services
-from regnf_service.http.waiting import pause
 from regnf_service.webhooks.deliverer import Deliverer
 from regnf_service.webhooks.policy import Webhooks
 from regnf_service.webhooks.sender import HttpSender

@@ -163,7 +163,7 @@ async def job_events(
     """From the beginning, or after `Last-Event-ID`."""
     record = await off_loop(find_job, services, id, caller)
     try:
-        waiting = await off_loop(services.records.events, id, last_event_id, 0.0)
+        waiting = await off_loop(services.records.events, id, last_event_id)
     except ValueError as error:
         raise Problem("INVALID_EVENT_ID") from error
     if last_event_id is not None and record.status not in ACTIVE and not waiting:

@@ -1,0 +1,129 @@
+"""All event streams of a process share their looks at the store."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from redis import Redis
+from redis.client import Pipeline
+from redis.exceptions import ConnectionError as RedisConnectionError
+
+from regnf_service.http.dependencies import Services
+from regnf_service.http.job_watch import JobWatch, Position
+from regnf_service.http.sse import event_stream
+from regnf_state.blobs.local import LocalBlobStore
+from regnf_state.records import JobNews
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+from tests.state.record_makers import finished, started
+
+
+@pytest.fixture
+def round_trips(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is sent to Redis from now on, an entry a round trip."""
+    sent: list[str] = []
+    command, pipeline = Redis.execute_command, Pipeline.execute
+
+    def counted_command(self: Redis, *arguments: object, **options: object) -> object:
+        sent.append(str(arguments[0]))
+        return command(self, *arguments, **options)
+
+    def counted_pipeline(self: Pipeline, raise_on_error: bool = True) -> object:
+        sent.append("pipeline")
+        return pipeline(self, raise_on_error)  # type: ignore[no-untyped-call]
+
+    monkeypatch.setattr(Redis, "execute_command", counted_command)
+    monkeypatch.setattr(Pipeline, "execute", counted_pipeline)
+    return sent
+
+
+@pytest.mark.parametrize("streams", [1, 40])
+def test_any_number_of_streams_is_one_round_trip_a_round(
+    redis: Redis, tmp_path: Path, streams: int, round_trips: list[str]
+) -> None:
+    store = RedisRecordStore(redis)
+    jobs = [finished(store, "failed", f"j{number}").id for number in range(4)]
+    services = Services(Settings(state_dir=tmp_path), store, LocalBlobStore(tmp_path / "blobs"), RqJobQueue(redis))
+    round_trips.clear()
+
+    async def read(job_id: str) -> str:
+        return "".join([text async for text in event_stream(services, job_id, None)])
+
+    async def read_all() -> list[str]:
+        return await asyncio.gather(*(read(jobs[number % 4]) for number in range(streams)))
+
+    texts = asyncio.run(read_all())
+    assert round_trips == ["pipeline"]
+    assert all(text.count('"status": "failed"') == 1 for text in texts)
+
+
+def test_a_stream_that_comes_during_a_look_is_answered_by_the_next(redis: Redis) -> None:
+    store = RedisRecordStore(redis)
+    started(store)
+    looks: list[list[Position]] = []
+
+    async def run() -> list[JobNews]:
+        loop = asyncio.get_running_loop()
+        late: list[asyncio.Task[JobNews]] = []
+
+        def look(positions: Sequence[Position]) -> list[JobNews]:
+            looks.append(list(positions))
+            if len(looks) == 1:
+                asked = asyncio.run_coroutine_threadsafe(_begin(watch, late), loop)
+                asked.result(30)
+            return store.news(positions)
+
+        watch = JobWatch(look, asyncio.Event())
+        first = await watch.news("j1", None)
+        return [first, *await asyncio.gather(*late)]
+
+    first, second = asyncio.run(run())
+    assert first == second
+    assert looks == [[("j1", None)], [("j1", None)]]
+
+
+async def _begin(watch: JobWatch, late: list[asyncio.Task[JobNews]]) -> None:
+    late.append(asyncio.create_task(watch.news("j1", None)))
+    await asyncio.sleep(0)
+
+
+def test_a_client_that_leaves_is_not_looked_for() -> None:
+    looks: list[Sequence[Position]] = []
+
+    def look(positions: Sequence[Position]) -> list[JobNews]:
+        looks.append(positions)
+        return [JobNews(None, []) for _ in positions]
+
+    async def run() -> None:
+        watch = JobWatch(look, asyncio.Event())
+        left = asyncio.create_task(watch.news("gone", None))
+        stays = asyncio.create_task(watch.news("stays", None))
+        await asyncio.sleep(0)
+        left.cancel()
+        assert (await stays).record is None
+
+    asyncio.run(run())
+    assert looks == [[("stays", None)]]
+
+
+def test_a_store_that_is_away_ends_the_streams_not_the_watch() -> None:
+    answers: list[object] = [RedisConnectionError("away"), [JobNews(None, [])]]
+
+    def look(positions: Sequence[Position]) -> list[JobNews]:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        assert isinstance(answer, list)
+        return answer
+
+    async def run() -> None:
+        watch = JobWatch(look, asyncio.Event())
+        outcomes = await asyncio.gather(watch.news("j", None), watch.news("j", None), return_exceptions=True)
+        assert [type(outcome) for outcome in outcomes] == [RedisConnectionError] * 2
+        assert (await watch.news("j", None)).record is None
+
+    asyncio.run(run())
