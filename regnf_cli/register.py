@@ -84,6 +84,7 @@ def register(
 def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: Path | None) -> dict[str, Any]:
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.loading import load_field
+    from regnf_core.registration import WarmStart
     from regnf_core.registration import register as run
     from regnf_core.viewing import result_document
 
@@ -101,7 +102,7 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
             options,
             request["seed"],
             lambda phase, share: bar.update(task, description=phase, completed=share),
-            start,
+            WarmStart(T_object_scene=start),
             clouds=output is not None,
         )
         bar.update(task, description="exporting", completed=1.0)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.options import RegistrationOptions
-    from regnf_core.registration import register
+    from regnf_core.registration import WarmStart, register
     from regnf_core.result import RegistrationResult
 
 _HOMES = {
@@ -33,6 +33,7 @@ _HOMES = {
     "RegnfError": "regnf_core.errors",
     "SdfField": "regnf_core.fields.base",
     "Sim3": "regnf_core.geometry.sim3",
+    "WarmStart": "regnf_core.robust.register",
     "open_field": "regnf_core.fields.safe_format",
     "register": "regnf_core.registration",
 }
@@ -44,6 +45,7 @@ __all__ = [
     "RegnfError",
     "SdfField",
     "Sim3",
+    "WarmStart",
     "__version__",
     "open_field",
     "register",

@@ -16,7 +16,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Phase, ProgressCallback, RegistrationResult
 from regnf_core.robust.model.object_model import ObjectModel, model_object
-from regnf_core.robust.register import register_robust
+from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import Run
 from regnf_core.surface.clouds import with_clouds
@@ -50,9 +50,11 @@ def register_batch(
     Every pair ends as :func:`regnf_core.register` alone would end with the same seed: a faulty pair spoils no other.
     ``models`` are the objects' models, made earlier. Without ``clouds`` the point clouds for viewers are left out,
     about half of the time. ``progress`` sees the phases of one pair after the other; its share is of all of them.
-    Raises InvalidInputError (PAIR_UNKNOWN) for a number beyond the lists, and CancelledError from ``progress``.
+    Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the
+    lists, and CancelledError from ``progress``.
     """
-    options = options or RegistrationOptions(preset="robust")
+    options = options or RegistrationOptions()
+    options.require_robust("registers a batch")
     wanted = list(product(range(len(detections)), range(len(objects)))) if pairs is None else list(pairs)
     for d, o in wanted:
         if not (0 <= d < len(detections) and 0 <= o < len(objects)):
@@ -98,15 +100,14 @@ class _Batch:
             self.options,
             self.seed,
             run,
-            object_model=model,
-            scene_view=view,
+            WarmStart(object_model=model),
+            view,
         )
-        if clouds:
-            with run.phase("exporting"):
-                result = with_clouds(result, self.scene, self.objects[o], box, self.options.sampling)
-        run.report("exporting", 1.0)
-        result.metrics.update(run.seconds)
-        return result
+
+        def add_clouds(found: RegistrationResult) -> RegistrationResult:
+            return with_clouds(found, self.scene, self.objects[o], box, cloud_region(box))
+
+        return run.finish(result, add_clouds if clouds else None)
 
     def _view(self, d: int) -> SceneView:
         return _once(self._views, d, lambda: view_scene(self.scene, self.detections[d], self.options.robust, self.seed))

@@ -28,7 +28,7 @@ from regnf_core.robust.library_search import (
 )
 from regnf_core.robust.model.model_file import read_object_model, write_object_model
 from regnf_core.robust.model.object_model import ObjectModel, model_object
-from regnf_core.robust.register import register_robust
+from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.robust.report import result_of
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import STARTS, Run
@@ -82,11 +82,13 @@ def search_library(
 
     All are compared by signature, the nearest 12 searched coarsely, at most 4 refined on their fields and judged: the
     time hardly grows with the library. Deterministic for a seed. ``progress`` as in :func:`regnf_core.register`.
-    Raises InvalidInputError (LIBRARY_EMPTY, FIELD_NOT_FINITE), InvalidDetectionError, NoSurfaceError.
+    Raises InvalidOptionsError (LIBRARY_SEARCH_UNSUPPORTED) for options of another preset, InvalidInputError
+    (LIBRARY_EMPTY, FIELD_NOT_FINITE), InvalidDetectionError, NoSurfaceError.
     """
+    options = options or RegistrationOptions()
+    options.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
     if not library:
         raise InvalidInputError("a library without objects", reason="LIBRARY_EMPTY")
-    options = options or RegistrationOptions(preset="robust")
     run = Run(progress)
     models = [one.model for one in library]
     with run.phase("sampling"):
@@ -98,10 +100,12 @@ def search_library(
         finalists = _refine(scene, view, library, still_in(contenders), options, seed, run)
     with run.phase("verifying"):
         result = _register_first(scene, view, library[finalists[0].number], finalists[0], options, seed)
-    with run.phase("exporting"):
-        result = with_clouds(result, scene, library[finalists[0].number].field(), detection, options.sampling)
-    run.report("exporting", 1.0)
-    result.metrics.update(run.seconds)
+
+    def add_clouds(found: RegistrationResult) -> RegistrationResult:
+        obj = library[finalists[0].number].field()
+        return with_clouds(found, scene, obj, detection, cloud_region(detection))
+
+    result = run.finish(result, add_clouds)
     return LibrarySearch(_ranking(library, nearest, contenders, finalists, result), result)
 
 
@@ -140,7 +144,7 @@ def _register_first(
     if finalist.conclusion.verdict == "rejected":
         quiet = Run(None)
         return register_robust(
-            scene, one.field(), view.detection, options, seed, quiet, object_model=one.model, scene_view=view
+            scene, one.field(), view.detection, options, seed, quiet, WarmStart(object_model=one.model), view
         )
     evaluations = view.evaluations + finalist.evaluations
     return result_of(finalist.problem, finalist.outcome, finalist.conclusion, options, seed, evaluations)

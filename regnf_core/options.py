@@ -5,7 +5,9 @@ Every length is in normalized field units unless its name says otherwise, as in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
@@ -14,6 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from regnf_core.errors import InvalidOptionsError
 
 Preset = Literal["paper", "robust"]
+Axis = Literal["x", "y", "z"]
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 _Ratio = Annotated[float, Gt(0), Le(1)]
 
@@ -35,9 +38,7 @@ class SamplingOptions:
     pixel_stride: Annotated[int, Ge(1), Le(512)] = 8
     """Every how many pixels a ray is cast, along both axes."""
     ground_fraction: Annotated[float, Ge(0), Le(0.5)] = 0.025
-    """Lowest share of the box's height whose points are dropped as ground."""
-    up_axis: Literal["x", "y", "z"] = "z"
-    """The scene's vertical axis: where the ground is, and from which side cameras look."""
+    """Lowest share of the box's height, along the option ``up_axis``, whose points are dropped as ground."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,8 @@ class RobustOptions:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
-    up_axis: Literal["x", "y", "z"] | None = None
-    """The vertical axis of scene and object alike: only turns about it are tried. None: every orientation.
-    Set it where things stand upright: the search is shorter, and no toppled twin is listed."""
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
-    """Rotations that the search starts from, evenly spread over all; with an up axis a tenth of them, about it.
+    """Rotations that the search starts from, evenly spread over all; with ``up_axis`` a tenth of them, about it.
     More when a pose that a person sees was missed; the search takes longer in proportion."""
     feature_draws: Annotated[int, Ge(0), Le(64)] = 4
     """Feature matches (FPFH and RANSAC, scale-free) searched from as well when the first search ends in a rejection.
@@ -154,7 +152,11 @@ class RegistrationOptions:
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     preset: Preset = "robust"
-    """The engine: `robust` needs no starting guess, `paper` is the published method."""
+    """The engine: `robust` needs no initial guess, `paper` is the published method."""
+    up_axis: Axis | None = None
+    """The vertical axis of scene and object. `robust`: only rotations about it are tried, which is faster and lists no
+    toppled pose; null tries every orientation. `paper`: where the ground is and which side the cameras look from;
+    null means z."""
     sampling: SamplingOptions = field(default_factory=SamplingOptions)
     initialization: InitializationOptions = field(default_factory=InitializationOptions)
     optimization: OptimizationOptions = field(default_factory=OptimizationOptions)
@@ -172,12 +174,55 @@ class RegistrationOptions:
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
-            raise InvalidOptionsError(f"options.{where}: {first['msg']}") from error
+            hint = did_you_mean(first["loc"]) if first["type"] == UNKNOWN_OPTION else ""
+            raise InvalidOptionsError(f"options.{where}: {first['msg']}{hint}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of every option, defaults included, in a fixed order."""
         values: dict[str, Any] = _ADAPTER.dump_python(self)
         return values
 
+    def require_robust(self, feature: str, reason: str = InvalidOptionsError.reason) -> None:
+        """Raises InvalidOptionsError with ``reason`` under another preset. feature: what only `robust` can do."""
+        if self.preset != "robust":
+            raise InvalidOptionsError(
+                f"only the preset `robust` {feature}; the options name `{self.preset}`", reason=reason
+            )
 
+
+def did_you_mean(location: Sequence[str | int]) -> str:
+    """A hint for an unknown option: "; did you mean `up_axis`?", or nothing where no name is close.
+
+    location: the option's path below ``options``, as pydantic gives it. Names of earlier versions are known.
+    """
+    path = tuple(str(part) for part in location)
+    if path in _FORMER_NAMES:
+        return f"; did you mean `{_FORMER_NAMES[path]}`?"
+    names = _names()
+    elsewhere = [".".join((*group, path[-1])) for group in names if path[-1] in names[group]]
+    close = elsewhere or [
+        ".".join((*path[:-1], name)) for name in get_close_matches(path[-1], names.get(path[:-1], ()), n=1, cutoff=0.7)
+    ]
+    return f"; did you mean `{close[0]}`?" if close else ""
+
+
+def _names() -> dict[tuple[str, ...], list[str]]:
+    """The names of the options of every group; the group () is the top level."""
+    names: dict[tuple[str, ...], list[str]] = {(): [one.name for one in fields(RegistrationOptions)]}
+    for one in fields(RegistrationOptions):
+        if callable(one.default_factory):
+            names[one.name,] = [option.name for option in fields(one.default_factory())]
+    return names
+
+
+UNKNOWN_OPTION = "unexpected_keyword_argument"
+"""The type of pydantic's error about an unknown option."""
+_FORMER_NAMES = {
+    ("sampling", "up_axis"): "up_axis",
+    ("robust", "up_axis"): "up_axis",
+    ("initialisation",): "initialization",
+    ("optimisation",): "optimization",
+    ("optimisation", "regulariser_weight"): "optimization.regularizer_weight",
+    ("optimization", "regulariser_weight"): "optimization.regularizer_weight",
+}
 _ADAPTER = TypeAdapter(RegistrationOptions)

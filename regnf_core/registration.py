@@ -1,17 +1,22 @@
-"""Registration of two fields: the engine that the options name, then the clouds that show what it found."""
+"""Registration of two fields: by the preset that the options name, then the point clouds of the result."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from torch import Tensor
+
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.paper.pipeline import register_paper
+from regnf_core.paper.sampling import in_detection
 from regnf_core.result import ProgressCallback, RegistrationResult
-from regnf_core.robust.model.object_model import ObjectModel
-from regnf_core.robust.register import register_robust
+from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.run import Run
 from regnf_core.surface.clouds import with_clouds
+
+__all__ = ["WarmStart", "register"]
 
 
 def register(
@@ -21,29 +26,37 @@ def register(
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
-    T_object_scene_start: Sim3 | None = None,
-    object_model: ObjectModel | None = None,
+    warm_start: WarmStart | None = None,
     clouds: bool = True,
 ) -> RegistrationResult:
-    """The similarity that carries the detected thing in the scene onto the library's object, and what supports it.
+    """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
 
     ``progress`` is called with the phase and the overall share done (0..1), once an iteration while optimizing; it may
-    raise CancelledError. For the preset `robust` alone: ``T_object_scene_start`` is where to look first, anything else
-    is searched only if that fails; ``object_model`` is what ``model_object`` made of ``obj``
-    earlier. Without ``clouds`` the result has the engine's own samples alone, and neither residuals nor
-    surroundings: for who draws no pictures.
+    raise CancelledError. ``warm_start``, for the preset `robust` alone: a pose to try first, and the object's model.
+    Without ``clouds`` the result holds only the samples that the registration used, and neither residuals nor
+    surroundings; this saves time when no pictures are drawn.
     Deterministic for a seed, on one machine and with the same number of threads.
-    Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE).
+    Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE), and
+    InvalidOptionsError (INITIAL_TRANSFORM_UNSUPPORTED, INVALID_OPTIONS) for a warm start under another preset.
     """
     options = options or RegistrationOptions()
+    if warm_start is not None:
+        _check_warm_start(warm_start, options)
     run = Run(progress)
     if options.preset == "robust":
-        result = register_robust(scene, obj, detection, options, seed, run, T_object_scene_start, object_model)
+        result = register_robust(scene, obj, detection, options, seed, run, warm_start)
     else:
         result = register_paper(scene, obj, detection, options, seed, run)
-    if clouds:
-        with run.phase("exporting"):
-            result = with_clouds(result, scene, obj, detection, options.sampling)
-    run.report("exporting", 1.0)
-    result.metrics.update(run.seconds)
-    return result
+    region = _paper_region(detection, options) if options.preset == "paper" else cloud_region(detection)
+    return run.finish(result, (lambda found: with_clouds(found, scene, obj, detection, region)) if clouds else None)
+
+
+def _paper_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:
+    return lambda points: in_detection(points, detection, options.sampling, options.up_axis or "z")
+
+
+def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:
+    if warm_start.T_object_scene is not None:
+        options.require_robust("starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED")
+    if warm_start.object_model is not None:
+        options.require_robust("uses an object model")

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from regnf_core.result import Phase, ProgressCallback
+from regnf_core.result import Phase, ProgressCallback, RegistrationResult
 
 STARTS: dict[Phase, float] = {
     "sampling": 0.0,
@@ -31,6 +31,17 @@ class Run:
         self._done = max(self._done, min(done, 1.0))
         if self._progress is not None:
             self._progress(phase, self._done)
+
+    def finish(
+        self, result: RegistrationResult, add_clouds: Callable[[RegistrationResult], RegistrationResult] | None = None
+    ) -> RegistrationResult:
+        """The result with its clouds, if any are wanted, and with the seconds of all phases among its metrics."""
+        if add_clouds is not None:
+            with self.phase("exporting"):
+                result = add_clouds(result)
+        self.report("exporting", 1.0)
+        result.metrics.update(self.seconds)
+        return result
 
     @contextmanager
     def phase(self, name: Phase) -> Iterator[None]:

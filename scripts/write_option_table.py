@@ -1,4 +1,4 @@
-"""Write the table of the preset `robust`'s options into docs/api.md. Run it when they change; a test compares the two.
+"""Write the table of the options that the preset `robust` uses into docs/api.md. Run it when they change; a test compares the two.
 
 python scripts/write_option_table.py
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from regnf_core.options import RobustOptions
+from regnf_core.options import RegistrationOptions, RobustOptions
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "api.md"
 _PLACE = re.compile(r"(<!-- made by scripts/write_option_table.py [^\n]*-->\n).*?(<!-- end -->)", flags=re.S)
@@ -22,7 +22,9 @@ _PLACE = re.compile(r"(<!-- made by scripts/write_option_table.py [^\n]*-->\n).*
 def with_table(text: str) -> str:
     """The document with the table as the options are now."""
     schema = TypeAdapter(RobustOptions).json_schema()["properties"]
-    rows = [_row(option.name, schema[option.name]) for option in dataclasses.fields(RobustOptions)]
+    common = TypeAdapter(RegistrationOptions).json_schema()["properties"]
+    rows = [_row("up_axis", common["up_axis"])]
+    rows += [_row(f"robust.{option.name}", schema[option.name]) for option in dataclasses.fields(RobustOptions)]
     table = "\n".join(["| Option | Default | Range | |", "|---|---|---|---|", *rows])
     return _PLACE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text)
 

@@ -14,8 +14,8 @@ from benchmarks.robust.cases import HELD_OUT, MAIN, Case, Pair, load_pairs, open
 from benchmarks.robust.judging import judge
 from benchmarks.robust.report import Bar, Section, Table, by_group, failures_of, median, share_bar
 from benchmarks.robust.runs import ROBUST, Context, Run
+from regnf_core import WarmStart, register
 from regnf_core import open_field as open_safe_field
-from regnf_core import register
 from regnf_core.library import LibraryObject, LibrarySearch, read_object_model, search_library
 from regnf_core.robust.library_search import by_signature
 from regnf_core.robust.scene.scene_view import view_scene
@@ -92,7 +92,14 @@ def _search(kind: str, pair: Pair, library: dict[str, LibraryObject], size: int,
     found = search_library(case.scene, case.detection, some, ROBUST, seed)
     seconds = time.perf_counter() - begun
     begun = time.perf_counter()
-    register(case.scene, open_field(pair.folder, pair.object), case.detection, ROBUST, seed, object_model=right.model)
+    register(
+        case.scene,
+        open_field(pair.folder, pair.object),
+        case.detection,
+        ROBUST,
+        seed,
+        warm_start=WarmStart(object_model=right.model),
+    )
     alone = time.perf_counter() - begun
     place = 1 + [one.name for one in found.ranking].index(pair.instance)
     judged = judge(found.result, case.truth, case.symmetries) if place == 1 else _missed(found)

@@ -18,7 +18,7 @@ ENDS = ("successful", "failed", "dismissed")
 _PATIENCE_S = 180.0
 _TIMES = 5
 """How often a job that was lost for good by two deaths is posted again."""
-_OPTIONS = {"robust": {"up_axis": "z"}}
+_OPTIONS = {"up_axis": "z"}
 
 
 def comparable(result: dict[str, Any]) -> dict[str, Any]:

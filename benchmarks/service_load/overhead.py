@@ -27,7 +27,7 @@ from benchmarks.service_load.small_fields import SmallPair, write_small_pair
 from regnf_cli.local_service import running_service
 from regnf_cli.remote import RemoteService
 
-_OPTIONS = {"robust": {"up_axis": "z"}}
+_OPTIONS = {"up_axis": "z"}
 
 
 @dataclass

@@ -36,7 +36,7 @@ from tests.core.importing.checkpoints import write_full_size_checkpoint
 _POLLERS = 100
 _EVERY_S = 1.0
 _LONG_WAIT_S = 10
-_OPTIONS = {"robust": {"up_axis": "z"}}
+_OPTIONS = {"up_axis": "z"}
 _CALM_S = 15.0
 """How long the pollers poll before the upload begins."""
 

@@ -25,7 +25,7 @@ from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
 from regnf_cli.remote import RemoteService
 
-_OPTIONS = {"robust": {"up_axis": "z"}}
+_OPTIONS = {"up_axis": "z"}
 _WORKERS = (1, 2)
 
 

@@ -40,10 +40,11 @@ def register_paper(
     generator = torch.Generator().manual_seed(seed)
 
     with run.phase("sampling"):
-        scene_samples = sample_scene(scene, detection, options.sampling)
+        up_axis = options.up_axis or "z"
+        scene_samples = sample_scene(scene, detection, options.sampling, up_axis=up_axis)
         run.report("sampling", 0.08)
         extent = surface_extent(obj)
-        object_samples = sample_object(obj, options.sampling, extent=extent)
+        object_samples = sample_object(obj, options.sampling, extent=extent, up_axis=up_axis)
         object_diameter = diameter(object_samples.points)
         A = thin_out(scene_samples, options.resampling.max_samples, generator)
         B = thin_out(object_samples, options.resampling.max_samples, generator)
@@ -57,7 +58,7 @@ def register_paper(
 
     with run.phase("verifying"):
         T = refined.T_object_scene
-        verification = verify(scene, obj, detection, extent, T, options.sampling, object_diameter)
+        verification = verify(scene, obj, detection, extent, T, options.sampling, object_diameter, up_axis)
     metrics = {
         **verification.metrics,
         "object_diameter": object_diameter,

@@ -11,20 +11,20 @@ from torch import Tensor
 from regnf_core.errors import InvalidDetectionError, NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.options import SamplingOptions
+from regnf_core.options import Axis, SamplingOptions
 from regnf_core.result import SurfaceSamples
 from regnf_core.surface.cameras import axis_vector, camera_positions, cast_rays
 from regnf_core.surface.extent import surface_extent
 from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, shortest_step
 
 MIN_POINTS = 50
-_BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
+BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
 _CLEARANCE = 0.75  # a camera keeps this many box diagonals from the center at least: outside the box, with room to see
 
 
 def sample_scene(
-    scene: SdfField, detection: OrientedBox, options: SamplingOptions, turn: float = 0.0
+    scene: SdfField, detection: OrientedBox, options: SamplingOptions, turn: float = 0.0, up_axis: Axis = "z"
 ) -> SurfaceSamples:
     """Points of the scene's surface within the detection box, ground removed. Scene frame, scene units.
 
@@ -33,8 +33,9 @@ def sample_scene(
     50 points are found, InvalidInputError (FIELD_NOT_FINITE).
     """
     check_box_meets_scene(scene, detection)
-    points = _trace_views(scene, detection, options.scene_camera_distance, options, turn)
-    points = points[_above_ground(points, detection, options)]
+    positions = _camera_positions(detection, options.scene_camera_distance, options.views, turn, up_axis)
+    points = _trace_views(scene, detection, positions, options)
+    points = points[_above_ground(points, detection, options, up_axis)]
     if points.shape[0] < MIN_POINTS:
         raise NoSurfaceError(
             f"only {points.shape[0]} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION"
@@ -43,7 +44,11 @@ def sample_scene(
 
 
 def sample_object(
-    obj: SdfField, options: SamplingOptions, turn: float = 0.0, extent: OrientedBox | None = None
+    obj: SdfField,
+    options: SamplingOptions,
+    turn: float = 0.0,
+    extent: OrientedBox | None = None,
+    up_axis: Axis = "z",
 ) -> SurfaceSamples:
     """Points of the object's surface. Object frame, object units.
 
@@ -52,7 +57,8 @@ def sample_object(
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     extent = extent or surface_extent(obj)
-    points = _trace_views(obj, extent, options.object_camera_distance, options, turn)
+    positions = _camera_positions(extent, options.object_camera_distance, options.views, turn, up_axis)
+    points = _trace_views(obj, extent, positions, options)
     if points.shape[0] < MIN_POINTS:
         raise NoSurfaceError(f"only {points.shape[0]} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
     return _with_normals(obj, points)
@@ -75,12 +81,14 @@ def check_box_meets_scene(scene: SdfField, detection: OrientedBox) -> None:
         raise InvalidDetectionError("the detection box lies outside the scene", reason="DETECTION_OUTSIDE_SCENE")
 
 
-def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: SamplingOptions, turn: float) -> Tensor:
-    """(M, 3) first surface points, seen from all cameras, within the slightly grown box."""
-    positions = camera_positions(
-        box.center, max(distance, _CLEARANCE * box.diagonal), options.views, options.up_axis, turn
-    )
-    grown = OrientedBox(box.center, box.size * (1.0 + _BOX_MARGIN), box.rotation)
+def _camera_positions(box: OrientedBox, distance: float, views: int, turn: float, up_axis: Axis) -> Tensor:
+    """(views, 3) where the cameras stand, outside the box."""
+    return camera_positions(box.center, max(distance, _CLEARANCE * box.diagonal), views, up_axis, turn)
+
+
+def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: SamplingOptions) -> Tensor:
+    """(M, 3) first surface points, seen from the cameras at ``positions`` (V, 3), within the slightly grown box."""
+    grown = OrientedBox(box.center, box.size * (1.0 + BOX_MARGIN), box.rotation)
     rays = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)
     rays = type(rays)(rays.origins.to(field.device), rays.directions.to(field.device))
     entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
@@ -92,14 +100,14 @@ def _trace_views(field: SdfField, box: OrientedBox, distance: float, options: Sa
     return hits.points[grown.contains(hits.points)]
 
 
-def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis = "z") -> Tensor:
     """(N,) bool: which points (N, 3) of the scene lie in the slightly grown box and above the ground."""
-    return detection.contains(points, _BOX_MARGIN) & _above_ground(points, detection, options)
+    return detection.contains(points, BOX_MARGIN) & _above_ground(points, detection, options, up_axis)
 
 
-def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions) -> Tensor:
+def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis) -> Tensor:
     """(N,) bool: which points are above the lowest ``ground_fraction`` of the box's height."""
-    up = axis_vector(options.up_axis)
+    up = axis_vector(up_axis)
     heights = detection.corners() @ up
     ground = heights.min() + options.ground_fraction * (heights.max() - heights.min())
     return points @ up.to(points) >= ground.to(points)

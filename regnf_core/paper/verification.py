@@ -17,7 +17,7 @@ from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import SamplingOptions
+from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
 from regnf_core.result import SurfaceSamples, Verdict
 from regnf_core.surface.agreement import object_residuals, scene_residuals
@@ -49,11 +49,12 @@ def verify(
     T_object_scene: Sim3,
     options: SamplingOptions,
     object_diameter: float,
+    up_axis: Axis = "z",
 ) -> Verification:
     """Judge the transform on fresh samples of both surfaces, seen by cameras half way between the first ones."""
     turn = math.pi / options.views
-    scene_points = _fresh_points(lambda chosen: sample_scene(scene, detection, chosen, turn), options)
-    object_points = _fresh_points(lambda chosen: sample_object(obj, chosen, turn, object_extent), options)
+    scene_points = _fresh_points(lambda chosen: sample_scene(scene, detection, chosen, turn, up_axis), options)
+    object_points = _fresh_points(lambda chosen: sample_object(obj, chosen, turn, object_extent, up_axis), options)
     forth = scene_residuals(scene, obj, scene_points, T_object_scene) / object_diameter
     back = object_residuals(scene, obj, object_points, T_object_scene) / object_diameter
     return judge(forth, back)

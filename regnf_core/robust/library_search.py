@@ -7,7 +7,7 @@ on their fields and judged as in a registration. The scene is sampled once, and 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 
@@ -16,7 +16,14 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.signature import signature
-from regnf_core.robust.pipeline import Outcome, Problem, find_candidates, pose_problem, refine_candidates
+from regnf_core.robust.pipeline import (
+    Outcome,
+    Problem,
+    find_candidates,
+    pose_problem,
+    refine_candidates,
+    start_rotations,
+)
 from regnf_core.robust.scene.scene_view import SceneView
 from regnf_core.robust.search.search import Round
 from regnf_core.robust.verdict.conclusion import Conclusion, conclude
@@ -66,12 +73,11 @@ def coarsely(
     view: SceneView, models: Sequence[ObjectModel], nearest: Sequence[int], options: RegistrationOptions, seed: int
 ) -> list[Contender]:
     """The nearest models after a coarse search on the samples, best first."""
-    rotations = max(24, int(options.robust.rotations / _ROTATION_SHARE))
-    fewer = replace(options.robust, rotations=rotations)
+    rotations = start_rotations(options, _ROTATION_SHARE)
     found = []
     for number in nearest[:_SHORTLIST]:
         generator = torch.Generator().manual_seed(seed)
-        T, scores = find_candidates(view, models[number], fewer, generator, rounds=_ROUNDS)
+        T, scores = find_candidates(view, models[number], rotations, generator, rounds=_ROUNDS)
         found.append(Contender(number, float(scores[0]), T))
     return sorted(found, key=lambda one: one.score)
 

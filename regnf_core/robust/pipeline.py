@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.pose_distance import displacement
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RobustOptions
+from regnf_core.options import RegistrationOptions, RobustOptions
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.refine.pose_candidates import LAST, STAGES, Finalists, Trail, run_stage
@@ -80,7 +80,7 @@ def pose_problem(
 def find_candidates(
     view: SceneView,
     model: ObjectModel,
-    options: RobustOptions,
+    rotations: Tensor,
     generator: torch.Generator,
     T_start: Sim3 | None = None,
     rounds: tuple[Round, ...] = ROUNDS,
@@ -88,6 +88,7 @@ def find_candidates(
 ) -> tuple[Sim3, Tensor]:
     """Candidate poses (H,) and their scores (H,), best first, from the samples alone: no field is evaluated.
 
+    rotations: (K, 3, 3) that the search starts from.
     With ``T_start``, a single pose in working frames, only its neighborhood is searched; ``more_seeds`` (H,) are
     searched beside those of the geometry.
     """
@@ -99,7 +100,7 @@ def find_candidates(
             model.samples.on_surface(),
             view.detection.rotation,
             view.detection.size / view.detection.diagonal,
-            _rotations(options),
+            rotations,
             torch.tensor(SCALE_FACTORS),
         )
     if more_seeds is not None:
@@ -158,7 +159,12 @@ def _missing_twins(T: Sim3, symmetry: SelfSymmetry, extremes: Tensor) -> Sim3:
     return twins[nearest > _SAME_POSE]
 
 
-def _rotations(options: RobustOptions) -> Tensor:
+def start_rotations(options: RegistrationOptions, divisor: float = 1.0) -> Tensor:
+    """(K, 3, 3) rotations that the search starts from: the option ``rotations`` over ``divisor``, 24 at least.
+
+    All orientations, or turns about the option ``up_axis``.
+    """
+    count = max(24, int(options.robust.rotations / divisor))
     if options.up_axis is None:
-        return super_fibonacci(options.rotations)
-    return turns_about(axis_vector(options.up_axis), max(24, options.rotations // _YAW_SHARE))
+        return super_fibonacci(count)
+    return turns_about(axis_vector(options.up_axis), max(24, count // _YAW_SHARE))

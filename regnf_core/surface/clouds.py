@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.options import SamplingOptions
-from regnf_core.paper.sampling import in_detection
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.surface.agreement import object_residuals, scene_residuals
 from regnf_core.surface.densify import densify
@@ -25,16 +25,17 @@ def with_clouds(
     scene_field: SdfField,
     object_field: SdfField,
     detection: OrientedBox,
-    options: SamplingOptions,
+    in_region: Callable[[Tensor], Tensor],
 ) -> RegistrationResult:
     """The result with both clouds densified, their residuals, and the scene round the detection.
 
+    ``in_region`` says which points (N, 3) of the scene may belong to the object's cloud, (N,) bool.
     The evaluations it took stand apart from the registration's own, as ``field_evaluations_clouds``.
     """
     scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
     generator = torch.Generator().manual_seed(result.seed)
     extent = _extent(result.object_samples)
-    A = densify(scene, result.scene_samples, _DENSE, generator, lambda points: in_detection(points, detection, options))
+    A = densify(scene, result.scene_samples, _DENSE, generator, in_region)
     B = densify(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
     residuals = {
         "scene_points": A.points,

@@ -56,9 +56,8 @@ def preview(result: RegistrationResult) -> Image.Image:
 
 
 def _up_axis(options: dict[str, Any]) -> str:
-    """The scene's vertical axis as far as the options say it."""
-    robust = options["robust"]["up_axis"] if options["preset"] == "robust" else None
-    return str(robust or options["sampling"]["up_axis"])
+    """The scene's vertical axis that the options name; z if they name none."""
+    return str(options["up_axis"] or "z")
 
 
 def residual_colors(shares: Floats) -> Floats:

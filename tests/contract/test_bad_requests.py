@@ -33,7 +33,7 @@ def matrix(*changes: tuple[int, int, Any]) -> dict[str, Any]:
         pytest.param({"sampling": {"views": "5"}}, "/options/sampling/views", id="a string"),
         pytest.param({"sampling": {"views": True}}, "/options/sampling/views", id="a boolean"),
         pytest.param({"sampling": {"views": 5.5}}, "/options/sampling/views", id="a fraction"),
-        pytest.param({"sampling": {"up_axis": "w"}}, "/options/sampling/up_axis", id="unknown axis"),
+        pytest.param({"up_axis": "w"}, "/options/up_axis", id="unknown axis"),
         pytest.param(
             {"sampling": {"scene_camera_distance": float("nan")}}, "/options/sampling/scene_camera_distance", id="NaN"
         ),
@@ -49,6 +49,13 @@ def matrix(*changes: tuple[int, int, Any]) -> dict[str, Any]:
 def test_options(world: World, options: Any, pointer: str) -> None:
     problem = assert_refused(post(world, world.valid_request() | {"options": options}), 422, "INVALID_OPTIONS")
     assert pointer in [entry["pointer"] for entry in problem["errors"]]
+
+
+def test_an_unknown_option_is_answered_with_the_one_that_was_meant(world: World) -> None:
+    body = world.valid_request() | {"options": {"robust": {"up_axis": "z"}}}
+    (fault,) = assert_refused(post(world, body), 422, "INVALID_OPTIONS")["errors"]
+    assert fault["pointer"] == "/options/robust/up_axis"
+    assert "did you mean `up_axis`?" in fault["detail"]
 
 
 @pytest.mark.parametrize(

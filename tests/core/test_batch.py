@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from regnf_core.batch import register_batch
-from regnf_core.errors import CancelledError, InvalidInputError
+from regnf_core.errors import CancelledError, InvalidInputError, InvalidOptionsError
 from regnf_core.fields.base import CountingField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.result import Phase
 from tests.core.analytic import chair, chair_pose, room, table
@@ -57,6 +58,13 @@ def test_an_unknown_pair_is_refused_before_any_work() -> None:
         with pytest.raises(InvalidInputError) as raised:
             register_batch(scene, [detection()], [chair()], pairs=[pair], options=ROBUST)
         assert raised.value.reason == "PAIR_UNKNOWN"
+    assert scene.evaluations == 0
+
+
+def test_options_of_another_preset_are_refused_before_any_work() -> None:
+    scene = CountingField(room(chair_pose()))
+    with pytest.raises(InvalidOptionsError, match="registers a batch"):
+        register_batch(scene, [detection()], [chair()], options=RegistrationOptions(preset="paper"))
     assert scene.evaluations == 0
 
 

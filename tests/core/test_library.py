@@ -8,9 +8,10 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from regnf_core.errors import InvalidInputError
-from regnf_core.fields.base import SdfField
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.fields.base import CountingField, SdfField
 from regnf_core.library import LibraryObject, model_object, search_library
+from regnf_core.options import RegistrationOptions
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, sphere, table
 from tests.core.robust.shapes import ROBUST, can, detection, placement_error, slab_table
 
@@ -84,3 +85,11 @@ def test_an_empty_library_is_refused() -> None:
     with pytest.raises(InvalidInputError) as raised:
         search_library(room(chair_pose()), detection(), [], ROBUST)
     assert raised.value.reason == "LIBRARY_EMPTY"
+
+
+def test_options_of_another_preset_are_refused_before_any_work() -> None:
+    scene, paper = CountingField(room(chair_pose())), RegistrationOptions(preset="paper")
+    with pytest.raises(InvalidOptionsError) as raised:
+        search_library(scene, detection(), library({"chair": chair()}, Counter()), paper)
+    assert raised.value.reason == "LIBRARY_SEARCH_UNSUPPORTED"
+    assert scene.evaluations == 0

@@ -10,11 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from regnf_core.errors import CancelledError, InitializationError, InvalidInputError
+from regnf_core.errors import CancelledError, InitializationError, InvalidInputError, InvalidOptionsError
+from regnf_core.fields.base import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import model_object
 from regnf_core.options import OptimizationOptions, RegistrationOptions
-from regnf_core.registration import register
+from regnf_core.registration import WarmStart, register
 from regnf_core.result import Phase
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere, table
 from tests.core.conftest import QUICK, ChairRun
@@ -105,6 +108,22 @@ def test_a_progress_callback_may_cancel() -> None:
     with pytest.raises(CancelledError):
         register(room(T), chair(), chair_box(T), BRIEF, progress=stop)
     assert iterations == 4
+
+
+@pytest.mark.parametrize(
+    ("warm_start", "reason"),
+    [
+        (WarmStart(T_object_scene=Sim3.identity()), "INITIAL_TRANSFORM_UNSUPPORTED"),
+        (WarmStart(object_model=model_object(chair())), "INVALID_OPTIONS"),
+    ],
+    ids=["initial transform", "object model"],
+)
+def test_a_warm_start_is_refused_before_any_work(warm_start: WarmStart, reason: str) -> None:
+    scene = CountingField(room(chair_pose()))
+    with pytest.raises(InvalidOptionsError, match="only the preset `robust`") as raised:
+        register(scene, chair(), chair_box(chair_pose()), OPTIONS, warm_start=warm_start)
+    assert raised.value.reason == reason
+    assert scene.evaluations == 0
 
 
 def test_a_wrong_object_is_never_registered() -> None:

@@ -117,7 +117,7 @@ class Stage:
         if story == "searched":
             return searched_result(self.data)
         if story == "tipped":
-            return self.data.result | {"options": {"preset": "robust", "robust": {"up_axis": "y"}}}
+            return self.data.result | {"options": {"preset": "robust", "up_axis": "y"}}
         if story != "ambiguous":
             return self.data.result
         return ambiguous_result(self.data)

@@ -38,7 +38,8 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
         "options": {
             "preset": "robust",
             "sampling": {"views": 5},
-            "robust": {"up_axis": None, "rotations": 600, "inlier_distance": 0.015},
+            "up_axis": None,
+            "robust": {"rotations": 600, "inlier_distance": 0.015},
         },
     }
 

@@ -89,7 +89,7 @@ class CoreEngine:
         from regnf_core.fields.safe_format import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
-        from regnf_core.registration import register
+        from regnf_core.registration import WarmStart, register
         from regnf_core.viewing import write_artifacts
 
         start, truth = request.get("initial_transform"), request.get("ground_truth")
@@ -100,8 +100,7 @@ class CoreEngine:
             RegistrationOptions.from_dict(request["options"]),
             request["seed"],
             report,
-            Sim3.from_matrix(start) if start else None,
-            model,
+            WarmStart(Sim3.from_matrix(start) if start else None, model),
         )
         report("exporting", 0.95)
         T_true = Sim3.from_matrix(truth["T_object_scene"]) if truth else None

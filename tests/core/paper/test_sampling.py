@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError
 from regnf_core.fields.base import CountingField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.options import SamplingOptions
+from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene, thin_out
 from regnf_core.result import SurfaceSamples
 from regnf_core.surface.cameras import Rays, camera_positions, cast_rays
@@ -34,7 +34,8 @@ def trace(field: AnalyticField, origins: list[list[float]], directions: list[lis
 
 def test_cameras_stand_on_the_upper_half_sphere_and_apart() -> None:
     center = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    for axis, number in (("x", 0), ("y", 1), ("z", 2)):
+    axes: list[tuple[Axis, int]] = [("x", 0), ("y", 1), ("z", 2)]
+    for axis, number in axes:
         offsets = camera_positions(center, 0.9, 5, axis) - center
         torch.testing.assert_close(offsets.norm(dim=1), torch.full((5,), 0.9, dtype=torch.float64))
         torch.testing.assert_close(
@@ -118,8 +119,9 @@ def test_ground_and_surroundings_are_left_out() -> None:
 
 def test_the_ground_follows_the_up_axis() -> None:
     ball = sphere(0.25)
-    for axis, number in (("x", 0), ("y", 1), ("z", 2)):
-        found = sample_scene(ball, BALL_BOX, SamplingOptions(pixel_stride=16, up_axis=axis, ground_fraction=0.5))
+    axes: list[tuple[Axis, int]] = [("x", 0), ("y", 1), ("z", 2)]
+    for axis, number in axes:
+        found = sample_scene(ball, BALL_BOX, SamplingOptions(pixel_stride=16, ground_fraction=0.5), up_axis=axis)
         assert float(found.points[:, number].min()) >= 0.0
 
 

@@ -29,7 +29,7 @@ REGISTER_EXAMPLES: dict[str, Any] = {
                 "label": "chair",
                 "score": 0.91,
             },
-            "options": {"robust": {"up_axis": "z", "scene_samples": 6000}},
+            "options": {"up_axis": "z", "robust": {"scene_samples": 6000}},
             "seed": 7,
         },
     },

@@ -7,6 +7,7 @@ from typing import TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from regnf_core.options import UNKNOWN_OPTION, did_you_mean
 from regnf_service.http.problems import Problem, json_pointer
 from regnf_service.http.schemas.detections import SPELLINGS as BOX_SPELLINGS
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
@@ -52,7 +53,13 @@ def refusal(error: ValidationError, otherwise: str) -> Problem:
     ]
     reason = next(filter(None, reasons), otherwise)
     entries = [
-        {"pointer": json_pointer(place), "detail": fault["msg"].removeprefix("Value error, ")}
+        {"pointer": json_pointer(place), "detail": _detail(place, fault["type"], fault["msg"])}
         for place, fault in zip(places, faults, strict=True)
     ]
     return Problem(reason, errors=entries)
+
+
+def _detail(place: list[str | int], kind: str, message: str) -> str:
+    """The fault in words; for an unknown option, with the name that may have been meant."""
+    unknown_option = kind == UNKNOWN_OPTION and place[0] == "options"
+    return message.removeprefix("Value error, ") + (did_you_mean(place[1:]) if unknown_option else "")

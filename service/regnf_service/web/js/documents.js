@@ -25,7 +25,7 @@ export function detectionOf(job, result) {
 
 /** The axis of the scene that points up, as far as the options say. */
 export function upAxisOf(options) {
-  const said = (options?.preset === 'robust' && options.robust?.up_axis) || options?.sampling?.up_axis;
+  const said = options?.up_axis;
   return ['x', 'y', 'z'].includes(said) ? said : 'z';
 }
 

@@ -6,7 +6,7 @@ const HINTS = {
   DETECTION_OUTSIDE_SCENE: 'The box lies outside the scene field’s bounds. Check its frame and units.',
   NO_INITIAL_TRANSFORM: 'Too little of the object’s shape is visible in the box, or it is another object. A tighter box or another library object may help.',
   LOW_OVERLAP: 'The surfaces touch only in part. A box that encloses the whole object, and nothing else, helps most.',
-  SEVERAL_POSES_AGREE: 'Choose the pose you mean below. Where things stand upright, the option robust.up_axis leaves out those that do not.',
+  SEVERAL_POSES_AGREE: 'Choose the pose you mean below. If things stand upright, set the option up_axis: poses that do not stand upright are left out.',
   SCENE_UNEXPLAINED: 'Something else, or more than the object, stands in the box. A tighter box or another library object may help.',
   SURFACE_UNEXPLAINED: 'Most often it is a look-alike, like a chair without its cushion. If something lies on the object, a tighter box may help.',
   FREE_SPACE_VIOLATED: 'Most often it is another object, or the scene’s field lacks parts of this one.',
