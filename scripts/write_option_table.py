@@ -1,4 +1,4 @@
-"""Write the table of the options that the preset `robust` uses into docs/api.md. Run it when they change; a test compares the two.
+"""Write the table of the options that the preset `robust` uses into docs/api.md. A test compares the two.
 
 python scripts/write_option_table.py
 """
