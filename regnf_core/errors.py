@@ -16,19 +16,27 @@ This module imports nothing heavy: the HTTP front end uses it without loading to
 
 from __future__ import annotations
 
+from regnf_core.hints import HINTS
+
 
 class RegnfError(Exception):
     """Base of all errors raised by regnf.
 
-    ``reason`` is a stable UPPER_SNAKE word; the message is for people and may change.
+    ``reason`` is a stable UPPER_SNAKE word; the message is for people and may change. ``hint`` says what to do next:
+    the one given, else the usual one for the reason, else None.
     """
 
     reason: str = "INTERNAL"
 
-    def __init__(self, message: str, *, reason: str | None = None) -> None:
+    def __init__(self, message: str, *, reason: str | None = None, hint: str | None = None) -> None:
         super().__init__(message)
         if reason is not None:
             self.reason = reason
+        self._hint = hint
+
+    @property
+    def hint(self) -> str | None:
+        return self._hint or HINTS.get(self.reason)
 
 
 class InvalidInputError(RegnfError):
@@ -44,9 +52,18 @@ class InvalidOptionsError(InvalidInputError):
 
 
 class InvalidDetectionError(InvalidInputError):
-    """A detection box is malformed, or lies outside the scene's bounds."""
+    """A detection box is malformed, or lies outside the scene's bounds.
+
+    ``place`` leads to the faulty member from the detection on: ("center", 0).
+    """
 
     reason = "INVALID_DETECTION"
+
+    def __init__(
+        self, message: str, *, reason: str | None = None, hint: str | None = None, place: tuple[str | int, ...] = ()
+    ) -> None:
+        super().__init__(message, reason=reason, hint=hint)
+        self.place = place
 
 
 class FieldFormatError(InvalidInputError):

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from regnf_core.detections import Detection, parse_detection
+from regnf_core.detections.rotations import quaternion_of
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.geometry.quaternions import matrix_from_quaternion
 
@@ -41,6 +44,23 @@ class OrientedBox:
             raise InvalidDetectionError("box rotation is not a proper rotation matrix")
         if self.score is not None and not 0.0 <= self.score <= 1.0:
             raise InvalidDetectionError("box score must lie within 0 and 1")
+
+    @classmethod
+    def from_dict(cls, values: Any, index: int | None = None) -> OrientedBox:
+        """A box from a detection's JSON, in any of the forms of :mod:`regnf_core.detections.parsing`.
+
+        Raises InvalidDetectionError naming the faulty member and what to write instead.
+        """
+        return cls.from_detection(parse_detection(values, index))
+
+    @classmethod
+    def from_detection(cls, box: Detection) -> OrientedBox:
+        return cls.from_quaternion(box.center, box.size, box.rotation_quaternion_xyzw, box.label, box.score)
+
+    def to_detection(self) -> Detection:
+        """The same box as plain numbers."""
+        center, size = (tuple(values.tolist()) for values in (self.center, self.size))
+        return Detection(center, size, quaternion_of(self.rotation.tolist()), self.label, self.score)
 
     @classmethod
     def from_corners(

@@ -8,7 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.errors import InvalidDetectionError, NoSurfaceError
+from regnf_core.detections import require_in_scene
+from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
@@ -75,10 +76,8 @@ def thin_out(samples: SurfaceSamples, limit: int, generator: torch.Generator) ->
 
 def check_box_meets_scene(scene: SdfField, detection: OrientedBox) -> None:
     """Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE) when the box lies wholly outside the scene's bounds."""
-    corners = detection.corners()
-    low, high = scene.bounds
-    if bool(((corners.amax(0) <= low) | (corners.amin(0) >= high)).any()):
-        raise InvalidDetectionError("the detection box lies outside the scene", reason="DETECTION_OUTSIDE_SCENE")
+    low, high = scene.bounds.tolist()
+    require_in_scene(detection.to_detection(), (low, high))
 
 
 def _camera_positions(box: OrientedBox, distance: float, views: int, turn: float, up_axis: Axis) -> Tensor:

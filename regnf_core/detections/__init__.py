@@ -1,0 +1,12 @@
+"""Detections: the box in which an object was found, read from every form that detectors and datasets write.
+
+Torch-free: the command line and the HTTP interface check a box before any field is opened.
+"""
+
+from __future__ import annotations
+
+from regnf_core.detections.bounds import Bounds, require_in_scene
+from regnf_core.detections.detection import Detection
+from regnf_core.detections.parsing import parse_detection
+
+__all__ = ["Bounds", "Detection", "parse_detection", "require_in_scene"]

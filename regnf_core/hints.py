@@ -1,0 +1,61 @@
+"""What to do next, by the stable reason of an error or of a verdict; and the name that was meant.
+
+Command line, problem objects, result documents and page all show these. Torch-free.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+HINTS: dict[str, str] = {
+    "NO_SURFACE_IN_DETECTION": "Check that the box is in the scene field's own frame and units, and that it encloses "
+    "the object.",
+    "NO_SURFACE_IN_OBJECT": "The object's field has no zero level within its bounds. Check its bounds and its sign: "
+    "positive outside, negative inside.",
+    "DETECTION_OUTSIDE_SCENE": "Write the box in the scene field's own frame and units; `regnf inspect` shows the "
+    "field's bounds.",
+    "NO_INITIAL_TRANSFORM": "Too little of the object's shape is visible in the box, or it is another object. Try a "
+    "tighter box, or another object of the library.",
+    "LOW_OVERLAP": "The surfaces agree in part only. Use a box that encloses the whole object and nothing else.",
+    "SEVERAL_POSES_AGREE": "Choose a pose among the alternatives. Where things stand upright, set the option "
+    "robust.up_axis: it leaves out poses that do not.",
+    "SCENE_UNEXPLAINED": "The box holds another object, or more than the object. Try a tighter box, or another object "
+    "of the library.",
+    "SURFACE_UNEXPLAINED": "Most often the object is a similar one, for example a chair without its cushion. If "
+    "something lies on it, try a tighter box.",
+    "FREE_SPACE_VIOLATED": "Most often it is another object, or the scene's field lacks parts of this one.",
+    "TOO_LITTLE_SURFACE": "Too little of the object was observed. Fit the scene's field to more views, or use a box "
+    "around more of the object.",
+    "LARGE_RESIDUAL": "Most often it is another object. With the preset paper, try the preset robust or more "
+    "iterations.",
+    "WORKER_LOST": "Most often memory ran out. Post the same request to start it again, or use a worker with more "
+    "memory.",
+    "JOB_TIMEOUT": "Use fewer samples, or set a longer time limit for the service (REGNF_JOB_TIMEOUT_S).",
+    "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
+}
+"""Errors may carry a hint of their own, which says more."""
+
+RENAMED: dict[str, str] = {
+    "centre": "center",
+    "initialisation": "initialization",
+    "optimisation": "optimization",
+    "regulariser_weight": "regularizer_weight",
+    "colour": "color",
+    "judgement": "verdict",
+    "family": "kind",
+    "max_hidden_share": "max_occluded_share",
+}
+"""Names of earlier versions, and what they are called now."""
+_MIN_SIMILARITY = 0.6
+
+
+def suggestion(name: str, known: Iterable[str]) -> str | None:
+    """ "Did you mean `center`?" for a name that is not known; None where nothing is near."""
+    names = sorted(known)
+    renamed = RENAMED.get(name)
+    if renamed in names:
+        return f"Did you mean `{renamed}`?"
+    by_lower = {one.lower(): one for one in reversed(names)}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=_MIN_SIMILARITY)
+    return f"Did you mean `{by_lower[near[0]]}`?" if near else None
