@@ -9,21 +9,20 @@ from regnf_cli.start_errors import StartError
 from regnf_service.http.tokens import TokensError, read_callers
 from regnf_service.webhooks.signing import read_secrets
 from regnf_service.webhooks.targets import AllowList
-from regnf_state.settings import Settings, is_loopback
+from regnf_state.settings import Settings
 
 _BACKLOG = 2048
 
 
-def open_socket(settings: Settings) -> socket.socket:
-    """A listening socket on the settings' host and port (0: a free one).
+def check_access(settings: Settings) -> None:
+    """Raises StartError for what would let strangers in, and for callers that cannot be read.
 
-    Raises StartError: ADDRESS_UNAVAILABLE, TOKENS_UNUSABLE, or UNAUTHENTICATED_PUBLIC_BIND for an address that others
-    can reach while no token is asked for.
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the address while no token is asked for. TOKENS_UNUSABLE: see there.
     """
-    if not is_loopback(settings.host) and not settings.needs_token and not settings.allow_unauthenticated:
+    if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
         raise StartError(
-            f"{settings.host} can be reached by others and no token is asked for: set REGNF_API_TOKENS, "
-            "or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
+            f"{settings.publish or settings.host} can be reached by others and no token is asked for: "
+            "set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
         )
     try:
@@ -32,6 +31,14 @@ def open_socket(settings: Settings) -> socket.socket:
         AllowList(settings.webhook_hosts)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason) from error
+
+
+def open_socket(settings: Settings) -> socket.socket:
+    """A listening socket on the settings' host and port (0: a free one).
+
+    Raises StartError: ADDRESS_UNAVAILABLE, or what ``check_access`` refuses.
+    """
+    check_access(settings)
     try:
         found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, protocol, _, address = found[0]

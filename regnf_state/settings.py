@@ -54,6 +54,8 @@ class Settings(BaseSettings):
     """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
     api_tokens_file: Path | None = None
     """More of them, one a line."""
+    publish: str | None = None
+    """In a container: where its port is published on the host, as compose takes it, `address:port`."""
     allow_unauthenticated: bool = False
     """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
     max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
@@ -108,11 +110,21 @@ class Settings(BaseSettings):
         return bool(self.api_tokens) or self.api_tokens_file is not None
 
     @property
+    def published_on_loopback(self) -> bool:
+        """Whether a container's port is published on the host's loopback. A port without an address is not."""
+        return self.publish is not None and is_loopback(self.publish.rpartition(":")[0].strip("[]"))
+
+    @property
+    def is_private(self) -> bool:
+        """Whether only this machine can reach the service."""
+        return self.published_on_loopback if self.publish else is_loopback(self.host)
+
+    @property
     def calls_per_s(self) -> float:
         """The rate that holds; 0: none."""
         if self.rate_limit_per_s is not None:
             return self.rate_limit_per_s
-        return 0.0 if is_loopback(self.host) else _RATE_BEYOND_LOOPBACK
+        return 0.0 if self.is_private else _RATE_BEYOND_LOOPBACK
 
     @property
     def scratch_dir(self) -> Path:

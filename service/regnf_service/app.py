@@ -88,7 +88,7 @@ def _middleware(
         TokenGate,
         callers=callers,
         needs_token=settings.needs_token,
-        allow_unauthenticated=settings.allow_unauthenticated,
+        allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
     limits = [Middleware(RateGate, limiter=limiter)] if limiter is not None else []
     return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), gate, *limits]

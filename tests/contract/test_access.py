@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -63,10 +64,12 @@ def test_the_probe_and_the_page_are_open_and_tell_nothing(guarded: World) -> Non
         ("::1", {}, 200),
         ("::ffff:127.0.0.1", {}, 200),
         ("10.0.0.5", {"allow_unauthenticated": True}, 200),
+        ("10.0.0.5", {"publish": "127.0.0.1:8080"}, 200),
+        ("10.0.0.5", {"publish": "0.0.0.0:8080"}, 401),
     ],
 )
 def test_without_tokens_only_loopback_is_served(
-    tmp_path: Path, address: str, settings: dict[str, bool], status: int
+    tmp_path: Path, address: str, settings: dict[str, Any], status: int
 ) -> None:
     host = f"[{address}]" if ":" in address else address
     made = make_world(tmp_path, **settings)

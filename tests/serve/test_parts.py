@@ -1,6 +1,7 @@
 """The supervisor's small parts on their own."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from regnf_cli import embedded_redis
-from regnf_cli.listening import address_of, is_loopback, open_socket
+from regnf_cli.listening import address_of, check_access, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
-from regnf_state.settings import Settings
+from regnf_state.settings import Settings, is_loopback
 from tests.worker.bench import alive, children_of, eventually
 
 
@@ -31,6 +32,37 @@ from tests.worker.bench import alive, children_of, eventually
 )
 def test_what_is_loopback(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
+
+
+@pytest.mark.parametrize(
+    ("publish", "private"),
+    [
+        ("127.0.0.1:8080", True),
+        ("127.0.0.1:9000-9010", True),
+        ("[::1]:8080", True),
+        ("0.0.0.0:8080", False),
+        ("[::]:8080", False),
+        ("192.0.2.1:8080", False),
+        ("8080", False),
+        ("127.0.0.1:8080:8080", False),
+    ],
+)
+def test_a_container_asks_for_no_token_where_only_its_host_reaches_it(publish: str, private: bool) -> None:
+    settings = Settings(host="0.0.0.0", publish=publish)
+    assert settings.is_private is private
+    assert settings.calls_per_s == (0 if private else 20)
+    if private:
+        check_access(settings)
+        return
+    with pytest.raises(StartError, match=f"^{re.escape(publish)} can be reached by others") as caught:
+        check_access(settings)
+    assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
+    check_access(Settings(host="0.0.0.0", publish=publish, api_tokens=frozenset({"lab:a-long-random-string"})))
+
+
+def test_a_published_loopback_is_not_private() -> None:
+    """Whoever publishes the port elsewhere says so, whatever the container's own address is."""
+    assert not Settings(host="127.0.0.1", publish="0.0.0.0:8080").is_private
 
 
 def test_addresses_to_open() -> None:
