@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 
-from regnf_core.fields.safe_format import read_description, write_safe_field
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description, write_safe_field
 
 LEVELS, LOG2_SIZE, WIDTH = 16, 19, 256
 SUFFIX = "-full-size"

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.fit_pieces import Floats, Piece, distances_to, measure_pieces, moved
 from benchmarks.make_image_fields import OBJECT_OPTIONS, ROOM_OPTIONS
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.surface.isosurface import extract_surface
 from regnf_data.composing import room_scene
 from regnf_data.layouts import read_layout

@@ -31,7 +31,7 @@ MB = 1e6
 _OPEN = """
 import sys, time
 import torch
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 begun = time.perf_counter()
 open_field(sys.argv[1])
 print(time.perf_counter() - begun)

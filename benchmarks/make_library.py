@@ -18,8 +18,8 @@ import numpy as np
 from benchmarks.robust.library_objects import GIVEN, library_meshes
 from regnf_core import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.library import model_object, write_object_model
+from regnf_core.schema.safe_format import write_safe_field
 from scripts import make_demo_fields as demo
 
 INSTANCES = {

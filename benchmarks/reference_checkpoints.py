@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 
 VALUE_BAR, GRADIENT_BAR = 1e-5, 1e-3

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.library import ObjectModel, model_object, read_object_model, write_object_model
 from regnf_core.loading import default_cache_dir, safe_field_path
 from regnf_core.options import RobustOptions

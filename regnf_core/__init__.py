@@ -19,7 +19,7 @@ from regnf_core.version import __version__
 if TYPE_CHECKING:
     from regnf_core.errors import RegnfError
     from regnf_core.fields.base import SdfField
-    from regnf_core.fields.safe_format import open_field
+    from regnf_core.fields.build import open_field
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.options import RegistrationOptions
@@ -34,7 +34,7 @@ _HOMES = {
     "SdfField": "regnf_core.fields.base",
     "Sim3": "regnf_core.geometry.sim3",
     "WarmStart": "regnf_core.robust.register",
-    "open_field": "regnf_core.fields.safe_format",
+    "open_field": "regnf_core.fields.build",
     "register": "regnf_core.registration",
 }
 

@@ -27,14 +27,14 @@ def load_field(
 
     Raises FieldFormatError (with the gate's reason) and FileNotFoundError.
     """
-    from regnf_core.fields.safe_format import open_field
+    from regnf_core.fields.build import open_field
 
     return open_field(safe_field_path(Path(path), description, cache_dir), device)
 
 
 def safe_field_path(path: Path, description: dict[str, Any] | None = None, cache_dir: Path | None = None) -> Path:
     """The safe field for a file: the file itself when it is one already, else what the import gate made of it."""
-    from regnf_core.fields.safe_format import read_description
+    from regnf_core.schema.safe_format import read_description
 
     if path.suffix.lower() == ".safetensors":
         try:

@@ -48,6 +48,33 @@ def test_no_package_imports_what_it_must_not_know(package: str) -> None:
     assert not broken
 
 
+def modules_of(package: str) -> dict[str, Path]:
+    """Every module of a package by its dotted name."""
+    files = (ROOT / FOLDERS.get(package, package)).rglob("*.py")
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+@pytest.mark.parametrize("package", ["regnf_core", "regnf_fit", "regnf_data"])
+def test_no_two_modules_import_each_other(package: str) -> None:
+    modules = modules_of(package)
+    imported = {name: set(imports_of(path)) - {name} for name, path in modules.items()}
+    pairs = {(a, b) for a in modules for b in imported[a] & modules.keys() if a < b and a in imported[b]}
+    assert not pairs
+
+
+def test_descriptions_know_nothing_of_what_evaluates_them() -> None:
+    """``regnf_core.schema`` is plain data: it imports itself and the errors, nothing else of regnf_core."""
+    allowed = ("regnf_core.schema", "regnf_core.errors")
+    broken = {
+        f"{module} imports {name}"
+        for module, path in modules_of("regnf_core").items()
+        if module.startswith("regnf_core.schema")
+        for name in imports_of(path)
+        if name.startswith("regnf_core.") and not name.startswith(allowed)
+    }
+    assert not broken
+
+
 @pytest.mark.parametrize(
     "module", ["regnf_service.app", "regnf_worker.main", "regnf_worker.jobs", "regnf_core", "regnf_cli.main"]
 )

@@ -36,7 +36,8 @@ from torch import Tensor
 from benchmarks.peers.disturbance import keypoints, rigid_fit
 from benchmarks.peers.interface import PeerCase, PeerResult
 from regnf_core import SdfField, Sim3
-from regnf_core.fields.base import CountingField, differentiable_signed_distance
+from regnf_core.fields.base import differentiable_signed_distance
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.exponential_map import rotation_exp
 from regnf_core.paper.kernel import AdaptiveKernel
 from regnf_core.paper.sampling import thin_out

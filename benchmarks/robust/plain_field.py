@@ -13,8 +13,8 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from regnf_core.fields.safe_format import read_description
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description
 
 
 class PlainField(nn.Module):

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from regnf_core.fields.observation import Observation
 
 
 @runtime_checkable
@@ -60,36 +57,3 @@ class _SignedDistance(torch.autograd.Function):
 def differentiable_signed_distance(field: SdfField, points: Tensor) -> Tensor:
     """Signed distance (N,) at points (N, 3) that autograd can differentiate once with respect to the points."""
     return _SignedDistance.apply(points, field)  # type: ignore[no-untyped-call, no-any-return]
-
-
-class CountingField:
-    """A field that counts the points it was asked for (a gradient counts as one evaluation), for reports and tests."""
-
-    def __init__(self, field: SdfField) -> None:
-        self.field = field
-        self.evaluations = 0
-
-    @property
-    def bounds(self) -> Tensor:
-        return self.field.bounds
-
-    @property
-    def device(self) -> torch.device:
-        return self.field.device
-
-    @property
-    def observation(self) -> Observation | None:
-        return getattr(self.field, "observation", None)
-
-    def to(self, device: torch.device | str) -> CountingField:
-        moved = CountingField(self.field.to(device))
-        moved.evaluations = self.evaluations
-        return moved
-
-    def signed_distance(self, points: Tensor) -> Tensor:
-        self.evaluations += points.shape[0]
-        return self.field.signed_distance(points)
-
-    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        self.evaluations += points.shape[0]
-        return self.field.signed_distance_and_gradient(points)

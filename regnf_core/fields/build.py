@@ -1,26 +1,86 @@
-"""From a description and its tensors to a field that can be evaluated."""
+"""From a stored description and its tensors to a field that can be evaluated."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 
+import torch
+from safetensors import safe_open
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.feature_volumes import build_feature_volumes
+from regnf_core.fields.grid_mlp import build_grid_mlp
+from regnf_core.fields.mlp import build_mlp
+from regnf_core.fields.neural_points import build_neural_points
+from regnf_core.fields.neus_facto import build_neus_facto
 from regnf_core.fields.observation import ObservedField, stored_observation
+from regnf_core.fields.onnx.graph import build_onnx
 from regnf_core.fields.scaled import AdjustedField
-from regnf_core.schema.kinds.kind import FieldDescription
-from regnf_core.schema.kinds.observation_grid import OBSERVATION
+from regnf_core.fields.voxel_blocks import build_voxel_blocks
+from regnf_core.fields.voxel_grid import build_voxel_grid
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription
+from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
+from regnf_core.schema.kinds.mesh import MeshDescription
+from regnf_core.schema.kinds.mlp import MlpDescription
+from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
+from regnf_core.schema.kinds.neus_facto import NeusFactoDescription
+from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.kinds.voxel_blocks import VoxelBlocksDescription
+from regnf_core.schema.kinds.voxel_grid import VoxelGridDescription
+from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.safe_format import read_header
+
+
+def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:
+    """Open the field file ``path``, with its parameters on ``device``. On a CPU, float32 tensors are memory-mapped.
+
+    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH, and
+    what :func:`build_field` raises.
+    """
+    description, names = read_header(path)
+    with safe_open(os.fspath(path), framework="pt", device=str(device)) as file:
+        return build_field(description, {name: file.get_tensor(name) for name in names})
 
 
 def build_field(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:
     """The field of ``description`` with its parameters in ``tensors`` (names as in the safe format), in float32.
 
-    Tensors keep their device; they must have passed the description's ``check``.
+    Tensors keep their device. They must have passed the description's ``check``.
+    Raises FieldFormatError: FIELD_INDEX_INVALID, MESH_INVALID or ONNX_GRAPH_INVALID, by kind.
     """
-    field = description.build({name: tensor for name, tensor in tensors.items() if name != OBSERVATION})
+    field = _build_kind(description, {name: tensor for name, tensor in tensors.items() if name != OBSERVATION})
     if description.observation is not None:
         field = ObservedField(field, stored_observation(description.observation, tensors[OBSERVATION]))
     if description.world_scale == 1.0 and description.sign == 1:
         return field
     return AdjustedField(field, description.world_scale, description.sign)
+
+
+def _build_kind(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:
+    """The kind's own function as a field, without the entries that all kinds share: one case a kind."""
+    match description:
+        case NeusFactoDescription():
+            return build_neus_facto(description, tensors)
+        case MlpDescription():
+            return build_mlp(description, tensors)
+        case MeshDescription():
+            from regnf_core.fields.mesh import build_mesh  # loads libigl and trimesh: nearly two seconds
+
+            return build_mesh(description, tensors)
+        case OnnxDescription():
+            return build_onnx(description, tensors)
+        case NeuralPointsDescription():
+            return build_neural_points(description, tensors)
+        case GridMlpDescription():
+            return build_grid_mlp(description, tensors)
+        case FeatureVolumesDescription():
+            return build_feature_volumes(description, tensors)
+        case VoxelGridDescription():
+            return build_voxel_grid(description, tensors)
+        case VoxelBlocksDescription():
+            return build_voxel_blocks(description, tensors)
+        case _:
+            raise NotImplementedError(f"no evaluator for fields of the class {type(description).__name__}")

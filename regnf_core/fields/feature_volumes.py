@@ -13,7 +13,6 @@ from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
 from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription, count_volumes
-from regnf_core.schema.kinds.mlp import count_layers
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,8 @@ def build_feature_volumes(
 
     Tensors keep their device; they must have passed :meth:`FeatureVolumesDescription.check_tensors`.
     """
-    layers = range(count_layers(tensors))
-    weights, biases = ([tensors[f"layers.{i}.{part}"].float() for i in layers] for part in ("weight", "bias"))
     volumes = tuple(tensors[f"volumes.{i}"].contiguous() for i in range(count_volumes(tensors)))
-    function = FeatureVolumesFunction(volumes, GeometryMlp(weights, biases, skip_at=None, activation="relu"))
+    function = FeatureVolumesFunction(volumes, GeometryMlp.from_tensors(tensors))
     high = torch.ones(3, device=function.device)
     bounds = torch.tensor(description.function_bounds, dtype=torch.float64)
     return FunctionField(BoxExtension(function, -high, high, float(description.sign)), bounds)

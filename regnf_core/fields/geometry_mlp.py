@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from regnf_core.fields.activations import ACTIVATIONS
+from regnf_core.schema.layers import count_layers
 
 
 class GeometryMlp:
@@ -31,6 +32,15 @@ class GeometryMlp:
         self.skip_at = skip_at if skip_at is not None and len(self.weights) > skip_at else None
         self.activation = activation
         self._function = ACTIVATIONS[activation]
+
+    @classmethod
+    def from_tensors(
+        cls, tensors: Mapping[str, Tensor], skip_at: int | None = None, activation: str = "relu"
+    ) -> GeometryMlp:
+        """The network in the tensors ``layers.{i}.weight`` and ``layers.{i}.bias`` of a stored field, in float32."""
+        layers = range(count_layers(tensors))
+        weights, biases = ([tensors[f"layers.{i}.{part}"].float() for i in layers] for part in ("weight", "bias"))
+        return cls(weights, biases, skip_at, activation)
 
     def to(self, device: torch.device | str) -> GeometryMlp:
         """The same network on another device."""

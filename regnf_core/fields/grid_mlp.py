@@ -13,7 +13,6 @@ from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
 from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
-from regnf_core.schema.kinds.mlp import count_layers
 
 
 @dataclass(frozen=True)
@@ -56,9 +55,7 @@ def build_grid_mlp(
     Tensors keep their device; they must have passed :meth:`GridMlpDescription.check_tensors`.
     """
     table = tensors["hash_table"].float()
-    layers = range(count_layers(tensors))
-    weights, biases = ([tensors[f"layers.{i}.{part}"].float() for i in layers] for part in ("weight", "bias"))
-    mlp = GeometryMlp(weights, biases, skip_at=None, activation="relu")
+    mlp = GeometryMlp.from_tensors(tensors)
     high = torch.full((3,), description.grid_radius, device=table.device)
     function = GridMlpFunction(HashEncoding(description.hash, table), mlp, description.grid_radius)
     bounds = torch.tensor(description.function_bounds, dtype=torch.float64)

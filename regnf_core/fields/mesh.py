@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.schema.kinds.mesh import MeshDescription
 
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9
@@ -151,6 +153,14 @@ class MeshField:
         cross = np.cross(first - corner, second - corner)
         norm = np.linalg.norm(cross, axis=1)
         return cross / np.maximum(norm, 1e-300)[:, None], norm / 2.0
+
+
+def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor]) -> MeshField:
+    """The field of ``description`` with its triangles in ``tensors``.
+
+    Raises FieldFormatError (MESH_INVALID) for a face that names a vertex that does not exist.
+    """
+    return MeshField(tensors["vertices"].cpu().numpy(), tensors["faces"].cpu().numpy(), description.function_bounds)
 
 
 def _as_float32(values: NDArray[Any]) -> Tensor:

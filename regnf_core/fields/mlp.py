@@ -11,7 +11,8 @@ from torch import Tensor
 from regnf_core.fields.activations import ACTIVATIONS
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.positional_encoding import PositionalEncoding
-from regnf_core.schema.kinds.mlp import ActivationName, MlpDescription, count_layers
+from regnf_core.schema.kinds.mlp import ActivationName, MlpDescription
+from regnf_core.schema.layers import count_layers
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from regnf_core.fields.cell_index import CellIndex
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.geometry.quaternions import matrix_from_quaternion
-from regnf_core.schema.kinds.mlp import count_layers
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
 
 _PRIMES = (73856093, 19349669, 83492791)
@@ -178,8 +177,6 @@ def build_neural_points(
     cells, rows = torch.unique((points / description.cell_size).floor().long(), dim=0, return_inverse=True)
     cell_points = torch.empty(cells.shape[0], dtype=torch.int64, device=points.device)
     cell_points[rows] = torch.arange(points.shape[0], device=points.device)
-    layers = count_layers(tensors)
-    weights, biases = ([tensors[f"layers.{i}.{part}"].float() for i in range(layers)] for part in ("weight", "bias"))
     orientations = tensors.get("orientations")
     function = NeuralPointsFunction(
         points=points,
@@ -188,7 +185,7 @@ def build_neural_points(
         table=PointTable.of(points, description.cell_size, description.buffer_size, description.reach),
         cells=CellIndex.of(cells),
         cell_points=cell_points,
-        mlp=GeometryMlp(weights, biases, skip_at=None, activation="relu"),
+        mlp=GeometryMlp.from_tensors(tensors),
         neighbors=description.neighbors,
         max_distance=description.max_distance,
         blend_first=description.blend_first,

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.kinds.observation_grid import UNSEEN, ObservationGrid
+from regnf_core.schema.observation_grid import UNSEEN, ObservationGrid
 
 
 @dataclass(frozen=True, eq=False)

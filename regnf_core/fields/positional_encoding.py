@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from regnf_core.schema.kinds.neus_facto import PositionalEncodingDescription
+from regnf_core.schema.positional_encoding import PositionalEncodingDescription
 
 _A, _B, _C, _D = 0.8506508, 0.5257311, 0.809017, 0.309017
 _ICOSAHEDRON = (

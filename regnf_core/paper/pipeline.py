@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import torch
 
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.shape import diameter
 from regnf_core.geometry.sim3 import Sim3

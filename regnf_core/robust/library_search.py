@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import torch
 
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.model.object_model import ObjectModel

@@ -9,7 +9,8 @@ from itertools import count
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions

@@ -11,7 +11,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.kinds.observation_grid import SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import SURFACE, UNSEEN
 
 
 @dataclass(frozen=True, eq=False)

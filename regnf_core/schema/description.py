@@ -1,50 +1,60 @@
-"""What a safe field file says about its tensors: which function they parametrize, and which shapes that asks for.
-
-Torch-free: the import gate writes descriptions and the worker's parent reads them without loading torch.
-"""
+"""What every kind of field shares: the entries of its description, and the check of its tensors. Plain data."""
 
 from __future__ import annotations
 
-import functools
-import math
-from typing import Any
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import TypeAdapter, ValidationError
+from annotated_types import Ge, Le, MaxLen
 
-from regnf_core.errors import FieldFormatError
-from regnf_core.schema.kinds import KINDS
-from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
+from regnf_core.schema.tensor_check import TensorSpec
+
+FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
+Corner = tuple[float, float, float]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
-def parse_description(values: Any) -> FieldDescription:
-    """The description from plain (JSON) values, of the kind that its ``family`` names.
+@dataclass(frozen=True, kw_only=True)
+class FieldDescription(ABC):
+    """Which function a file's tensors parametrize. A kind adds entries of its own and ``check_tensors``.
 
-    Raises FieldFormatError: FIELD_FAMILY_UNKNOWN, or SAFE_FORMAT_INVALID naming the first faulty entry.
+    A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale).
     """
-    if not isinstance(values, dict):
-        raise FieldFormatError("the field's description is not a JSON object", reason="SAFE_FORMAT_INVALID")
-    family = values.get("family")
-    kind = KINDS.get(family) if isinstance(family, str) else None
-    if kind is None:
-        raise FieldFormatError(f"unknown field family {family!r}", reason="FIELD_FAMILY_UNKNOWN")
-    try:
-        description = _adapter(kind).validate_python(values)
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise FieldFormatError(f"description.{where}: {first['msg']}", reason="SAFE_FORMAT_INVALID") from error
-    lower, upper = description.bounds
-    if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lower, upper, strict=True)):
-        raise FieldFormatError("description.bounds: not a finite, non-empty box", reason="SAFE_FORMAT_INVALID")
-    return description
 
+    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
-def description_to_dict(description: FieldDescription) -> dict[str, Any]:
-    """Plain (JSON) values of a description, defaults included, in a fixed order."""
-    values: dict[str, Any] = _adapter(type(description)).dump_python(description, mode="json")
-    return values
+    family: str
+    bounds: tuple[Corner, Corner]
+    """Lowest and highest corner of the region where the field has meaning, the field's own frame and unit."""
+    world_scale: Annotated[float, Ge(1e-6), Le(1e6)] = 1.0
+    """Length, in the field's unit, of one unit of the function's coordinates."""
+    sign: Literal[1, -1] = 1
+    """-1: the function is negative in free space."""
+    up_axis: Axis | None = None
+    """Which axis points up, where somebody said so. Changes nothing about the function."""
+    label: Annotated[str, MaxLen(200)] | None = None
+    source: dict[str, Any] = field(default_factory=dict)
+    """Free notes on the field's origin."""
+    observation: ObservationGrid | None = None
+    """What was seen of the volume, if it is known; its states are one more tensor."""
 
+    @property
+    def function_bounds(self) -> tuple[Corner, Corner]:
+        """The bounds in the function's coordinates."""
+        (ax, ay, az), (bx, by, bz) = self.bounds
+        s = self.world_scale
+        return (ax / s, ay / s, az / s), (bx / s, by / s, bz / s)
 
-@functools.cache
-def _adapter(kind: type[FieldDescription]) -> TypeAdapter[FieldDescription]:
-    return TypeAdapter(kind)
+    def check(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of all tensors that is not as described."""
+        if self.observation is not None:
+            self.observation.check_tensors(tensors)
+            tensors = {name: spec for name, spec in tensors.items() if name != OBSERVATION}
+        self.check_tensors(tensors)
+
+    @abstractmethod
+    def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
+        """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first of the function's tensors that is amiss."""

@@ -8,7 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.result import RegistrationResult, SurfaceSamples
 from regnf_core.surface.agreement import object_residuals, scene_residuals

@@ -16,8 +16,8 @@ import torch
 from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.observation import Observation
-from regnf_core.fields.safe_format import write_safe_field
-from regnf_core.schema.kinds.observation_grid import OBSERVATION
+from regnf_core.schema.observation_grid import OBSERVATION
+from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint

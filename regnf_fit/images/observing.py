@@ -13,9 +13,10 @@ from torch import Tensor
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import Observation
-from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
-from regnf_core.schema.kinds.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
+from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.posed_images import PosedImages
 
 _MARGIN = 1.0
@@ -94,7 +95,7 @@ def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Ob
     """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
 
     Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
-    images saw one; FieldFormatError as :func:`regnf_core.fields.safe_format.open_field`.
+    images saw one; FieldFormatError as :func:`regnf_core.fields.build.open_field`.
     """
     seen = observe(images, voxels)
     if seen is None:

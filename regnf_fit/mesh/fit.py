@@ -13,7 +13,8 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.safe_format import open_field, write_safe_field
+from regnf_core.fields.build import open_field
+from regnf_core.schema.safe_format import write_safe_field
 from regnf_fit.mesh.network import DEGREE, TrainableField
 from regnf_fit.mesh.options import FitOptions, FitProgress, FitReport
 from regnf_fit.mesh.samples import ExactSamples, diagonal, near_samples, padded_bounds, volume_samples

@@ -10,8 +10,8 @@ import torch
 
 from benchmarks.enlarge import enlarge
 from regnf_core import open_field
-from regnf_core.fields.safe_format import read_description, write_safe_field
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description, write_safe_field
 
 
 def test_values_and_gradients_are_the_same(tmp_path: Path) -> None:

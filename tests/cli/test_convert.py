@@ -9,8 +9,9 @@ import pytest
 import torch
 import trimesh
 
+from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
-from regnf_core.fields.safe_format import open_field, read_description
+from regnf_core.schema.safe_format import read_description
 from regnf_data.sdfstudio import write_dataset
 from regnf_fit.images.observing import observe
 from tests.cli.conftest import DATA, Run

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.fields.safe_format import read_description
+from regnf_core.schema.safe_format import read_description
 from regnf_data.sdfstudio import write_dataset
 from tests.cli.conftest import Run
 from tests.fit.images import scenes

@@ -7,7 +7,7 @@ import torch
 
 from regnf_core.batch import register_batch
 from regnf_core.errors import CancelledError, InvalidInputError, InvalidOptionsError
-from regnf_core.fields.base import CountingField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from regnf_core.errors import CancelledError, InitializationError, InvalidInputError, InvalidOptionsError
-from regnf_core.fields.base import CountingField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3

@@ -22,7 +22,7 @@ REQUEST: dict[str, Any] = {
 @pytest.mark.parametrize("start", [None, START])
 def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[Any] = []
-    monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
+    monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
     monkeypatch.setattr("regnf_core.viewing.write_artifacts", lambda result, folder, **said: ["result.json"])
     request = REQUEST | {"initial_transform": start, "ground_truth": None}
@@ -36,7 +36,7 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
 
 
 def test_requests_recorded_before_there_were_starts_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_core.fields.safe_format.open_field", lambda path, device: path.name)
+    monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: None)
     monkeypatch.setattr("regnf_core.viewing.write_artifacts", lambda result, folder, **said: [])
     assert CoreEngine("cpu").register(Path("s"), Path("o"), None, REQUEST, lambda phase, share: None, tmp_path) == []

@@ -184,9 +184,7 @@ def test_two_workers_one_job(table: Bench) -> None:
     for number in range(6):
         done = table.finished(f"j{number}")
         assert (done.status, done.attempt) == ("successful", 1)
-        assert (
-            len([e for e in table.context.records.events(f"j{number}", None) if e.data["phase"] == "loading"]) == 1
-        )
+        assert len([e for e in table.context.records.events(f"j{number}", None) if e.data["phase"] == "loading"]) == 1
 
 
 def upload(table: Bench, sha256: str, data: bytes) -> None:

@@ -86,7 +86,7 @@ class CoreEngine:
     def register(
         self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
     ) -> list[str]:
-        from regnf_core.fields.safe_format import open_field
+        from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
         from regnf_core.registration import WarmStart, register
@@ -110,7 +110,7 @@ class CoreEngine:
     def search(
         self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
     ) -> list[str]:
-        from regnf_core.fields.safe_format import open_field
+        from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.library import LibraryObject, search_library
         from regnf_core.viewing import ranking_document, write_artifacts
@@ -133,7 +133,7 @@ class CoreEngine:
         return names
 
     def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
-        from regnf_core.fields.safe_format import open_field
+        from regnf_core.fields.build import open_field
         from regnf_core.library import model_object, write_object_model
 
         robust = RegistrationOptions.from_dict(options).robust

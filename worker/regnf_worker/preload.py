@@ -18,7 +18,7 @@ _MODULES = (
     "regnf_worker.registration",
     "regnf_core.geometry.box",
     "regnf_core.viewing",
-    "regnf_core.fields.safe_format",
+    "regnf_core.fields.build",
     "regnf_core.library",
     "regnf_core.registration",
     "regnf_core.geometry.sim3",

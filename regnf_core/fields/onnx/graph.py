@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,9 +15,7 @@ from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.onnx.elementwise import ELEMENTWISE, Operator
 from regnf_core.fields.onnx.linear import LINEAR
 from regnf_core.fields.onnx.shaping import SHAPING
-
-if TYPE_CHECKING:
-    from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.kinds.onnx import OnnxDescription
 
 OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
 _MAX_ELEMENTS = 1 << 24

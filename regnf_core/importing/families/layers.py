@@ -10,7 +10,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
-from regnf_core.schema.kinds.neus_facto import MAX_LAYERS
+from regnf_core.schema.layers import MAX_LAYERS
 
 _NORMALIZED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))
 """How torch names direction and length of a normalized weight: the older way, the newer way."""

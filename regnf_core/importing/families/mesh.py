@@ -1,23 +1,14 @@
-"""A mesh file as an exact distance: welded, without triangles of no area, its faces outward."""
+"""Mesh files: triangles become an exact distance field, points with normals a reconstructed surface."""
 
 from __future__ import annotations
 
-import igl
 import numpy as np
-import numpy.typing as npt
 
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes import MESH_READERS
-from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
+from regnf_core.importing.meshes.geometry import malformed
 from regnf_core.importing.upload_description import UploadDescription
-
-_MARGIN = 0.05
-"""How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""
-_PROBES = 2_000
-_INSIDE = 0.5
-_FAR = 1e4
-"""Coordinates beyond this many diagonals leave float32 too few digits."""
 
 
 def convert_mesh(format_: str, data: memoryview, wanted: UploadDescription) -> ConvertedField:
@@ -32,88 +23,6 @@ def convert_mesh(format_: str, data: memoryview, wanted: UploadDescription) -> C
         return mesh_field(geometry, f"a {format_} file", wanted)
     if format_ != "ply" or len(geometry.vertices) == 0:
         raise malformed(f"the {format_} file holds no triangles")
-    from regnf_core.importing.families.point_cloud import convert_cloud
+    from regnf_core.importing.families.point_cloud import convert_cloud  # loads scipy and Open3D
 
     return convert_cloud(geometry, f"a {format_} file", wanted)
-
-
-def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, family: str = "mesh") -> ConvertedField:
-    """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
-    require_family(wanted, family)
-    refuse_other_entries(wanted, family)
-    _check(geometry)
-    vertices, faces = _welded(geometry.vertices, geometry.faces)
-    inside_out = _is_inside_out(vertices, faces)
-    if inside_out:
-        faces = faces[:, ::-1]
-    low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
-    diagonal = float(np.linalg.norm(high - low))
-    bounds = [(low - _MARGIN * diagonal).tolist(), (high + _MARGIN * diagonal).tolist()]
-    loose = _open_edge_share(faces, len(vertices))
-    why = (
-        f"{origin}: {len(faces)} triangles, {len(vertices)} vertices",
-        "watertight"
-        if loose == 0.0
-        else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number tells inside",
-        *(f"passed over: {what}" for what in geometry.left_out),
-    )
-    return ConvertedField(
-        family,
-        why,
-        {"family": "mesh", "source": {"family": family}, **shared_entries(wanted, bounds)},
-        {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
-        _warnings(inside_out, max(np.abs(low).max(), np.abs(high).max()) / diagonal),
-    )
-
-
-def _check(geometry: Geometry) -> None:
-    if not np.isfinite(geometry.vertices).all() or np.abs(geometry.vertices).max(initial=0.0) > 1e30:
-        raise malformed("the mesh has a vertex that is no finite number")
-    if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
-        raise malformed("a face names a vertex that does not exist")
-
-
-def _welded(vertices: Float64Array, faces: Int64Array) -> tuple[npt.NDArray[np.float32], Int64Array]:
-    """Vertices at one place are one, those of no face and triangles without area are dropped."""
-    used, faces = np.unique(faces, return_inverse=True)
-    places = vertices[used].astype(np.float32) + np.float32(0.0)  # adding zero makes -0.0 plain
-    rows = np.ascontiguousarray(places).view([("", np.float32)] * 3).reshape(-1)
-    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
-    corners = number.reshape(-1)[faces.reshape(-1, 3)]
-    a, b, c = (places[first][corners[:, i]].astype(np.float64) for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    corners = corners[area > 0.0]
-    if len(corners) == 0:
-        raise malformed("no triangle of the mesh has an area")
-    kept, corners = np.unique(corners, return_inverse=True)
-    return places[first][kept], corners.reshape(-1, 3)
-
-
-def _is_inside_out(vertices: npt.NDArray[np.float32], faces: Int64Array) -> bool:
-    """Whether the winding number says "inside" nowhere, but does where the faces are turned round."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    probes = low + (high - low) * np.random.default_rng(0).random((_PROBES, 3))
-    tree = igl.FastWindingNumberBVH()
-    tree.init(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64))
-    winding = tree.winding_number(np.ascontiguousarray(probes, np.float64))
-    return bool((winding < -_INSIDE).sum() > (winding > _INSIDE).sum())
-
-
-def _open_edge_share(faces: Int64Array, vertices: int) -> float:
-    """Share of the directed edges that no neighbor runs through the other way, exactly once."""
-    start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
-    forward, count = np.unique(start * vertices + end, return_counts=True)
-    single = forward[count == 1]
-    matched = np.isin(single // vertices + (single % vertices) * vertices, single, assume_unique=True)
-    return float(1.0 - matched.sum() / len(start))
-
-
-def _warnings(inside_out: bool, reach: float) -> tuple[str, ...]:
-    warnings = []
-    if inside_out:
-        text = "its faces point inwards and were turned round; of a room seen from within say sign: -1"
-        warnings.append(f"MESH_INSIDE_OUT: {text}")
-    if reach > _FAR:
-        text = f"its coordinates reach {reach:.0f} diagonals from the origin, which costs digits: move it there"
-        warnings.append(f"FAR_FROM_ORIGIN: {text}")
-    return tuple(warnings)

@@ -15,7 +15,7 @@ from regnf_core.importing.onnx.tensor import Array
 from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
-from regnf_core.schema.kinds.onnx_operators import OPERATORS
+from regnf_core.schema.onnx_operators import OPERATORS
 
 _BATCH = 1024
 _LEAST_FIXED_BATCH = 64

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.mesh import mesh_field
+from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import read_description
 from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family
 from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.safe_format import read_description
 
 _OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}

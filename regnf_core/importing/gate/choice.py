@@ -15,7 +15,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.plausibility import check_plausibility
-from regnf_core.schema.description import parse_description
+from regnf_core.schema.parsing import parse_description
 
 _SAMPLES = 4_096
 _CLEARLY_BETTER = 0.05

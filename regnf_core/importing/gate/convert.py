@@ -23,7 +23,7 @@ from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
-from regnf_core.schema.kinds.observation_grid import OBSERVATION
+from regnf_core.schema.observation_grid import OBSERVATION
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
@@ -47,7 +47,8 @@ def convert_file(
 
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
-    from regnf_core.fields.safe_format import open_field, write_safe_field
+    from regnf_core.fields.build import open_field
+    from regnf_core.schema.safe_format import write_safe_field
 
     converted = _settled(_convert(upload, description, limits.tensor_bytes))
     _require_text(converted.description)

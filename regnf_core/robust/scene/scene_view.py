@@ -8,7 +8,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import CountingField, SdfField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
 from regnf_core.fields.observation import observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RobustOptions

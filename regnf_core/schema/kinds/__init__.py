@@ -5,9 +5,9 @@ docs/families.md tells how to add one.
 
 from __future__ import annotations
 
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription
 from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
-from regnf_core.schema.kinds.kind import FieldDescription
 from regnf_core.schema.kinds.mesh import MeshDescription
 from regnf_core.schema.kinds.mlp import MlpDescription
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription

@@ -4,18 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from regnf_core.schema.kinds.kind import FieldDescription
-from regnf_core.schema.kinds.mlp import check_plain_layers, count_layers
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.layers import check_layers, count_layers, layer_tensor_names
 from regnf_core.schema.tensor_check import TensorSpec, require, require_names, require_shape
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.box_extension import BoxExtension
-    from regnf_core.fields.feature_volumes import FeatureVolumesFunction
-    from regnf_core.fields.function_field import FunctionField
 
 _MOST_VOLUMES = 16
 
@@ -30,20 +23,14 @@ class FeatureVolumesDescription(FieldDescription):
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         volumes = count_volumes(tensors)
         require(1 <= volumes <= _MOST_VOLUMES, f"the field has {volumes} volumes, expected 1 to {_MOST_VOLUMES}")
-        names = {f"layers.{i}.{part}" for i in range(count_layers(tensors)) for part in ("weight", "bias")}
+        names = layer_tensor_names(count_layers(tensors))
         require_names(tensors, names | {f"volumes.{i}" for i in range(volumes)})
         features = tensors["volumes.0"].shape[-1] if tensors["volumes.0"].shape else 0
         for i in range(volumes):
             shape = tensors[f"volumes.{i}"].shape
             require(len(shape) == 4 and shape[0] >= 2, f"volumes.{i} has shape {shape}, expected a cube of features")
             require_shape(tensors, f"volumes.{i}", (shape[0], shape[0], shape[0], features))
-        check_plain_layers(tensors, 3 + features)
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[BoxExtension[FeatureVolumesFunction]]:
-        """The volumes and the network as a field."""
-        from regnf_core.fields.feature_volumes import build_feature_volumes
-
-        return build_feature_volumes(self, tensors)
+        check_layers(tensors, 3 + features)
 
 
 def count_volumes(names: Mapping[str, object]) -> int:

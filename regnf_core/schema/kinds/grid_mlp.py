@@ -4,21 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Gt, Le
 
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_core.schema.kinds.kind import FieldDescription
-from regnf_core.schema.kinds.mlp import check_plain_layers, count_layers
+from regnf_core.schema.layers import check_layers, count_layers, layer_tensor_names
 from regnf_core.schema.tensor_check import TensorSpec, require_names, require_shape
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.box_extension import BoxExtension
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.grid_mlp import GridMlpFunction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,13 +26,7 @@ class GridMlpDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
-        names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
+        names = layer_tensor_names(layers)
         require_names(tensors, names | {"hash_table"})
         require_shape(tensors, "hash_table", (self.hash.entries, self.hash.features_per_level))
-        check_plain_layers(tensors, self.hash.width)
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[BoxExtension[GridMlpFunction]]:
-        """The grid and the network as a field."""
-        from regnf_core.fields.grid_mlp import build_grid_mlp
-
-        return build_grid_mlp(self, tensors)
+        check_layers(tensors, self.hash.width)

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, MaxLen
 
-from regnf_core.schema.kinds.kind import FieldDescription
-from regnf_core.schema.kinds.neus_facto import MAX_LAYERS, PositionalEncodingDescription
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.layers import MAX_LAYERS, check_layers, count_layers, layer_tensor_names, require_layer_count
+from regnf_core.schema.positional_encoding import PositionalEncodingDescription
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.mlp import MlpFunction
 
 ActivationName = Literal["relu", "softplus", "sine"]
 LayerNumbers = Annotated[tuple[Annotated[int, Ge(0), Le(MAX_LAYERS)], ...], MaxLen(MAX_LAYERS)]
@@ -46,44 +41,13 @@ class MlpDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
-        require(1 <= layers <= MAX_LAYERS, f"the field has {layers} layers, expected 1 to {MAX_LAYERS}")
-        require(all(0 < i < layers for i in self.input_at), "input_at names a layer that is not there, or the first")
-        require(all(i < layers - 1 for i in self.normalized), "normalized names a layer that is not there, or the last")
-        names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
-        require_names(tensors, names | {f"norms.{i}.{part}" for i in self.normalized for part in ("weight", "bias")})
-        width = self.input_width
-        for layer in range(layers):
-            if layer in self.input_at:
-                width += self.input_width
-            rows = count_rows(tensors, f"layers.{layer}.weight")
-            require_shape(tensors, f"layers.{layer}.weight", (rows, width))
-            require_shape(tensors, f"layers.{layer}.bias", (rows,))
-            if layer in self.normalized:
-                require_shape(tensors, f"norms.{layer}.weight", (rows,))
-                require_shape(tensors, f"norms.{layer}.bias", (rows,))
-            width = rows
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[MlpFunction]:
-        """The network as a field."""
-        from regnf_core.fields.mlp import build_mlp
-
-        return build_mlp(self, tensors)
-
-
-def check_plain_layers(tensors: Mapping[str, TensorSpec], width: int) -> None:
-    """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the layers take ``width`` columns and follow one another.
-
-    The tensors' names must have been checked.
-    """
-    layers = count_layers(tensors)
-    require(1 <= layers <= MAX_LAYERS, f"the field has {layers} layers, expected 1 to {MAX_LAYERS}")
-    for layer in range(layers):
-        rows = count_rows(tensors, f"layers.{layer}.weight")
-        require_shape(tensors, f"layers.{layer}.weight", (rows, width))
-        require_shape(tensors, f"layers.{layer}.bias", (rows,))
-        width = rows
-
-
-def count_layers(names: Mapping[str, object]) -> int:
-    """How many layers' weights there are."""
-    return sum(name.startswith("layers.") and name.endswith(".weight") for name in names)
+        require_layer_count(layers)
+        require(all(0 < i < layers for i in self.input_at), "input_at names the first layer or a missing one")
+        require(all(i < layers - 1 for i in self.normalized), "normalized names the last layer or a missing one")
+        norms = {f"norms.{i}.{part}" for i in self.normalized for part in ("weight", "bias")}
+        require_names(tensors, layer_tensor_names(layers) | norms)
+        check_layers(tensors, self.input_width, dict.fromkeys(self.input_at, self.input_width))
+        for i in self.normalized:
+            rows = count_rows(tensors, f"layers.{i}.weight")
+            require_shape(tensors, f"norms.{i}.weight", (rows,))
+            require_shape(tensors, f"norms.{i}.bias", (rows,))

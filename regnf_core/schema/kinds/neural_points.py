@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
-from regnf_core.schema.kinds.kind import FieldDescription
-from regnf_core.schema.kinds.mlp import check_plain_layers, count_layers
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.voxel_grid import Length
+from regnf_core.schema.layers import check_layers, count_layers, layer_tensor_names
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.neural_points import NeuralPointsFunction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +37,7 @@ class NeuralPointsDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)
-        names = {f"layers.{i}.{part}" for i in range(layers) for part in ("weight", "bias")}
+        names = layer_tensor_names(layers)
         require_names(tensors, names | {"points", "features"} | ({"orientations"} if self.oriented else set()))
         points = count_rows(tensors, "points")
         require_shape(tensors, "points", (points, 3))
@@ -52,10 +46,4 @@ class NeuralPointsDescription(FieldDescription):
         require_shape(tensors, "features", (points, shape[1]))
         if self.oriented:
             require_shape(tensors, "orientations", (points, 4))
-        check_plain_layers(tensors, shape[1] + 3)
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[NeuralPointsFunction]:
-        """The points as a field."""
-        from regnf_core.fields.neural_points import build_neural_points
-
-        return build_neural_points(self, tensors)
+        check_layers(tensors, shape[1] + 3)

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le, Len, MaxLen
 
-from regnf_core.schema.kinds.kind import FORBID_UNKNOWN, FieldDescription
-from regnf_core.schema.kinds.onnx_operators import OPERATORS, SHAPE_ONLY
+from regnf_core.schema.description import FORBID_UNKNOWN, FieldDescription
+from regnf_core.schema.onnx_operators import OPERATORS, SHAPE_ONLY
 from regnf_core.schema.tensor_check import TensorSpec, require, require_names
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.onnx.graph import OnnxFunction
 
 MAX_NODES = 2_000
 MAX_NUMBERS = 20_000
@@ -92,9 +86,3 @@ class OnnxDescription(FieldDescription):
             require(settled, f"{where}: its shape would depend on the points")
             by_points |= dict.fromkeys(node.outputs, any(moving) and node.op not in SHAPE_ONLY)
         require(by_points.get(self.output, False), "the output does not depend on the points")
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[OnnxFunction]:
-        """The graph as a field. Raises FieldFormatError (ONNX_GRAPH_INVALID) when its parts do not fit one another."""
-        from regnf_core.fields.onnx.graph import build_onnx
-
-        return build_onnx(self, tensors)

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.voxel_grid import Length, Place
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.voxel_blocks import VoxelBlocksFunction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +29,3 @@ class VoxelBlocksDescription(FieldDescription):
         shape = tensors["values"].shape
         require(len(shape) == 4 and shape[1] >= 1, f"values has shape {shape}, expected blocks of voxels")
         require_shape(tensors, "values", (blocks, shape[1], shape[1], shape[1]))
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[VoxelBlocksFunction]:
-        """The blocks as a field."""
-        from regnf_core.fields.voxel_blocks import build_voxel_blocks
-
-        return build_voxel_blocks(self, tensors)

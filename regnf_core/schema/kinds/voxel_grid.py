@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
-from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.tensor_check import TensorSpec, require, require_names
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from regnf_core.fields.box_extension import BoxExtension
-    from regnf_core.fields.function_field import FunctionField
-    from regnf_core.fields.voxel_grid import VoxelGridFunction
 
 Coordinate = Annotated[float, Ge(-1e9), Le(1e9)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
@@ -38,9 +31,3 @@ class VoxelGridDescription(FieldDescription):
         require_names(tensors, {"values"})
         shape = tensors["values"].shape
         require(len(shape) == 3 and min(shape) >= 2, f"values has shape {shape}, expected two nodes an axis at least")
-
-    def build(self, tensors: Mapping[str, Tensor]) -> FunctionField[BoxExtension[VoxelGridFunction]]:
-        """The grid as a field."""
-        from regnf_core.fields.voxel_grid import build_voxel_grid
-
-        return build_voxel_grid(self, tensors)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 
 DATA = Path(__file__).resolve().parents[3] / "examples" / "data"
 

@@ -11,8 +11,9 @@ import torch
 import trimesh
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
+from regnf_core.schema.safe_format import read_description, write_safe_field
 
 DESCRIPTION = {"family": "mesh", "bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]}
 

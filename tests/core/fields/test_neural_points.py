@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.build import build_field
-from regnf_core.fields.safe_format import open_field, write_safe_field
-from regnf_core.schema.description import parse_description
+from regnf_core.fields.build import build_field, open_field
+from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import write_safe_field
 from tests.core.fields.grids import numeric_gradient
 
 Array = NDArray[Any]

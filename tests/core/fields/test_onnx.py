@@ -16,8 +16,8 @@ from regnf_core.fields.build import build_field
 from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.description import description_to_dict, parse_description
-from regnf_core.schema.kinds.onnx_operators import OPERATORS, SHAPE_ONLY
+from regnf_core.schema.onnx_operators import OPERATORS, SHAPE_ONLY
+from regnf_core.schema.parsing import description_to_dict, parse_description
 from tests.core.importing.onnx_models import Initializers, model, nodes, sphere
 
 RNG = np.random.default_rng(0)

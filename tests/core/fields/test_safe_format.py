@@ -15,9 +15,9 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import build_field
-from regnf_core.fields.safe_format import open_field, read_description, write_safe_field
-from regnf_core.schema.description import parse_description
+from regnf_core.fields.build import build_field, open_field
+from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import read_description, write_safe_field
 from tests.core.fields.small_field import GRID, description, tensors
 
 Tensors = dict[str, np.ndarray[Any, Any]]
@@ -73,7 +73,7 @@ def test_writing_and_describing_load_no_torch(tmp_path: Path) -> None:
     path = tmp_path / "field.safetensors"
     write_safe_field(path, description(), tensors())
     program = (
-        "import sys; from regnf_core.fields.safe_format import read_description\n"
+        "import sys; from regnf_core.schema.safe_format import read_description\n"
         f"read_description({str(path)!r}); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from regnf_core.fields.safe_format import open_field, read_description
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.schema.safe_format import read_description
 from tests.core.fields.reference import central_differences
 from tests.core.importing import small_families as small
 from tests.core.importing.archives import assert_refused

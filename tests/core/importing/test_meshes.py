@@ -10,8 +10,8 @@ import pytest
 import torch
 import trimesh
 
+from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.safe_format import open_field
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.gate.gate import import_field
 from tests.core.importing.archives import assert_refused, saved

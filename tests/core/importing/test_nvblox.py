@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.containers import sqlite_source
 from regnf_core.importing.containers.sqlite_source import TableSource
 from regnf_core.importing.families import nvblox

@@ -14,15 +14,15 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import build_field
-from regnf_core.fields.safe_format import open_field, write_safe_field
+from regnf_core.fields.build import build_field, open_field
 from regnf_core.importing.containers.sniff import sniff_format
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.onnx import model as reader
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.description import parse_description
+from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import write_safe_field
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.onnx_models import model, nodes, sphere
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.safe_format import open_field
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field

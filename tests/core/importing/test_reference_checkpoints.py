@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from regnf_core.fields.safe_format import read_description
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.schema.safe_format import read_description
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.checkpoints import write_small_checkpoint
 

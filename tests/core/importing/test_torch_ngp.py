@@ -13,10 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.safe_format import open_field, read_description
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description
 from tests.core.fields.grids import numeric_gradient
 from tests.core.fields.reference import encode_slowly
 from tests.core.importing.archives import assert_refused

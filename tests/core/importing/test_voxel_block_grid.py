@@ -10,7 +10,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.fields.grids import slow_trilinear

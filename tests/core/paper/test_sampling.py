@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError
-from regnf_core.fields.base import CountingField
+from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene, thin_out

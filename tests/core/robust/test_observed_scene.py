@@ -8,7 +8,7 @@ from regnf_core.fields.observation import Observation, ObservedField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.registration import register
-from regnf_core.schema.kinds.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, seen_from, union
 from tests.core.robust.shapes import ROBUST, detection, placement_error, random_pose
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidDetectionError, NoSurfaceError
-from regnf_core.fields.base import CountingField
+from regnf_core.fields.counting import CountingField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.robust.samples import sample_object_surface, sample_scene_surface

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
-from regnf_core.fields.safe_format import open_field
-from regnf_core.schema.kinds.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions

@@ -5,9 +5,10 @@ import pytest
 import torch
 
 from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
-from regnf_core.fields.safe_format import open_field, read_description
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.options import LossWeights, ReconstructionOptions

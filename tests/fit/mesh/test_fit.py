@@ -10,10 +10,11 @@ import torch
 
 from regnf_core.errors import CancelledError, InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import BoxField
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.safe_format import open_field, read_description
 from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.safe_format import read_description
 from regnf_fit.mesh.fit import fit_field
 from regnf_fit.mesh.network import TrainableField
 from regnf_fit.mesh.options import FitOptions

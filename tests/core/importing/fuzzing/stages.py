@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import write_safe_field
 from regnf_core.importing.containers.container import read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
@@ -17,6 +16,7 @@ from regnf_core.importing.gate import convert
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.pickle.tensors import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.safe_format import write_safe_field
 
 BUDGET = 1 << 24
 """Bytes of tensors that one case may have."""

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.safe_format import open_field
+from regnf_core.fields.build import open_field
 from regnf_core.importing.gate import gate
 from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 from regnf_core.importing.gate.report import MIB

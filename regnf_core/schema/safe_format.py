@@ -1,6 +1,6 @@
 """regnf's own field file: safetensors with a JSON description. Nothing in it can run, and every shape is checked first.
 
-Writing and reading the description need no torch; :func:`open_field` loads it. The format is in docs/safe-format.md.
+Torch-free: :func:`regnf_core.fields.build.open_field` makes a field of it. The format is in docs/safe-format.md.
 """
 
 from __future__ import annotations
@@ -15,15 +15,12 @@ from safetensors import SafetensorError, safe_open
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.files import atomic_path
-from regnf_core.schema.description import description_to_dict, parse_description
-from regnf_core.schema.kinds.kind import FieldDescription
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.parsing import description_to_dict, parse_description
 from regnf_core.schema.tensor_check import TensorSpec
 
 if TYPE_CHECKING:
-    import torch
     from numpy.typing import NDArray
-
-    from regnf_core.fields.base import SdfField
 
 FORMAT_VERSION = "1"
 _TYPE_NAMES = {"float32": "F32", "float16": "F16", "int32": "I32"}
@@ -62,23 +59,11 @@ def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
     """
-    return description_to_dict(_read_header(path)[0])
+    return description_to_dict(read_header(path)[0])
 
 
-def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:
-    """The field in ``path``, its parameters on ``device``. On a CPU float32 tensors are mapped, not read.
-
-    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
-    """
-    from regnf_core.fields.build import build_field
-
-    description, names = _read_header(path)
-    with safe_open(os.fspath(path), framework="pt", device=str(device)) as file:
-        return build_field(description, {name: file.get_tensor(name) for name in names})
-
-
-def _read_header(path: str | os.PathLike[str]) -> tuple[FieldDescription, list[str]]:
-    """The checked description, and the tensors' names."""
+def read_header(path: str | os.PathLike[str]) -> tuple[FieldDescription, list[str]]:
+    """The checked description, and the names of the tensors. Raises what :func:`read_description` raises."""
     try:
         with safe_open(os.fspath(path), framework="numpy") as file:
             metadata = file.metadata() or {}

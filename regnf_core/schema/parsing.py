@@ -1,0 +1,50 @@
+"""What a safe field file says about its tensors: which function they parametrize, and which shapes that asks for.
+
+Torch-free: the import gate writes descriptions and the worker's parent reads them without loading torch.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.kinds import KINDS
+
+
+def parse_description(values: Any) -> FieldDescription:
+    """The description from plain (JSON) values, of the kind that its ``family`` names.
+
+    Raises FieldFormatError: FIELD_FAMILY_UNKNOWN, or SAFE_FORMAT_INVALID naming the first faulty entry.
+    """
+    if not isinstance(values, dict):
+        raise FieldFormatError("the field's description is not a JSON object", reason="SAFE_FORMAT_INVALID")
+    family = values.get("family")
+    kind = KINDS.get(family) if isinstance(family, str) else None
+    if kind is None:
+        raise FieldFormatError(f"unknown field family {family!r}", reason="FIELD_FAMILY_UNKNOWN")
+    try:
+        description = _adapter(kind).validate_python(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise FieldFormatError(f"description.{where}: {first['msg']}", reason="SAFE_FORMAT_INVALID") from error
+    lower, upper = description.bounds
+    if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lower, upper, strict=True)):
+        raise FieldFormatError("description.bounds: not a finite, non-empty box", reason="SAFE_FORMAT_INVALID")
+    return description
+
+
+def description_to_dict(description: FieldDescription) -> dict[str, Any]:
+    """Plain (JSON) values of a description, defaults included, in a fixed order."""
+    values: dict[str, Any] = _adapter(type(description)).dump_python(description, mode="json")
+    return values
+
+
+@functools.cache
+def _adapter(kind: type[FieldDescription]) -> TypeAdapter[FieldDescription]:
+    return TypeAdapter(kind)
