@@ -20,6 +20,7 @@ from regnf_core.paper.sampling import MIN_POINTS, check_box_meets_scene
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.working_frame import WorkingField, WorkingFrame
 from regnf_core.surface.cells import Cells, surface_cells, tighten
+from regnf_core.surface.projection import project_to_surface
 
 REGION_GROWTH = 1.2
 """The scene is sampled in the box grown by this: boxes are often too small or off center."""
@@ -119,10 +120,7 @@ def _settle(field: WorkingField, cells: Cells, limit: int, generator: torch.Gene
     start = cells.centers[close].float()
     if start.shape[0] == 0:
         return Samples(start, start[:, 0], start)
-    value, gradient = field.value_and_gradient(start)
-    slope = gradient.square().sum(-1).clamp_min(_LEAST_SLOPE**2)
-    points = start - (value / slope).unsqueeze(-1) * gradient
-    value, gradient = field.value_and_gradient(points)
-    length = gradient.norm(dim=-1)
-    kept = (value.abs() <= _CLOSE * cells.edge) & (length >= _LEAST_SLOPE)
-    return Samples(points[kept], value[kept], gradient[kept] / length[kept, None])
+    found = project_to_surface(field.value_and_gradient, start, 1, _LEAST_SLOPE)
+    length = found.gradient.norm(dim=-1)
+    kept = (found.distance.abs() <= _CLOSE * cells.edge) & (length >= _LEAST_SLOPE)
+    return Samples(found.points[kept], found.distance[kept], found.gradient[kept] / length[kept, None])

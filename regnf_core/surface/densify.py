@@ -10,12 +10,12 @@ from torch import Tensor
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.nearest_neighbors import gaps
 from regnf_core.result import SurfaceSamples
+from regnf_core.surface.projection import project_to_surface
 
 _REACH = 1.5  # new points lie up to this many gaps from an old one
 _LARGEST_GAP = 4.0  # typical gaps; a lone stray point must not draw all new ones
 _NEWTON_STEPS = 1  # new points start within a gap of the surface
 _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
-_MIN_SLOPE = 0.25  # squared gradient below which a Newton step is not trusted to its full length
 
 
 def densify(
@@ -41,15 +41,10 @@ def densify(
     seeds, shake = seeds.to(samples.points.device), shake.to(samples.points)
     normals = samples.normals[seeds]
     points = samples.points[seeds] + shake - (shake * normals).sum(-1, keepdim=True) * normals
-    for _ in range(_NEWTON_STEPS):
-        distance, gradient = field.signed_distance_and_gradient(points)
-        gradient = gradient.to(points)
-        length = distance.to(points) / gradient.square().sum(-1).clamp_min(_MIN_SLOPE)
-        points = points - length.unsqueeze(-1) * gradient
-    distance, gradient = field.signed_distance_and_gradient(points)
-    kept = (distance.to(points).abs() <= _TOLERANCE_SHARE * gap) & inside(points)
-    unit = torch.nn.functional.normalize(gradient.to(points), dim=-1)
+    found = project_to_surface(field.signed_distance_and_gradient, points, _NEWTON_STEPS)
+    kept = (found.distance.abs() <= _TOLERANCE_SHARE * gap) & inside(found.points)
+    unit = torch.nn.functional.normalize(found.gradient, dim=-1)
     return SurfaceSamples(
-        torch.cat([samples.points, points[kept]]),
+        torch.cat([samples.points, found.points[kept]]),
         torch.cat([samples.normals, unit[kept]]),
     )

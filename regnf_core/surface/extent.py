@@ -7,6 +7,7 @@ import torch
 from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.surface.projection import newton_step
 from regnf_core.surface.sphere_tracing import finite_distance
 
 _GRID = 32  # cells along the longest edge; 32,768 evaluations at most
@@ -31,8 +32,7 @@ def surface_extent(field: SdfField) -> OrientedBox:
     if not near.any():
         raise NoSurfaceError("the object's field has no surface within its bounds", reason="NO_SURFACE_IN_OBJECT")
     distance, gradient = field.signed_distance_and_gradient(centers[near])
-    step = (distance / gradient.square().sum(-1).clamp_min(0.25)).unsqueeze(-1) * gradient
-    surface = (centers[near] - step.to(centers)).double().cpu()
+    surface = (centers[near] - newton_step(distance, gradient).to(centers)).double().cpu()
     lowest, highest = torch.maximum(surface.amin(0), low), torch.minimum(surface.amax(0), high)
     center, size = (lowest + highest) / 2, (highest - lowest).clamp_min(cell)
     return OrientedBox(center, size * (1.0 + _MARGIN), torch.eye(3, dtype=torch.float64))

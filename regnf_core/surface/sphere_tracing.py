@@ -13,6 +13,7 @@ from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.geometry.ray_box import ray_box_interval
 from regnf_core.surface.cameras import Rays
 
 _STEP_SHARE = 0.9  # of the distance to the surface: neural fields overstate it a little here and there
@@ -31,11 +32,7 @@ class Hits:
 
 def clip_to_region(rays: Rays, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """Entry (>= 0) and exit (N,) of every ray into the axis-aligned region low..high (3,); exit < entry: missed."""
-    low, high = low.to(rays.origins), high.to(rays.origins)
-    safe = torch.where(rays.directions.abs() < 1e-12, 1e-12, rays.directions)
-    first, second = (low - rays.origins) / safe, (high - rays.origins) / safe
-    entry = torch.minimum(first, second).amax(-1).clamp_min(0.0)
-    return entry, torch.maximum(first, second).amin(-1)
+    return ray_box_interval(rays.origins, rays.directions, low.to(rays.origins), high.to(rays.origins))
 
 
 def finite_distance(field: SdfField, points: Tensor) -> Tensor:

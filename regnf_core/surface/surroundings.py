@@ -9,10 +9,10 @@ from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.result import SurfaceSamples
 from regnf_core.surface.densify import densify
+from regnf_core.surface.projection import project_to_surface
 
 _SEED_SHARE = 0.2
 _NEWTON_STEPS = 3
-_MIN_SLOPE = 0.25  # squared gradient below which a Newton step is not trusted to its full length
 _TOLERANCE = 1e-3  # of the bounds' diagonal: largest |S| at a point that is kept
 
 
@@ -29,16 +29,8 @@ def surroundings(scene: SdfField, detection: OrientedBox, count: int, generator:
         return within & ~detection.contains(points)
 
     points = (low + (high - low) * torch.rand(int(_SEED_SHARE * count), 3, generator=generator)).to(scene.device)
-    for _ in range(_NEWTON_STEPS):
-        distance, gradient = scene.signed_distance_and_gradient(points)
-        points = points - _newton_step(distance, gradient.to(points))
-    distance, gradient = scene.signed_distance_and_gradient(points)
-    kept = (distance.to(points).abs() <= _TOLERANCE * float((high - low).norm())) & shown(points)
-    normals = torch.nn.functional.normalize(gradient.to(points)[kept], dim=-1)
-    seeds = SurfaceSamples(points[kept], normals)
+    found = project_to_surface(scene.signed_distance_and_gradient, points, _NEWTON_STEPS)
+    kept = (found.distance.abs() <= _TOLERANCE * float((high - low).norm())) & shown(found.points)
+    normals = torch.nn.functional.normalize(found.gradient[kept], dim=-1)
+    seeds = SurfaceSamples(found.points[kept], normals)
     return densify(scene, seeds, count, generator, shown) if len(seeds.points) else seeds
-
-
-def _newton_step(distance: Tensor, gradient: Tensor) -> Tensor:
-    length = distance.to(gradient) / gradient.square().sum(-1).clamp_min(_MIN_SLOPE)
-    return length.unsqueeze(-1) * gradient

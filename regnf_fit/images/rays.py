@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from regnf_core.geometry.ray_box import ray_box_interval
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.depth_normals import LocalPlanes
 
@@ -59,7 +60,8 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
     T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
     directions = np.einsum("rij,rj->ri", T_world_pixel[image], centers)
     origins = images.T_world_camera[image, :3, 3]
-    near, far = depths_in_box(origins, directions, images.bounds)
+    bounds = torch.from_numpy(images.bounds)
+    near, far = ray_box_interval(torch.from_numpy(origins), torch.from_numpy(directions), bounds[0], bounds[1])
 
     def picked(values: NDArray[np.generic] | None) -> Tensor:
         if values is None:
@@ -69,23 +71,11 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
     return PixelRays(
         origins=torch.from_numpy(origins).float(),
         directions=torch.from_numpy(directions).float(),
-        near=torch.from_numpy(near).float(),
-        far=torch.from_numpy(far).float(),
+        near=near.float(),
+        far=far.float(),
         colors=picked(images.colors) / 255.0 if len(pixels) else torch.zeros(0, 3),
         depths=picked(images.depths),
         background=picked(None if images.masks is None else ~images.masks) > 0.5,
         cosines=picked(None if planes is None else planes.cosines),
         deviations=picked(None if planes is None else planes.deviations),
     )
-
-
-def depths_in_box(
-    origins: NDArray[np.float64], directions: NDArray[np.float64], bounds: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depths (R,) at which rays enter and leave ``bounds`` (2, 3); where they miss it, far is not beyond near."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        crossings = (bounds[:, None] - origins) / directions  # (2, R, 3)
-    # 0 / 0: the ray lies in the face's plane, which does not cut it off
-    low = np.nan_to_num(crossings.min(axis=0), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
-    high = np.nan_to_num(crossings.max(axis=0), nan=np.inf, posinf=np.inf, neginf=-np.inf)
-    return np.maximum(low.max(axis=1), 0.0), high.min(axis=1)

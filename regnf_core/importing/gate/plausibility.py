@@ -7,6 +7,7 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
+from regnf_core.surface.projection import newton_step
 
 SAMPLES = 16_384
 _NEAREST_SHARE = 16
@@ -17,6 +18,7 @@ _SAME = 1e-3
 _SURFACE_SHARE = 1e-3
 """A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
 _GRADIENT_RANGE = (0.5, 2.0)
+_MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zero is left out; the steps are bounded
 
 
 def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
@@ -86,8 +88,7 @@ def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]
     for _ in range(_STEPS):
         distance, gradient = _evaluate(field, points)
         signs.append(distance.sign())
-        squared = gradient.square().sum(dim=-1).clamp_min(1e-12)
-        step = gradient * (distance / squared).unsqueeze(-1)
+        step = newton_step(distance, gradient, _MIN_SLOPE)
         too_long = (step.norm(dim=-1, keepdim=True) / (diagonal / 20)).clamp_min(1.0)
         points = torch.minimum(torch.maximum(points - step / too_long, box[0]), box[1])
     distance, gradient = _evaluate(field, points)

@@ -13,8 +13,10 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.residuals import DistanceModel, Samples
 from regnf_core.robust.verdict.evidence import REACH
+from regnf_core.surface.projection import newton_step
 
 _BEYOND = 2.0  # inlier distances: farther from the object's surface a sample is no part of it
+_MIN_SLOPE = 1e-3  # a gradient shorter than this has no direction
 _FACING = -0.25  # cosines of the normals beneath this: surface that faces the object's
 
 
@@ -34,9 +36,9 @@ def extra_share(
     if not bool(near.any()):
         return 0.0
     beyond = near & (height > _BEYOND * options.inlier_distance)
-    slope = gradient[beyond].square().sum(-1, keepdim=True).clamp_min(1e-6)
-    beneath = places[beyond] - value[beyond, None] * gradient[beyond] / slope
-    extra = ((A.normals[beyond] @ R.mT) * gradient[beyond]).sum(-1) >= _FACING * slope.squeeze(-1).sqrt()
+    beneath = places[beyond] - newton_step(value[beyond], gradient[beyond], _MIN_SLOPE)
+    slope = gradient[beyond].square().sum(-1).clamp_min(_MIN_SLOPE**2).sqrt()
+    extra = ((A.normals[beyond] @ R.mT) * gradient[beyond]).sum(-1) >= _FACING * slope
     extra |= _covered(scene, A, ((beneath - t) @ R) / s, options.inlier_distance / float(s))
     return float(extra.sum() / near.sum())
 
