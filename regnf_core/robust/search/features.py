@@ -6,17 +6,16 @@ square radius of one before they are described, and the scale is estimated with 
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
+from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.residuals import Samples
+from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 
 _VOXEL = 0.08  # root mean square radii
-_FEATURE_RADIUS, _NEIGHBORS = 4.0, 100  # voxels, points
-_INLIER = 1.5  # voxels
-_ITERATIONS, _CONFIDENCE = 20_000, 0.999
+_FEATURE_RADIUS = 4.0  # voxels
+_MATCHING = MatchingOptions(max_distance=1.5 * _VOXEL, with_scaling=True, edge_length_ratio=None, max_draws=20_000)
 _FEWEST = 30  # points a described cloud must have
 _SCALES = (0.2, 5.0)  # of the normalized clouds: what lies beyond is no match
 
@@ -26,30 +25,14 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
 
     Deterministic for a seed, whatever the number of threads. Loads open3d.
     """
-    import open3d
-    from open3d.pipelines import registration
-
     found: list[Sim3] = []
     to_scene, to_object = _normalizing(scene), _normalizing(obj)
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
+    with without_warnings():
         source, target = _described(scene, to_scene), _described(obj, to_object)
+        if min(len(source), len(target)) < _FEWEST:
+            return Sim3.cat([])
         for draw in range(count):
-            if source is None or target is None:
-                break
-            open3d.utility.random.seed((seed * 1009 + draw) % 2**31)
-            matched = registration.registration_ransac_based_on_feature_matching(
-                source[0],
-                target[0],
-                source[1],
-                target[1],
-                mutual_filter=True,
-                max_correspondence_distance=_INLIER * _VOXEL,
-                estimation_method=registration.TransformationEstimationPointToPoint(with_scaling=True),
-                ransac_n=4,
-                checkers=[registration.CorrespondenceCheckerBasedOnDistance(_INLIER * _VOXEL)],
-                criteria=registration.RANSACConvergenceCriteria(_ITERATIONS, _CONFIDENCE),
-            )
-            T = _similarity(matched)
+            T = _similarity(match(source, target, _MATCHING, seed * 1009 + draw))
             if T is not None:
                 found.append(to_object.inverse() @ T @ to_scene)
     return Sim3.cat(found)
@@ -63,25 +46,14 @@ def _normalizing(samples: Samples) -> Sim3:
     return Sim3(scale, torch.eye(3, dtype=torch.float64), -scale * center)
 
 
-def _described(samples: Samples, normalize: Sim3) -> tuple[Any, Any] | None:
-    """The normalized cloud, one point a voxel, and its descriptors; None when it is too small to be described."""
-    import open3d
-    from open3d.pipelines import registration
-
-    points = normalize.apply(samples.on_surface().double())
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.numpy()))
-    cloud.normals = open3d.utility.Vector3dVector(samples.normals.double().numpy())
-    cloud = cloud.voxel_down_sample(_VOXEL)
-    if len(cloud.points) < _FEWEST:
-        return None
-    reach = open3d.geometry.KDTreeSearchParamHybrid(_FEATURE_RADIUS * _VOXEL, _NEIGHBORS)
-    return cloud, registration.compute_fpfh_feature(cloud, reach)
+def _described(samples: Samples, normalize: Sim3) -> DescribedCloud:
+    """The normalized cloud with its descriptors."""
+    return describe(normalize.apply(samples.on_surface().double()), samples.normals, _VOXEL, _FEATURE_RADIUS)
 
 
-def _similarity(matched: Any) -> Sim3 | None:
+def _similarity(matrix: Tensor | None) -> Sim3 | None:
     """The match as a similarity, if it is one: no reflection, no collapse."""
-    matrix = torch.tensor(matched.transformation.tolist(), dtype=torch.float64)
-    if len(matched.correspondence_set) == 0 or not torch.isfinite(matrix).all():
+    if matrix is None or not torch.isfinite(matrix).all():
         return None
     scale = torch.linalg.det(matrix[:3, :3]).clamp_min(0.0) ** (1.0 / 3.0)
     if not _SCALES[0] < float(scale) < _SCALES[1]:
