@@ -229,6 +229,10 @@ class RecordStore(Protocol):
 
     def get_field(self, sha256: str) -> FieldRecord | None: ...
 
+    def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        """Several fields in one round trip, in the order asked for."""
+        ...
+
     def list_fields(
         self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
     ) -> list[FieldRecord]:

@@ -125,6 +125,15 @@ class JournaledRecordStore(RedisRecordStore):
             found = super().get_field(sha256)
         return found
 
+    def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        found = super().get_fields(references)
+        missing = [name for name, field in zip(references, found, strict=True) if field is None]
+        if not missing or self.epoch.stands():
+            return found
+        for name in missing:
+            self.recall_field(name)
+        return super().get_fields(references)
+
     def recall_field(self, sha256: str) -> FieldRecord | None:
         """Make a lost record anew. The field as it is to go on, None when nothing was to be made."""
         field = self.journal.recall_field(sha256)

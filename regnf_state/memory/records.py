@@ -213,6 +213,10 @@ class InMemoryRecordStore:
         with self._changed:
             return self._fields.get(sha256)
 
+    def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        with self._changed:
+            return [self._fields.get(name) for name in references]
+
     def list_fields(
         self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
     ) -> list[FieldRecord]:

@@ -58,12 +58,16 @@ class RedisDocuments:
             document, (seconds, microseconds) = pipeline.execute()
         return json.loads(document) if document is not None else None, seconds + microseconds / 1e6
 
-    def _read_many(self, keys: Iterable[str]) -> list[dict[str, Any]]:
-        """The documents that exist, in the order of their keys."""
+    def _read_each(self, keys: Iterable[str]) -> list[dict[str, Any] | None]:
+        """The document of each key, or None. One round trip."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for key in keys:
                 pipeline.hget(key, "document")
-            return [json.loads(document) for document in pipeline.execute() if document is not None]
+            return [None if document is None else json.loads(document) for document in pipeline.execute()]
+
+    def _read_many(self, keys: Iterable[str]) -> list[dict[str, Any]]:
+        """The documents that exist, in the order of their keys."""
+        return [document for document in self._read_each(keys) if document is not None]
 
     def _newest_first(
         self, index: str, key_of: Callable[[str], str], before: tuple[float, str] | None

@@ -104,6 +104,10 @@ class RedisFieldRecords(RedisDocuments):
         document, _ = self._read(_key(sha256))
         return FieldRecord(**document) if document is not None else None
 
+    def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        documents = self._read_each(map(_key, references))
+        return [None if document is None else FieldRecord(**document) for document in documents]
+
     def list_fields(
         self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
     ) -> list[FieldRecord]:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from redis import Redis
-from redis.client import Pipeline
 from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_service.http.dependencies import Services
@@ -19,36 +18,18 @@ from regnf_state.records import JobNews
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
+from tests.round_trips import counted_round_trips
 from tests.state.record_makers import finished, started
-
-
-@pytest.fixture
-def round_trips(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is sent to Redis from now on, an entry a round trip."""
-    sent: list[str] = []
-    command, pipeline = Redis.execute_command, Pipeline.execute
-
-    def counted_command(self: Redis, *arguments: object, **options: object) -> object:
-        sent.append(str(arguments[0]))
-        return command(self, *arguments, **options)
-
-    def counted_pipeline(self: Pipeline, raise_on_error: bool = True) -> object:
-        sent.append("pipeline")
-        return pipeline(self, raise_on_error)  # type: ignore[no-untyped-call]
-
-    monkeypatch.setattr(Redis, "execute_command", counted_command)
-    monkeypatch.setattr(Pipeline, "execute", counted_pipeline)
-    return sent
 
 
 @pytest.mark.parametrize("streams", [1, 40])
 def test_any_number_of_streams_is_one_round_trip_a_round(
-    redis: Redis, tmp_path: Path, streams: int, round_trips: list[str]
+    redis: Redis, tmp_path: Path, streams: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = RedisRecordStore(redis)
     jobs = [finished(store, "failed", f"j{number}").id for number in range(4)]
     services = Services(Settings(state_dir=tmp_path), store, LocalBlobStore(tmp_path / "blobs"), RqJobQueue(redis))
-    round_trips.clear()
+    round_trips = counted_round_trips(monkeypatch)
 
     async def read(job_id: str) -> str:
         return "".join([text async for text in event_stream(services, job_id, None)])

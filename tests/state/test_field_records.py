@@ -181,3 +181,10 @@ def test_an_owner_has_no_more_than_its_quota(store: RecordStore) -> None:
     store.delete_field(mine[1])
     assert store.stored("alice") == (1, 10)
     assert store.stored("anonymous") == (0, 0)
+
+
+def test_several_fields_come_in_the_order_asked_for(store: RecordStore) -> None:
+    store.create_field(field(store, SCENE))
+    store.create_field(field(store, OBJECT))
+    found = store.get_fields([OBJECT, "c" * 64, SCENE])
+    assert found == [store.get_field(OBJECT), None, store.get_field(SCENE)]

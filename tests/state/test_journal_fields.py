@@ -54,3 +54,12 @@ def test_a_deleted_field_stays_deleted(world: World) -> None:
     world.field()
     world.records.delete_field(SCENE)
     assert world.lose_redis() == Rebuilt()
+
+
+def test_a_batched_read_recalls_what_redis_lost(world: World) -> None:
+    ready = world.field()
+    world.redis.flushall()
+    found, nobody = world.records.get_fields([SCENE, "d" * 64])
+    assert found is not None
+    assert replace(found, version=ready.version) == ready
+    assert nobody is None

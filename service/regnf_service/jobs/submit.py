@@ -28,14 +28,11 @@ def check_fields(services: Services, caller: str, request: dict[str, Any], named
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
     Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
     """
-
     services.webhooks.check(caller, request)
-
-    def field(sha256: str) -> FieldRecord | None:
-        return services.records.get_field(reference_of(caller, sha256))
-
-    _require_usable({pointer: field(sha256) for pointer, sha256 in named.items()})
-    bounds = _bounds(field(request["scene"]))
+    asked = [request["scene"], *named.values()]
+    scene, *found = services.records.get_fields([reference_of(caller, sha256) for sha256 in asked])
+    _require_usable(dict(zip(named, found, strict=True)))
+    bounds = _bounds(scene)
     box = request["detection"]
     if bounds is None or boxes_overlap(box["center"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
         return
