@@ -42,7 +42,7 @@ def write_missing(name: str, mesh: MeshField, path: Path) -> None:
         return
     low, high = mesh.bounds
     target = mesh.transformed(demo.object_from_mesh(mesh, _LARGEST / float((high - low).max())))
-    description = {"family": "mesh", "bounds": target.bounds.tolist(), "label": name}
+    description = {"kind": "mesh", "bounds": target.bounds.tolist(), "label": name}
     tensors = {"vertices": target.vertices.astype(np.float32), "faces": target.faces.astype(np.int32)}
     write_safe_field(path, description, tensors)
 

@@ -37,7 +37,7 @@ from regnf_core.schema.safe_format import read_header
 def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu") -> SdfField:
     """Open the field file ``path``, with its parameters on ``device``. On a CPU, float32 tensors are memory-mapped.
 
-    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH, and
+    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_KIND_UNKNOWN, FIELD_SHAPES_MISMATCH, and
     what :func:`build_field` raises.
     """
     description, names = read_header(path)

@@ -26,7 +26,8 @@ class FieldDescription(ABC):
 
     __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
 
-    family: str
+    kind: str
+    """One of the names in ``regnf_core.schema.kinds.KINDS``."""
     bounds: tuple[Corner, Corner]
     """Lowest and highest corner of the region where the field has meaning, the field's own frame and unit."""
     world_scale: Annotated[float, Ge(1e-6), Le(1e6)] = 1.0

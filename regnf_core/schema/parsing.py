@@ -17,18 +17,19 @@ from regnf_core.schema.kinds import KINDS
 
 
 def parse_description(values: Any) -> FieldDescription:
-    """The description from plain (JSON) values, of the kind that its ``family`` names.
+    """The description from plain (JSON) values, of the kind that its ``kind`` names.
 
-    Raises FieldFormatError: FIELD_FAMILY_UNKNOWN, or SAFE_FORMAT_INVALID naming the first faulty entry.
+    Raises FieldFormatError: FIELD_KIND_UNKNOWN, or SAFE_FORMAT_INVALID naming the first faulty entry.
     """
     if not isinstance(values, dict):
         raise FieldFormatError("the field's description is not a JSON object", reason="SAFE_FORMAT_INVALID")
-    family = values.get("family")
-    kind = KINDS.get(family) if isinstance(family, str) else None
-    if kind is None:
-        raise FieldFormatError(f"unknown field family {family!r}", reason="FIELD_FAMILY_UNKNOWN")
+    name = values.get("kind")
+    described = KINDS.get(name) if isinstance(name, str) else None
+    if described is None:
+        hint = " (did you mean `kind` where it says `family`?)" if name is None and "family" in values else ""
+        raise FieldFormatError(f"unknown kind of field {name!r}{hint}", reason="FIELD_KIND_UNKNOWN")
     try:
-        description = _adapter(kind).validate_python(values)
+        description = _adapter(described).validate_python(values)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -46,5 +47,5 @@ def description_to_dict(description: FieldDescription) -> dict[str, Any]:
 
 
 @functools.cache
-def _adapter(kind: type[FieldDescription]) -> TypeAdapter[FieldDescription]:
-    return TypeAdapter(kind)
+def _adapter(described: type[FieldDescription]) -> TypeAdapter[FieldDescription]:
+    return TypeAdapter(described)

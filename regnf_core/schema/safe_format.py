@@ -22,7 +22,9 @@ from regnf_core.schema.tensor_check import TensorSpec
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-FORMAT_VERSION = "1"
+FORMAT_VERSION = "2"
+_VERSION_WITH_FAMILY = "1"
+"""The version before: the same but for the entry ``kind``, which was called ``family``."""
 _TYPE_NAMES = {"float32": "F32", "float16": "F16", "int32": "I32"}
 _ALIGNMENT = 64
 _MAX_DESCRIPTION = 1 << 20
@@ -34,7 +36,7 @@ def write_safe_field(
     """Write a field file, whole or not at all: a temporary file beside ``path`` is renamed once it is on the disk.
 
     The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32,
-    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_FAMILY_UNKNOWN,
+    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_KIND_UNKNOWN,
     FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
     """
     parsed = parse_description(description)
@@ -57,7 +59,7 @@ def write_safe_field(
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
     """The description of the field in ``path``, from the file's header alone, checked against the tensors' shapes.
 
-    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_FAMILY_UNKNOWN or FIELD_SHAPES_MISMATCH.
+    Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_KIND_UNKNOWN or FIELD_SHAPES_MISMATCH.
     """
     return description_to_dict(read_header(path)[0])
 
@@ -80,7 +82,7 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
     version, text = metadata.get("regnf"), metadata.get("field")
     if version is None or text is None:
         raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")
-    if version != FORMAT_VERSION:
+    if version not in (FORMAT_VERSION, _VERSION_WITH_FAMILY):
         raise FieldFormatError(f"field format version {version[:20]!r} is not known", reason="SAFE_FORMAT_VERSION")
     if len(text) > _MAX_DESCRIPTION:
         raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
@@ -88,6 +90,8 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FieldFormatError("the field's description is not JSON", reason="SAFE_FORMAT_INVALID") from error
+    if version == _VERSION_WITH_FAMILY and isinstance(values, dict) and "family" in values:
+        values = {"kind": values.pop("family"), **values}
     return parse_description(values)
 
 

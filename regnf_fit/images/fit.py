@@ -156,7 +156,7 @@ class _Writer:
 
     def __call__(self, field: RadianceField, path: Path) -> None:
         description: dict[str, Any] = {
-            "family": "neus_facto",
+            "kind": "neus_facto",
             "hash": asdict(self.options.grid),
             "positional_encoding": {"degree": DEGREE, "two_pi": False},
             "use_grid": True,

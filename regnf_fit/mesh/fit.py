@@ -140,7 +140,7 @@ def _draw(samples: ExactSamples, count: int, generator: torch.Generator) -> Exac
 
 def _description(options: FitOptions, bounds: Tensor, label: str | None, source: dict[str, Any]) -> dict[str, Any]:
     return {
-        "family": "neus_facto",
+        "kind": "neus_facto",
         "hash": asdict(options.grid),
         "positional_encoding": {"degree": DEGREE, "two_pi": False},
         "use_grid": True,

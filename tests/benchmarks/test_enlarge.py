@@ -26,7 +26,7 @@ def test_values_and_gradients_are_the_same(tmp_path: Path) -> None:
     }  # fmt: skip
     tensors = {name: random.normal(scale=0.3, size=shape).astype(np.float32) for name, shape in shapes.items()}
     description = {
-        "family": "neus_facto",
+        "kind": "neus_facto",
         "bounds": [[-1.0] * 3, [1.0] * 3],
         "hash": asdict(small),
         "positional_encoding": {"degree": 6},

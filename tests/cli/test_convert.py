@@ -31,7 +31,7 @@ def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> Non
     outcome = run("convert", tmp_path / "ball.glb", safe, "--description", tmp_path / "said.json")
     assert outcome.code == 0, outcome.stderr
     assert outcome.stdout.startswith(f"{safe}: mesh, ")
-    assert (read_description(safe)["family"], read_description(safe)["label"]) == ("mesh", "ball")
+    assert (read_description(safe)["kind"], read_description(safe)["label"]) == ("mesh", "ball")
     assert open_field(safe).signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.5, abs=0.01)
     assert run("convert", tmp_path / "ball.glb", grid, "--resolution", 8).code == 0
     assert np.load(grid)["sdf"].shape == (9, 9, 9)

@@ -51,7 +51,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
     norms = _norms(state, layers, source)
     description = {
-        "family": "mlp",
+        "kind": "mlp",
         **shared_entries(wanted, UNIT_CUBE),
         "activation": "relu",
         "input_at": seeing,

@@ -39,7 +39,7 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     origin, spacing, told = _placement(arrays, np.array(values.shape))
     far = origin + spacing * (np.array(values.shape) - 1)
     description = {
-        "family": "voxel_grid",
+        "kind": "voxel_grid",
         **shared_entries(wanted, [origin.tolist(), far.tolist()]),
         "origin": origin.tolist(),
         "spacing": spacing.tolist(),

@@ -19,7 +19,7 @@ def grid_readings(
     return tuple(
         Reading(
             grid_name(grid),
-            {"family": "neus_facto", **entries, "hash": asdict(grid), "use_grid": True},
+            {"kind": "neus_facto", **entries, "hash": asdict(grid), "use_grid": True},
             {**layers, "hash_table": table.reshape(-1, grid.features_per_level)},
         )
         for grid in grids

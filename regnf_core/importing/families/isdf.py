@@ -49,7 +49,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         raise tensor_error(message, "TENSOR_SHAPE")
     scale = wanted.input_scale or _INPUT_SCALE
     description = {
-        "family": "mlp",
+        "kind": "mlp",
         **shared_entries(wanted, [[-_REACH] * 3, [_REACH] * 3]),
         "activation": "softplus",
         "positional_encoding": {"degree": degree, "base_frequency": scale, "off_axis": True},

@@ -39,7 +39,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     skips = [i for i, extra in enumerate(layers.extra_columns) if extra]
     require_extra_columns(layers, names, dict.fromkeys(skips, layers.input_width))
     description = {
-        "family": "mlp",
+        "kind": "mlp",
         **shared_entries(wanted, UNIT_CUBE),
         "activation": "softplus",
         "positional_encoding": {"degree": degree},

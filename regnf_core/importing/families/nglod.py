@@ -36,7 +36,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     tensors = {f"volumes.{i}": _volume(state, i, layers.input_width - 3, source) for i in range(used)}
-    description = {"family": "feature_volumes", **shared_entries(wanted, UNIT_CUBE), "source": {"family": FAMILY}}
+    description = {"kind": "feature_volumes", **shared_entries(wanted, UNIT_CUBE), "source": {"family": FAMILY}}
     why = (
         f"keys features.*.fm and louts.*: {used} of {levels} levels of detail, decoded by {names[0][:-2]}",
         "bounds [-1, 1]: the cube of the volumes",

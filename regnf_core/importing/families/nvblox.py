@@ -39,7 +39,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, wanted: UploadDescr
     low, high = seen_extent(blocks, seen)
     middle = voxel_size / 2.0
     description = {
-        "family": "voxel_blocks",
+        "kind": "voxel_blocks",
         **shared_entries(wanted, [(middle + voxel_size * corner).tolist() for corner in (low, high)]),
         "origin": [middle] * 3,
         "voxel_size": voxel_size,

@@ -37,7 +37,7 @@ def convert_onnx(data: memoryview, tensor_bytes: int, wanted: UploadDescription)
     parts = _Parts(model, tensor_bytes)
     batch, told = _batch(model.input, model.output)
     description = {
-        "family": "onnx",
+        "kind": "onnx",
         "source": {"family": "onnx"},
         **shared_entries(wanted, UNIT_CUBE),
         "nodes": parts.nodes,

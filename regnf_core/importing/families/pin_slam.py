@@ -55,7 +55,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     if layers.input_width != width:
         raise tensor_error(f"sdf.layers.0 has {layers.input_width} columns, expected {width}", "TENSOR_SHAPE")
     description = {
-        "family": "neural_points",
+        "kind": "neural_points",
         **shared_entries(wanted, [(low - settings.cell_size).tolist(), (high + settings.cell_size).tolist()]),
         "cell_size": settings.cell_size,
         "buffer_size": settings.buffer_size,

@@ -15,6 +15,7 @@ from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import read_description
 
+FAMILY = "regnf"
 _OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
 
@@ -23,7 +24,7 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: 
     """The field in ``data``, the mapped bytes of ``path``, with what ``wanted`` overrides.
 
     Raises FieldFormatError: the SAFETENSORS_* reasons, SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, TENSOR_*,
-    FIELD_FAMILY_UNKNOWN, FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
+    FIELD_KIND_UNKNOWN, FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
     """
     header = read_header(data)
     if sum(tensor.size for tensor in header.values()) > tensor_bytes:
@@ -31,15 +32,17 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: 
     description = _overruled(read_description(path), wanted)
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
     why = ("a regnf field file",)
-    return ConvertedField(str(description["family"]), why, description, tensors)
+    return ConvertedField(FAMILY, why, description, tensors)
 
 
 def _overruled(description: dict[str, Any], wanted: UploadDescription) -> dict[str, Any]:
     """``description`` with what was said instead; a new scale takes the bounds along, unless they were said too."""
-    family = str(description["family"])
-    require_family(wanted, family)
-    refuse_other_entries(wanted, f"a field file of the kind {family}", sorted(_OVERRULED & description.keys()))
+    require_family(wanted, FAMILY)
+    refuse_other_entries(
+        wanted, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
+    )
     changed = description | wanted.said()
+    changed.pop("family", None)
     if wanted.bounds is None:
         ratio = changed["world_scale"] / description["world_scale"]
         changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]

@@ -117,7 +117,7 @@ def _assemble(
         readings = grid_readings(table, grids, layers.tensors(), entries)
     else:
         unused = asdict(_unused_grid(table.size, width, variant, wanted))
-        description = {"family": "neus_facto", **entries, "hash": unused, "use_grid": False}
+        description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}
         readings = (Reading("no grid", description, layers.tensors()),)
     return converted_of(variant.name, why, readings, tuple(warnings))
 

@@ -33,7 +33,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         raise tensor_error(f"{_PREFIX}{names[0]} has {layers.input_width} columns, expected 3", "TENSOR_SHAPE")
     require_extra_columns(layers, names)
     description = {
-        "family": "mlp",
+        "kind": "mlp",
         **shared_entries(wanted, UNIT_CUBE),
         "activation": "sine",
         "source": {"family": FAMILY},

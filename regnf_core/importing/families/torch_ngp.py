@@ -51,7 +51,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     readings = tuple(
         Reading(
             f"{grid_name(grid)}, growing by {grid.per_level_scale:.6g}",
-            {"family": "grid_mlp", **entries, "hash": asdict(grid)},
+            {"kind": "grid_mlp", **entries, "hash": asdict(grid)},
             {**layers.tensors(), "hash_table": table.reshape(-1, grid.features_per_level)},
         )
         for grid in grids

@@ -42,7 +42,7 @@ def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, famil
     return ConvertedField(
         family,
         why,
-        {"family": "mesh", "source": {"family": family}, **shared_entries(wanted, bounds)},
+        {"kind": "mesh", "source": {"family": family}, **shared_entries(wanted, bounds)},
         {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
         _warnings(inside_out, max(np.abs(low).max(), np.abs(high).max()) / diagonal),
     )

@@ -59,7 +59,7 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     fill_unseen(values, blocks.seen, blocks.voxel_size, wanted.sign or 1)
     low, high = seen_extent(blocks.keys, blocks.seen)
     description = {
-        "family": "voxel_blocks",
+        "kind": "voxel_blocks",
         **shared_entries(wanted, [(blocks.voxel_size * corner).tolist() for corner in (low, high)]),
         "voxel_size": blocks.voxel_size,
         "source": {"family": FAMILY},

@@ -56,6 +56,7 @@ def convert_file(
     write_safe_field(target, converted.description, converted.tensors)
     parameters = sum(array.size for name, array in converted.tensors.items() if name != OBSERVATION)
     family, why, warnings = converted.family, converted.why, converted.warnings
+    kind = str(converted.description["kind"])
     bounds, label = converted.description["bounds"], converted.description["label"]
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
@@ -71,6 +72,7 @@ def convert_file(
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
         "family": family,
+        "kind": kind,
         "why": why,
         "bounds": bounds,
         "parameters": parameters,

@@ -139,6 +139,7 @@ def _report(
         lower, upper = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["bounds"])
         return ImportReport(
             family=str(values["family"]),
+            kind=str(values["kind"]),
             why=tuple(map(str, values["why"])),
             bounds=(lower, upper),
             parameters=int(values["parameters"]),

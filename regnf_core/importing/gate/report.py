@@ -31,6 +31,9 @@ class ImportReport:
     """An import that succeeded. Lengths are in the field's own units, its own frame."""
 
     family: str
+    """The format of the file: which trainer or program wrote it."""
+    kind: str
+    """The kind of the stored field: which function it is; see docs/safe-format.md."""
     why: tuple[str, ...]
     """The evidence for the family, one short sentence each."""
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]

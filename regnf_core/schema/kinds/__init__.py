@@ -27,4 +27,4 @@ KINDS: dict[str, type[FieldDescription]] = {
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,
 }
-"""By the description's ``family``."""
+"""By the description's ``kind``."""

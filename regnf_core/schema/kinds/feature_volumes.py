@@ -17,7 +17,7 @@ _MOST_VOLUMES = 16
 class FeatureVolumesDescription(FieldDescription):
     """A field of the feature_volumes kind; see :class:`regnf_core.fields.feature_volumes.FeatureVolumesFunction`."""
 
-    family: Literal["feature_volumes"]
+    kind: Literal["feature_volumes"]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""

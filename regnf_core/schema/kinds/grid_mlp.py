@@ -18,7 +18,7 @@ from regnf_core.schema.tensor_check import TensorSpec, require_names, require_sh
 class GridMlpDescription(FieldDescription):
     """A field of the grid_mlp kind; see :class:`regnf_core.fields.grid_mlp.GridMlpFunction`."""
 
-    family: Literal["grid_mlp"]
+    kind: Literal["grid_mlp"]
     hash: HashGridConfig
     grid_radius: Annotated[float, Gt(0), Le(1e6)] = 1.0
     """The grid covers [-grid_radius, grid_radius]^3."""

@@ -14,7 +14,7 @@ from regnf_core.schema.tensor_check import TensorSpec, count_rows, require_names
 class MeshDescription(FieldDescription):
     """A triangle mesh; see :class:`regnf_core.fields.mesh.MeshField`. No entries of its own."""
 
-    family: Literal["mesh"]
+    kind: Literal["mesh"]
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""

@@ -21,7 +21,7 @@ LayerNumbers = Annotated[tuple[Annotated[int, Ge(0), Le(MAX_LAYERS)], ...], MaxL
 class MlpDescription(FieldDescription):
     """A field of the mlp kind; see :class:`regnf_core.fields.mlp.MlpFunction`."""
 
-    family: Literal["mlp"]
+    kind: Literal["mlp"]
     activation: ActivationName
     """Between layers; softplus is log(1 + exp(100 a)) / 100."""
     positional_encoding: PositionalEncodingDescription | None = None

@@ -18,7 +18,7 @@ from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, requ
 class NeuralPointsDescription(FieldDescription):
     """A field of the neural_points kind; see :class:`regnf_core.fields.neural_points.NeuralPointsFunction`."""
 
-    family: Literal["neural_points"]
+    kind: Literal["neural_points"]
     cell_size: Length
     """Edge of the cells that hold one point each."""
     buffer_size: Annotated[int, Ge(1), Le(1 << 40)]

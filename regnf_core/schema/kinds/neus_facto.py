@@ -24,7 +24,7 @@ SKIP_LAYER = 4
 class NeusFactoDescription(FieldDescription):
     """A field of the neus-facto kind; see :class:`regnf_core.fields.neus_facto.NeusFactoFunction`."""
 
-    family: Literal["neus_facto"]
+    kind: Literal["neus_facto"]
     hash: HashGridConfig | None = None
     """None: the network has no columns for a grid."""
     positional_encoding: PositionalEncodingDescription | None = None

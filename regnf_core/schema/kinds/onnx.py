@@ -50,7 +50,7 @@ class ConstantDescription:
 class OnnxDescription(FieldDescription):
     """A field of the onnx kind; see :class:`regnf_core.fields.onnx.graph.OnnxFunction`."""
 
-    family: Literal["onnx"]
+    kind: Literal["onnx"]
     nodes: Annotated[tuple[NodeDescription, ...], Len(1, MAX_NODES)]
     """In the order of evaluation."""
     constants: Annotated[dict[_Name, ConstantDescription], MaxLen(MAX_NODES)]

@@ -15,7 +15,7 @@ from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, requ
 class VoxelBlocksDescription(FieldDescription):
     """A field of the voxel_blocks kind; see :class:`regnf_core.fields.voxel_blocks.VoxelBlocksFunction`."""
 
-    family: Literal["voxel_blocks"]
+    kind: Literal["voxel_blocks"]
     origin: Place = (0.0, 0.0, 0.0)
     """Where the first node of block (0, 0, 0) is, in the function's coordinates."""
     voxel_size: Length

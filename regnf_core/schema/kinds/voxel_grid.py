@@ -20,7 +20,7 @@ Length = Annotated[float, Ge(1e-9), Le(1e9)]
 class VoxelGridDescription(FieldDescription):
     """A field of the voxel_grid kind; see :class:`regnf_core.fields.voxel_grid.VoxelGridFunction`."""
 
-    family: Literal["voxel_grid"]
+    kind: Literal["voxel_grid"]
     origin: Place
     """Where node (0, 0, 0) is, in the function's coordinates."""
     spacing: tuple[Length, Length, Length]

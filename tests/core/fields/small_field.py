@@ -16,7 +16,7 @@ GRID = HashGridConfig.from_top_resolution(64, levels=4, log2_table_size=10, base
 def description(**changes: Any) -> dict[str, Any]:
     """A whole description, with some entries changed."""
     values: dict[str, Any] = {
-        "family": "neus_facto",
+        "kind": "neus_facto",
         "hash": asdict(GRID),
         "positional_encoding": {"degree": 6, "two_pi": False},
         "use_grid": True,

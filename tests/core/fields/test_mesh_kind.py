@@ -15,7 +15,7 @@ from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.schema.safe_format import read_description, write_safe_field
 
-DESCRIPTION = {"family": "mesh", "bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]}
+DESCRIPTION = {"kind": "mesh", "bounds": [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]}
 
 
 def sphere() -> dict[str, np.ndarray[Any, Any]]:
@@ -37,9 +37,7 @@ def test_a_sphere_is_read_back(tmp_path: Path) -> None:
 
 
 def test_unit_and_sign_go_round_it(tmp_path: Path) -> None:
-    write_safe_field(
-        tmp_path / "f", {"family": "mesh", "bounds": [[-3.0] * 3, [3.0] * 3], "world_scale": 2.0}, sphere()
-    )
+    write_safe_field(tmp_path / "f", {"kind": "mesh", "bounds": [[-3.0] * 3, [3.0] * 3], "world_scale": 2.0}, sphere())
     assert open_field(tmp_path / "f").signed_distance(torch.tensor([[2.0, 0.0, 0.0]])).item() == pytest.approx(
         1.0, abs=3e-3
     )

@@ -43,7 +43,7 @@ CASES: dict[str, dict[str, Any]] = {
 
 
 def description(**changes: Any) -> dict[str, Any]:
-    return {"family": "mlp", "bounds": [[-1.0] * 3, [1.0] * 3]} | changes
+    return {"kind": "mlp", "bounds": [[-1.0] * 3, [1.0] * 3]} | changes
 
 
 def encoding_width(values: dict[str, Any]) -> int:

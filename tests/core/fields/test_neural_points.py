@@ -26,7 +26,7 @@ PRIMES = (73856093, 19349669, 83492791)
 
 def description(**changes: Any) -> dict[str, Any]:
     values = {
-        "family": "neural_points",
+        "kind": "neural_points",
         "bounds": [[-1.5] * 3, [1.5] * 3],
         "cell_size": CELL,
         "buffer_size": 50_000_000,

@@ -122,10 +122,30 @@ def test_tensors_that_do_not_fit_the_description(faulty: Tensors, tmp_path: Path
     path = tmp_path / "field.safetensors"
     assert reason_of(lambda: write_safe_field(path, description(), faulty)) == "FIELD_SHAPES_MISMATCH"
     assert not path.exists()
-    metadata = {"regnf": "1", "field": json.dumps(description())}
+    metadata = {"regnf": "2", "field": json.dumps(description())}
     save_file({name: np.ascontiguousarray(array) for name, array in faulty.items()}, path, metadata)
     assert reason_of(lambda: read_description(path)) == "FIELD_SHAPES_MISMATCH"
     assert reason_of(lambda: open_field(path)) == "FIELD_SHAPES_MISMATCH"
+
+
+def with_family() -> dict[str, Any]:
+    """A description as version 1 of the format has it: ``family`` in place of ``kind``."""
+    values = description()
+    return {"family": values.pop("kind"), **values}
+
+
+def test_a_file_of_version_1_is_still_read(tmp_path: Path) -> None:
+    path = tmp_path / "field.safetensors"
+    write_safe_field(path, description(), tensors())
+    new = open_field(path).signed_distance(torch.zeros(1, 3))
+    save_file(tensors(), path, {"regnf": "1", "field": json.dumps(with_family())})
+    assert read_description(path)["kind"] == "neus_facto"
+    torch.testing.assert_close(open_field(path).signed_distance(torch.zeros(1, 3)), new)
+
+
+def test_the_old_name_of_an_entry_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError, match="did you mean `kind`"):
+        write_safe_field(tmp_path / "field.safetensors", with_family(), tensors())
 
 
 def test_numbers_that_are_not_finite(tmp_path: Path) -> None:
@@ -137,7 +157,8 @@ def test_numbers_that_are_not_finite(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        (description(family="pin_slam"), "FIELD_FAMILY_UNKNOWN"),
+        (description(kind="pin_slam"), "FIELD_KIND_UNKNOWN"),
+        (with_family(), "FIELD_KIND_UNKNOWN"),
         (description(contraction="sphere"), "SAFE_FORMAT_INVALID"),
         (description(bounds=[[0, 0, 0], [1, 1, 0]]), "SAFE_FORMAT_INVALID"),
         (description(bounds=[[0, 0, 0], [1, 1, float("inf")]]), "SAFE_FORMAT_INVALID"),
@@ -155,7 +176,7 @@ def test_numbers_that_are_not_finite(tmp_path: Path) -> None:
 def test_descriptions_that_mean_nothing(values: Any, reason: str, tmp_path: Path) -> None:
     path = tmp_path / "field.safetensors"
     assert reason_of(lambda: write_safe_field(path, values, tensors())) == reason
-    save_file(tensors(), path, {"regnf": "1", "field": json.dumps(values)})
+    save_file(tensors(), path, {"regnf": "2", "field": json.dumps(values)})
     assert reason_of(lambda: read_description(path)) == reason
 
 
@@ -164,11 +185,11 @@ def test_descriptions_that_mean_nothing(values: Any, reason: str, tmp_path: Path
     [
         (None, "SAFE_FORMAT_INVALID"),
         ({"field": json.dumps(description())}, "SAFE_FORMAT_INVALID"),
-        ({"regnf": "1"}, "SAFE_FORMAT_INVALID"),
-        ({"regnf": "2", "field": json.dumps(description())}, "SAFE_FORMAT_VERSION"),
-        ({"regnf": "1", "field": "{"}, "SAFE_FORMAT_INVALID"),
-        ({"regnf": "1", "field": "[" * 100_000}, "SAFE_FORMAT_INVALID"),
-        ({"regnf": "1", "field": " " * (2 << 20)}, "SAFE_FORMAT_INVALID"),
+        ({"regnf": "2"}, "SAFE_FORMAT_INVALID"),
+        ({"regnf": "3", "field": json.dumps(description())}, "SAFE_FORMAT_VERSION"),
+        ({"regnf": "2", "field": "{"}, "SAFE_FORMAT_INVALID"),
+        ({"regnf": "2", "field": "[" * 100_000}, "SAFE_FORMAT_INVALID"),
+        ({"regnf": "2", "field": " " * (2 << 20)}, "SAFE_FORMAT_INVALID"),
     ],
 )
 def test_metadata_that_is_not_ours(metadata: dict[str, str] | None, reason: str, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ VALUES = np.random.default_rng(4).normal(size=(4, EDGE, EDGE, EDGE)).astype(np.f
 
 def description(**changes: Any) -> dict[str, Any]:
     bounds = [[-1.0] * 3, [1.0] * 3]
-    return {"family": "voxel_blocks", "origin": ORIGIN.tolist(), "voxel_size": SIZE, "bounds": bounds} | changes
+    return {"kind": "voxel_blocks", "origin": ORIGIN.tolist(), "voxel_size": SIZE, "bounds": bounds} | changes
 
 
 def field(values: NDArray[Any] = VALUES, blocks: NDArray[Any] = BLOCKS, **changes: Any) -> SdfField:

@@ -23,7 +23,7 @@ FAR = ORIGIN + SPACING * (np.array(VALUES.shape) - 1)
 
 
 def description(**changes: Any) -> dict[str, Any]:
-    values = {"family": "voxel_grid", "origin": ORIGIN.tolist(), "spacing": SPACING.tolist()}
+    values = {"kind": "voxel_grid", "origin": ORIGIN.tolist(), "spacing": SPACING.tolist()}
     return values | {"bounds": [ORIGIN.tolist(), FAR.tolist()]} | changes
 
 

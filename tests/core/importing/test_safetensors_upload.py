@@ -81,7 +81,7 @@ def test_a_field_file_may_be_uploaded_again(field_file: Path, tmp_path: Path) ->
     report = convert_file(field_file, tmp_path, None, ImportLimits())
     assert (tmp_path / FIELD_NAME).read_bytes() == field_file.read_bytes()
     assert report["label"] == "ball"
-    assert report["family"] == "neus_facto"
+    assert (report["family"], report["kind"]) == ("regnf", "neus_facto")
 
 
 def test_its_description_may_be_overruled(field_file: Path, tmp_path: Path) -> None:

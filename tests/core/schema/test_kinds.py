@@ -1,4 +1,4 @@
-"""What holds for every kind of field: it is told by its family's name, and unit and sign are applied round it."""
+"""What holds for every kind of field: its name tells it, and unit and sign are applied round it."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def test_a_description_of_the_first_version_opens_unchanged() -> None:
     assert parse_description(description_to_dict(parsed)) == parsed
 
 
-@pytest.mark.parametrize("family", [None, 3, ["neus_facto"], "neus-facto", {}])
-def test_unknown_families(family: Any) -> None:
+@pytest.mark.parametrize("kind", [None, 3, ["neus_facto"], "neus-facto", {}])
+def test_unknown_kinds(kind: Any) -> None:
     with pytest.raises(FieldFormatError) as caught:
-        parse_description(description(family=family))
-    assert caught.value.reason == "FIELD_FAMILY_UNKNOWN"
+        parse_description(description(kind=kind))
+    assert caught.value.reason == "FIELD_KIND_UNKNOWN"
 
 
 @pytest.mark.parametrize(
@@ -75,6 +75,6 @@ def test_the_gradient_is_that_of_the_scaled_distance() -> None:
 
 
 def test_every_kind_is_described_without_torch() -> None:
-    assert all(get_args(get_type_hints(kind)["family"]) == (name,) for name, kind in KINDS.items())
+    assert all(get_args(get_type_hints(kind)["kind"]) == (name,) for name, kind in KINDS.items())
     program = "import sys, regnf_core.schema.kinds; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)

@@ -153,7 +153,15 @@ def test_tensors_beyond_the_limit_are_refused(upload: Path, tmp_path: Path) -> N
     assert_refused(lambda: import_field(upload, tmp_path, None, limits), "TENSOR_TOO_LARGE")
 
 
-GOOD = {"family": "f", "why": [], "bounds": [[0, 0, 0], [1, 1, 1]], "parameters": 1, "plausibility": {}, "warnings": []}
+GOOD = {
+    "family": "f",
+    "kind": "k",
+    "why": [],
+    "bounds": [[0, 0, 0], [1, 1, 1]],
+    "parameters": 1,
+    "plausibility": {},
+    "warnings": [],
+}
 GOOD |= {"label": None, "isolation": {}, "peak_memory_bytes": 1}
 
 
