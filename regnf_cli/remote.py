@@ -212,5 +212,7 @@ def _check(response: httpx.Response) -> dict[str, Any]:
 
 
 def _problem(problem: dict[str, Any]) -> ServiceError:
+    if problem.get("reason") == "JOB_FAILED" and isinstance(problem.get("error"), dict):
+        problem = problem["error"]  # why the job failed says more than that it did
     detail = problem.get("detail") or problem.get("title") or "the service gave no detail"
     return ServiceError(str(detail), reason=str(problem.get("reason", ServiceError.reason)))

@@ -115,6 +115,7 @@ REASONS: dict[str, Reason] = {
     "TOO_MANY_STREAMS": Reason(429, "Too many streams at once", "You read as many streams as you may. Close one."),
     "JOB_NOT_READY": Reason(409, "Job not finished", "The job has no result yet. Retry after `Retry-After`."),
     "JOB_DISMISSED": Reason(409, "Job was dismissed", "The job was cancelled. Post the request again to run it."),
+    "JOB_FAILED": Reason(409, "Job has failed", "The job ended without a result. `error` is its own problem."),
     "JOB_FINISHED": Reason(409, "Job has finished", "A job that succeeded or failed can no longer be cancelled."),
     "JOB_ACTIVE": Reason(409, "Job is active", "Cancel the job before you delete it."),
     "JOB_EXPIRED": Reason(410, "Job has expired", "The job outlived its retention. Post the request again."),

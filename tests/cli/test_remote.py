@@ -141,6 +141,22 @@ def test_a_refusal_is_bad_input_with_the_services_reason(run: Run, demo: list[ob
     assert "UNAUTHENTICATED Who are you?" in outcome.stderr
 
 
+def test_a_failed_job_tells_its_own_reason(run: Run, demo: list[object], serve: Serve) -> None:
+    own = {"reason": "NO_SURFACE_IN_DETECTION", "status": 422, "detail": "12 surface points were found"}
+    whole = service("registered")
+
+    def answers(method: str, path: str) -> Answer:
+        if path == "/jobs/j":
+            return 200, json.dumps({"id": "j", "status": "failed", "error": own})
+        if path == "/jobs/j/result":
+            return 409, json.dumps({"reason": "JOB_FAILED", "detail": "The job failed.", "error": own})
+        return whole(method, path)
+
+    outcome = run(*demo, "--server", serve(answers))
+    assert outcome.code == 2
+    assert "NO_SURFACE_IN_DETECTION 12 surface points were found" in outcome.stderr
+
+
 @pytest.mark.parametrize("answer", [(200, "<html>hello</html>"), (200, "[]"), (404, "<html>"), (418, "[1]")])
 def test_what_is_no_regnf_service(answer: Answer, run: Run, demo: list[object], serve: Serve) -> None:
     outcome = run(*demo, "--server", serve(lambda method, path: answer))

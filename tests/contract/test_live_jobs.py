@@ -151,8 +151,8 @@ def test_a_box_in_empty_space_fails_with_its_own_problem(client: httpx.Client, f
     assert answer.status_code == 202, answer.text
     job = finished(client, answer.json()["id"])
     assert job["status"] == "failed", job
-    problem = assert_refused(client.get(f"/jobs/{job['id']}/result"), 422, job["error"]["reason"])
-    assert problem["detail"] == job["error"]["detail"]
+    problem = assert_refused(client.get(f"/jobs/{job['id']}/result"), 409, "JOB_FAILED")
+    assert problem["error"] == job["error"]
     outside = {"min": [high + 1 for high in upper], "max": [high + 2 for high in upper]}
     assert_refused(submit(client, fields, detection=outside), 422, "DETECTION_OUTSIDE_SCENE")
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
+import re
 
+import pytest
+from prometheus_client import generate_latest
+
+from regnf_state.reasons import REASONS
 from tests.contract.world import RESULT, World, assert_refused
 
 DATA = bytes(range(256)) * 4
@@ -37,15 +41,29 @@ def test_a_failed_job_answers_with_its_own_problem(world: World) -> None:
     job_id = world.submit(seed=1)
     detail = "12 surface points were found; 500 are needed."
     world.fail(job_id, reason="NO_SURFACE_IN_DETECTION", title="No surface", status=422, detail=detail, found=12)
-    problem = assert_refused(world.client.get(f"/jobs/{job_id}/result"), 422, "NO_SURFACE_IN_DETECTION")
-    assert (problem["detail"], problem["found"]) == (detail, 12)
-    assert world.client.get(f"/jobs/{job_id}").json()["error"]["detail"] == detail
+    problem = assert_refused(world.client.get(f"/jobs/{job_id}/result"), 409, "JOB_FAILED")
+    assert problem["detail"] == f"NO_SURFACE_IN_DETECTION: {detail}"
+    own = problem["error"]
+    assert (own["reason"], own["status"], own["detail"], own["found"]) == ("NO_SURFACE_IN_DETECTION", 422, detail, 12)
+    assert world.client.get(f"/jobs/{job_id}").json()["error"] == own
 
 
 def test_a_reason_that_only_the_engine_knows_passes_through(world: World) -> None:
     job_id = world.submit(seed=1)
     world.fail(job_id, reason="SOMETHING_NEW", title="New", status=422, detail="never seen here")
-    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 422, "SOMETHING_NEW")
+    problem = assert_refused(world.client.get(f"/jobs/{job_id}/result"), 409, "JOB_FAILED")
+    assert problem["error"]["reason"] == "SOMETHING_NEW"
+
+
+@pytest.mark.parametrize("reason", ["WORKER_LOST", "JOB_TIMEOUT", "OUT_OF_MEMORY", "STORAGE_FULL", "INTERNAL"])
+def test_polling_a_failed_job_is_no_error_of_the_server(world: World, reason: str) -> None:
+    job_id = world.submit(seed=1)
+    world.fail(job_id, reason=reason, title="Failed", status=REASONS[reason].status, detail="why")
+    for path in ("result", "artifacts/trace.json"):
+        assert_refused(world.client.get(f"/jobs/{job_id}/{path}"), 409, "JOB_FAILED")
+    counted = generate_latest(world.app.state.metrics.registry).decode()
+    assert 'status="409"' in counted
+    assert not re.search(r'regnf_http_requests_total\{[^}]*status="5', counted)
 
 
 def test_a_dismissed_job_has_no_result(world: World) -> None:

@@ -53,16 +53,6 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
         self.headers = dict(headers or {})
         self.extra = dict(extra or {})
 
-    @classmethod
-    def stored(cls, document: Mapping[str, Any]) -> Problem:
-        """The problem that a record holds, as an answer: its reason may be one of the engine's own."""
-        problem = cls("INTERNAL")
-        problem.reason, problem.title, problem.detail = (str(document[name]) for name in ("reason", "title", "detail"))
-        problem.status = int(document["status"])
-        known = {"type", "status", "reason", "title", "detail", "instance", "request_id"}
-        problem.extra = {name: value for name, value in document.items() if name not in known}
-        return problem
-
     def document(self, instance: str | None = None, request_id: str | None = None) -> dict[str, Any]:
         """The problem object as it travels."""
         document: dict[str, Any] = {

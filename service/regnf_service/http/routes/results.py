@@ -23,31 +23,21 @@ from regnf_state.records import ACTIVE, JobRecord
 router = APIRouter(tags=["results"])
 _BLOCK_BYTES = 256 * 1024
 _CACHE = "private, max-age=0, must-revalidate"
-_OWN_PROBLEMS = (
-    "FIELD_NOT_FOUND",
-    "FIELD_REJECTED",
-    "FIELD_IMPORT_TIMEOUT",
-    "NO_SURFACE_IN_DETECTION",
-    "NO_SURFACE_IN_OBJECT",
-    "NO_INITIAL_TRANSFORM",
-    "WORKER_LOST",
-    "JOB_TIMEOUT",
-    "OUT_OF_MEMORY",
-    "STORAGE_FULL",
-    "INTERNAL",
-)
-"""What a failed job can have ended with, as far as the table of reasons goes; the engine's own are 422."""
 _FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(set(ARTIFACTS.values()))}
 
 
 def _require_successful(record: JobRecord) -> None:
-    """Raises Problem JOB_NOT_READY, JOB_DISMISSED, or what ended the job."""
+    """Raises Problem JOB_NOT_READY, JOB_DISMISSED, JOB_FAILED with what ended the job.
+
+    A failed job is 409 whatever ended it: this request met no error of the server, and polling it must raise no alarm.
+    """
     if record.status in ACTIVE:
         raise Problem("JOB_NOT_READY", headers={"Retry-After": "1"})
     if record.status == "dismissed":
         raise Problem("JOB_DISMISSED")
     if record.status == "failed":
-        raise Problem.stored(whole_problem(record.error or {}))
+        error = whole_problem(record.error or {})
+        raise Problem("JOB_FAILED", f"{error['reason']}: {error['detail']}", extra={"error": error})
 
 
 def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
@@ -69,13 +59,13 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
             "JOB_NOT_FOUND",
             "JOB_NOT_READY",
             "JOB_DISMISSED",
+            "JOB_FAILED",
             "JOB_EXPIRED",
-            *_OWN_PROBLEMS,
         ),
     },
 )
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
-    """A failed job answers here with its own problem."""
+    """A failed job has no result: the member `error` of the 409 is the job's own problem."""
     manifest = _manifest(services, id, caller)
     try:
         document = read_result(services.blobs, manifest)
@@ -101,9 +91,9 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
         "ARTIFACT_NOT_FOUND",
         "JOB_NOT_READY",
         "JOB_DISMISSED",
+        "JOB_FAILED",
         "JOB_EXPIRED",
         "RANGE_NOT_SATISFIABLE",
-        *_OWN_PROBLEMS,
     ),
 }
 

@@ -46,6 +46,7 @@ class ProblemDocument(Outgoing):
     instance: str | None = None
     request_id: str | None = None
     errors: list[ProblemEntry] = []
+    error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the job's own problem.")
 
 
 def rfc3339(seconds: float | None) -> str | None:
