@@ -1,0 +1,94 @@
+"""Every compose command that the documentation prints renders, and starts services that have what they need."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+import pytest
+
+from regnf_cli.listening import check_access
+from regnf_cli.start_errors import StartError
+from regnf_state.settings import Settings
+from scripts.images.commands import ComposeCommand, documented_commands
+from scripts.images.compose import Service, render
+from tests.docker.files import COMPOSE, ROOT
+
+COMMANDS = documented_commands(ROOT)
+every_command = pytest.mark.parametrize("command", COMMANDS, ids=lambda command: f"{command.source}: {command.text}")
+
+
+def rendered(command: ComposeCommand) -> dict[str, Service]:
+    return render(ROOT / command.file, command.variables, command.profiles)
+
+
+def settings_of(service: Service, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """What the program in the container reads: its environment, and nothing of this process'."""
+    for name in [name for name in os.environ if name.startswith("REGNF_")]:
+        monkeypatch.delenv(name)
+    for name, value in service["environment"].items():
+        monkeypatch.setenv(name, value)
+    return Settings()
+
+
+def test_the_documentation_prints_commands() -> None:
+    sources = {command.source for command in COMMANDS}
+    assert sources == {"README.md", "docs/deployment.md", "docker/compose.yaml"}
+    assert {profile for command in COMMANDS for profile in command.profiles} == {"cpu", "gpu", "observability"}
+
+
+@every_command
+def test_the_front_end_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = settings_of(rendered(command)["api"], monkeypatch)
+    check_access(settings)
+    assert settings.redis_url == "redis://redis:6379/0"
+
+
+@every_command
+def test_a_worker_starts(command: ComposeCommand, monkeypatch: pytest.MonkeyPatch) -> None:
+    services = rendered(command)
+    workers = [name for name in services if name.startswith("worker")]
+    assert workers
+    assert set(command.scale) <= set(services)
+    for name in workers:
+        settings = settings_of(services[name], monkeypatch)
+        assert settings.redis_url == "redis://redis:6379/0"
+        assert not settings.api_tokens
+
+
+@every_command
+def test_grafana_is_given_a_password(command: ComposeCommand) -> None:
+    services = rendered(command)
+    assert ("grafana" in services) == ("observability" in command.profiles)
+    if "grafana" in services:
+        assert services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]
+
+
+@pytest.mark.parametrize("publish", ["0.0.0.0:8080", "8080", "192.0.2.1:8080"])
+def test_published_to_others_it_does_not_start_without_tokens(publish: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    api = render(COMPOSE, {"REGNF_PUBLISH": publish}, ["cpu"])["api"]
+    assert api["ports"] == [f"{publish}:8080"]
+    with pytest.raises(StartError) as caught:
+        check_access(settings_of(api, monkeypatch))
+    assert caught.value.reason == "UNAUTHENTICATED_PUBLIC_BIND"
+
+
+def test_the_front_end_knows_where_its_port_is_published() -> None:
+    for variables in ({}, {"REGNF_PUBLISH": "127.0.0.1:9000"}):
+        api = render(COMPOSE, variables)["api"]
+        assert api["ports"] == [f"{api['environment']['REGNF_PUBLISH']}:8080"]
+
+
+@pytest.mark.parametrize(("password", "status"), [("", 1), ("a-password", 0)])
+def test_grafana_does_not_start_without_a_password(password: str, status: int) -> None:
+    grafana = render(COMPOSE, {"GRAFANA_PASSWORD": password}, ["observability"])["grafana"]
+    shell, option, script = grafana["entrypoint"]
+    assert script.endswith("; exec /run.sh")
+    done = subprocess.run(
+        [shell, option, script.removesuffix("/run.sh") + "true"],
+        env={"PATH": os.environ["PATH"]} | grafana["environment"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (status, "" if password else "set GRAFANA_PASSWORD\n")
