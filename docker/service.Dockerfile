@@ -1,30 +1,34 @@
 # The HTTP front end: contract, routes, storage, queue client, page. It never loads torch, and torch is not in here.
 #   docker build -f docker/service.Dockerfile -t regnf-service .
+# BASE is any Debian 12 with Python 3.11, its venv module and `python` in the path.
+ARG BASE=python:3.11-slim-bookworm
 
-FROM python:3.11-slim-bookworm AS build
+# The project as a wheel: what the images hold is what `pip install regnf` would bring.
+FROM ${BASE} AS wheel
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+RUN python -m venv /opt/build
+WORKDIR /source
+COPY . .
+RUN /opt/build/bin/pip wheel --no-deps --wheel-dir /wheels .
+
+FROM ${BASE} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/regnf
 ENV PATH=/opt/regnf/bin:$PATH
 WORKDIR /source
-COPY pyproject.toml constraints.txt README.md LICENSE ./
-COPY regnf_core regnf_core
-COPY regnf_cli regnf_cli
-COPY regnf_data regnf_data
-COPY regnf_fit regnf_fit
-COPY regnf_state regnf_state
-COPY service service
-COPY worker worker
-RUN pip install --constraint constraints.txt ".[service]"
+COPY constraints.txt ./
+COPY --from=wheel /wheels /wheels
+RUN pip install --constraint constraints.txt "$(echo /wheels/regnf-*.whl)[service]"
 
-FROM python:3.11-slim-bookworm
+FROM ${BASE}
 # The state folder belongs to the user, so that a fresh volume mounted there does as well.
 RUN groupadd --system --gid 10001 regnf \
     && useradd --system --uid 10001 --gid regnf --home-dir /tmp --no-create-home regnf \
     && install --directory --owner regnf --group regnf --mode 0750 /var/lib/regnf
 COPY --from=build /opt/regnf /opt/regnf
 COPY docker/serve_api.py /opt/regnf/serve_api.py
-# A container's loopback is of no use to anyone outside it. Listening elsewhere needs REGNF_API_TOKENS, or
-# REGNF_ALLOW_UNAUTHENTICATED=true where something else keeps strangers out.
+# A container's loopback is of no use to anyone outside it. Listening elsewhere needs REGNF_API_TOKENS, REGNF_PUBLISH on
+# the host's loopback, or REGNF_ALLOW_UNAUTHENTICATED=true where something else keeps strangers out.
 ENV PATH=/opt/regnf/bin:$PATH \
     HOME=/tmp \
     PYTHONUNBUFFERED=1 \

@@ -2,27 +2,31 @@
 #   docker build -f docker/worker.Dockerfile -t regnf-worker .
 # Where the default package index offers GPU builds of torch first, give an index of CPU builds beside it and the image
 # shrinks by gigabytes:  --build-arg PIP_EXTRA_INDEX_URL=...
+# BASE is any Debian 12 with Python 3.11, its venv module and `python` in the path.
+ARG BASE=python:3.11-slim-bookworm
 
-FROM python:3.11-slim-bookworm AS build
+# The project as a wheel: what the images hold is what `pip install regnf` would bring.
+FROM ${BASE} AS wheel
+ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
+RUN python -m venv /opt/build
+WORKDIR /source
+COPY . .
+RUN /opt/build/bin/pip wheel --no-deps --wheel-dir /wheels .
+
+FROM ${BASE} AS build
 ARG PIP_EXTRA_INDEX_URL=""
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/regnf
 ENV PATH=/opt/regnf/bin:$PATH
 WORKDIR /source
 COPY constraints.txt ./
-# torch first and by itself: the layer is the largest by far and outlives changes of everything below.
+# torch first, by itself and by its pinned version: the layer is the largest by far and outlives changes of everything
+# below, and an open range may resolve to another build.
 RUN pip install --constraint constraints.txt torch
-COPY pyproject.toml README.md LICENSE ./
-COPY regnf_core regnf_core
-COPY regnf_cli regnf_cli
-COPY regnf_data regnf_data
-COPY regnf_fit regnf_fit
-COPY regnf_state regnf_state
-COPY service service
-COPY worker worker
-RUN pip install --constraint constraints.txt ".[engine,service]"
+COPY --from=wheel /wheels /wheels
+RUN pip install --constraint constraints.txt "$(echo /wheels/regnf-*.whl)[engine,service]"
 
-FROM python:3.11-slim-bookworm
+FROM ${BASE}
 # What open3d and torch load. Versions come with the pinned release of the base image.
 # hadolint ignore=DL3008
 RUN apt-get update \

@@ -7,6 +7,8 @@ import importlib.util
 import re
 import subprocess
 import sys
+import tomllib
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -25,11 +27,19 @@ def test_hadolint_finds_nothing(path: Path) -> None:
 
 
 @every_image
-def test_built_in_two_stages_on_the_pinned_base(path: Path) -> None:
+def test_every_stage_is_built_on_the_pinned_base(path: Path) -> None:
     bases = [rest for name, rest in instructions(path) if name == "FROM"]
-    assert bases == ["python:3.11-slim-bookworm AS build", "python:3.11-slim-bookworm"]
+    assert bases == ["${BASE} AS wheel", "${BASE} AS build", "${BASE}"]
+    assert instructions(path)[0] == ("ARG", "BASE=python:3.11-slim-bookworm")
     assert any(name == "COPY" and rest.startswith("--from=build ") for name, rest in last_stage(path))
-    assert not any("pip install" in rest for _, rest in last_stage(path))
+    assert not any("pip " in rest for _, rest in last_stage(path))
+
+
+def test_both_images_share_the_stage_that_makes_the_wheel() -> None:
+    wheels = [takewhile(lambda step: step != ("FROM", "${BASE} AS build"), instructions(path)) for path in DOCKERFILES]
+    service, worker = map(list, wheels)
+    assert service == worker
+    assert ("RUN", "/opt/build/bin/pip wheel --no-deps --wheel-dir /wheels .") in service
 
 
 @every_image
@@ -48,25 +58,41 @@ def test_every_install_is_constrained(path: Path) -> None:
     assert all("--constraint constraints.txt" in rest for rest in installs)
 
 
-@every_image
-def test_every_copied_source_exists_and_is_sent_to_the_builder(path: Path) -> None:
+def is_sent(source: str) -> bool:
+    """Whether .dockerignore lets a path of the repository through: it, or a folder that it is in."""
     patterns = [line for line in (ROOT / ".dockerignore").read_text().splitlines() if line and not line.startswith("#")]
     assert patterns[0] == "*"
     admitted = [pattern[1:] for pattern in patterns if pattern.startswith("!")]
+    places = [source, *(str(parent) for parent in Path(source).parents)]
+    return any(fnmatch.fnmatch(place, pattern) for place in places for pattern in admitted)
+
+
+@every_image
+def test_every_copied_source_exists_and_is_sent_to_the_builder(path: Path) -> None:
     for source in copied_sources(path):
         assert (ROOT / source).exists(), source
-        assert any(fnmatch.fnmatch(source, pattern) for pattern in admitted), source
+        assert source == "." or is_sent(source), source
+
+
+def test_the_builder_is_sent_what_the_wheel_is_made_of_and_no_more() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    parts = [*wheel["packages"], "pyproject.toml", project["project"]["readme"], *project["project"]["license-files"]]
+    assert [part for part in parts if not is_sent(part)] == []
+    assert [
+        other for other in (".git", ".venv", "tests", "docs", "examples/data", "benchmarks") if is_sent(other)
+    ] == []
 
 
 def test_the_service_image_has_no_torch() -> None:
     text = " ".join(rest for _, rest in instructions(SERVICE))
     assert not re.search(r"torch|open3d|engine|all\]", text)
-    assert '".[service]"' in text
+    assert '"$(echo /wheels/regnf-*.whl)[service]"' in text
 
 
 def test_the_worker_image_has_the_engine_and_its_libraries() -> None:
     text = " ".join(rest for _, rest in instructions(WORKER))
-    assert '".[engine,service]"' in text
+    assert '"$(echo /wheels/regnf-*.whl)[engine,service]"' in text
     wanted = re.search(r"runtime=\(([^)]*)\)", (ROOT / "scripts" / "system-packages.sh").read_text())
     assert wanted is not None
     assert set(wanted[1].split()) <= set(text.split())
