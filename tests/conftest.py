@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 
 import pytest
 from redis import Redis
@@ -13,7 +15,7 @@ from regnf_state.records import RecordStore
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.object_store import ObjectServer, object_server
-from tests.redis_server import private_redis
+from tests.redis_server import installed_servers, private_redis
 
 # Threads of several processes that spin while they wait slow a shared machine tenfold. Set before torch loads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -26,22 +28,33 @@ def objects() -> Iterator[ObjectServer]:
         yield server
 
 
-@pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
+@pytest.fixture(scope="session")
+def redis_server() -> Iterator[Callable[[str], str]]:
+    """The address of a server by its kind; each is started when it is first asked for."""
+    with ExitStack() as stack:
+        yield cache(lambda name: stack.enter_context(private_redis(name)))
+
+
+@pytest.fixture(scope="session", params=installed_servers())
+def redis_url(request: pytest.FixtureRequest, redis_server: Callable[[str], str]) -> str:
+    """A server of each kind in turn."""
+    return redis_server(request.param)
 
 
 @pytest.fixture
 def redis(redis_url: str) -> Iterator[Redis]:
+    """Empty."""
     with connect(redis_url) as client:
         client.flushall()
         yield client
 
 
-@pytest.fixture(params=["memory", "redis"])
-def store(request: pytest.FixtureRequest) -> Iterator[RecordStore]:
+@pytest.fixture(params=["memory", *installed_servers()])
+def store(request: pytest.FixtureRequest, redis_server: Callable[[str], str]) -> Iterator[RecordStore]:
+    """Each kind of record store, empty."""
     if request.param == "memory":
         yield InMemoryRecordStore()
         return
-    yield RedisRecordStore(request.getfixturevalue("redis"))
+    with connect(redis_server(request.param)) as client:
+        client.flushall()
+        yield RedisRecordStore(client)

@@ -1,4 +1,4 @@
-"""The Redis server of `regnf serve`, to be killed and started at will over the same history."""
+"""A Redis server, with the options of `regnf serve`, to be killed and started at will over the same history."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from regnf_cli.embedded_redis import answers, server_command
-from tests.worker.bench import eventually
+from tests.redis_server import command_of, wait_for
 
 
 @dataclass
@@ -27,9 +26,9 @@ class RestartableRedis:
         return f"unix://{self.folder}/s"
 
     def start(self) -> None:
-        command = server_command(self.folder / "s", self.data)
+        command = command_of(self.folder / "s", self.data)
         self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=self.environment)
-        eventually(lambda: answers(self.url), "Redis")
+        wait_for(self.url, self.process)
 
     def kill(self) -> None:
         assert self.process is not None

@@ -1,6 +1,6 @@
 """What goes from the store because nobody needs it, and what stays because somebody does."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,17 +13,9 @@ from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.journal.rebuild import Rebuilder
 from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue
 from regnf_state.records import FieldRecord, JobRecord
-from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
-from tests.redis_server import private_redis
 
 DAY_S = 24 * 3600.0
-
-
-@pytest.fixture(scope="module")
-def redis() -> Iterator[Redis]:
-    with private_redis() as url, connect(url) as client:
-        yield client
 
 
 class ShiftedRecords(JournaledRecordStore):

@@ -1,19 +1,9 @@
 """One leader at a time, and a leader that was slow hears that it no longer leads."""
 
-from collections.abc import Iterator
-
 import pytest
 from redis import Redis
 
 from regnf_service.upkeep.lease import Lease, LeaseLostError
-from regnf_state.redis.client import connect
-from tests.redis_server import private_redis
-
-
-@pytest.fixture(scope="module")
-def redis() -> Iterator[Redis]:
-    with private_redis() as url, connect(url) as client:
-        yield client
 
 
 @pytest.fixture

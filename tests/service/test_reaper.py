@@ -1,6 +1,5 @@
 """What the reaper finds, and what it leaves alone."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import pytest
@@ -9,17 +8,9 @@ from redis import Redis
 from regnf_service.upkeep.reaper import Reaped, Reaper
 from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord, JobRecord
-from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
-from tests.redis_server import private_redis
 
 SHA = "a" * 64
-
-
-@pytest.fixture(scope="module")
-def redis() -> Iterator[Redis]:
-    with private_redis() as url, connect(url) as client:
-        yield client
 
 
 @dataclass

@@ -1,7 +1,6 @@
 """What the journal remembers of jobs, and how their records are made anew from it."""
 
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
@@ -11,15 +10,7 @@ from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.journal.rebuild import Rebuilt
 from regnf_state.memory import InMemoryJobQueue
 from regnf_state.records import JobRecord, StaleAttemptError
-from regnf_state.redis.client import connect
-from tests.redis_server import private_redis
 from tests.state.journal_world import RETENTION_S, World, fresh_world
-
-
-@pytest.fixture(scope="module")
-def redis() -> Iterator[Redis]:
-    with private_redis() as url, connect(url) as client:
-        yield client
 
 
 @pytest.fixture

@@ -1,21 +1,12 @@
 """What the journal remembers of fields, and how their records are made anew from it."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 from redis import Redis
 
 from regnf_state.journal.rebuild import Rebuilt
-from regnf_state.redis.client import connect
-from tests.redis_server import private_redis
 from tests.state.journal_world import SCENE, World, fresh_world
-
-
-@pytest.fixture(scope="module")
-def redis() -> Iterator[Redis]:
-    with private_redis() as url, connect(url) as client:
-        yield client
 
 
 @pytest.fixture
