@@ -137,5 +137,5 @@ REASONS: dict[str, Reason] = {
     "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
     "STORE_UNAVAILABLE": Reason(503, "Records unavailable", "The record store does not answer. Retry later."),
     "STORAGE_UNAVAILABLE": Reason(503, "Storage unavailable", "The blob storage does not answer. Retry later."),
-    "INTERNAL": Reason(500, "Internal error", "A fault of ours. The log has it under the request id."),
+    "INTERNAL": Reason(500, "Internal error", "The service failed. Its log has the error under the request id."),
 }

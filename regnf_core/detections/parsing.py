@@ -141,12 +141,12 @@ def _nuscenes(values: Mapping[Any, Any]) -> Detection:
             raise fault((str(name),), "is not a member of a nuScenes box", suggestion(str(name), known) or FORMS)
     width, length, height = edges(values["size"], ("size",))
     label = next((values[name] for name in ("label", *NUSCENES_LABELS) if name in values), None)
-    score = next((values[name] for name in ("score", *NUSCENES_SCORES) if name in values), None)
+    score = next((values[name] for name in NUSCENES_SCORES if name in values), None)
     return Detection(
         point(values["translation"], ("translation",)),
         (length, width, height),
         read_quaternion(values["rotation"], ("rotation",), "wxyz"),
-        **_labels({"label": label, "score": None if score == -1 else score}),
+        **_labels({"label": label, "score": values.get("score", None if score == -1 else score)}),
     )
 
 

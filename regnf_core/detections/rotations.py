@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from regnf_core.geometry.quaternion_formula import rotation_rows
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -25,11 +27,8 @@ def normal_quaternion(xyzw: Sequence[float]) -> Quaternion:
 def rotation_columns(xyzw: Sequence[float]) -> tuple[Vector, Vector, Vector]:
     """The images of the axes x, y and z, from a unit quaternion."""
     x, y, z, w = xyzw
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)),
-        (2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)),
-        (2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)),
-    )
+    first, second, third = zip(*rotation_rows(x, y, z, w), strict=True)
+    return first, second, third
 
 
 def orthonormality_error(rows: Sequence[Sequence[float]]) -> float:

@@ -65,5 +65,5 @@ async def _reap(services: Services, redis: Redis) -> None:
         except (RedisError, OSError) as error:
             logger.warning("the reaper found a store away: %s", type(error).__name__)
         except Exception:
-            logger.exception("a fault of ours ended the reaper's round; the next one comes")
+            logger.exception("an internal error ended this round of the reaper; the next round follows")
         await pause(_REAP_EVERY_S, services.stopping)

@@ -49,7 +49,7 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except (RedisError, StorageUnavailableError):
         raise
     except RegnfError as error:
-        _refuse(context, sha256, attempt, problem(error.reason, str(error)))
+        _refuse(context, sha256, attempt, problem(error.reason, str(error), hint=error.hint))
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
     except JobTimeoutException:

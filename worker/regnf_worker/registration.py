@@ -68,7 +68,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
         except (RedisError, StorageUnavailableError):
             raise
         except RegnfError as error:
-            _fail(context, job_id, attempt, problem(error.reason, str(error)))
+            _fail(context, job_id, attempt, problem(error.reason, str(error), hint=error.hint))
         except Exception as error:
             if are_files_away(error):
                 raise

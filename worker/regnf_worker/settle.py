@@ -18,7 +18,7 @@ _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
 """What a process does not do to itself; other signals, a segmentation fault say, would come again."""
 _DETAILS = {
     "WORKER_LOST": "The process that did the work was killed. Send the request again.",
-    "INTERNAL": "A fault of ours: the process that did the work ended without a word. The log has more under its id.",
+    "INTERNAL": "Internal error: the process of the job ended without a report. The log has more under its id.",
 }
 
 

@@ -18,6 +18,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
+from regnf_core.hints import HINTS
 from regnf_service.http.contract import allowed_methods
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.reasons import REASONS
@@ -41,6 +42,7 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
         *,
         errors: Sequence[Mapping[str, str]] = (),
         headers: Mapping[str, str] | None = None,
+        hint: str | None = None,
         extra: Mapping[str, Any] | None = None,
     ) -> None:
         entry = REASONS[reason]
@@ -51,6 +53,7 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
         self.detail = detail or entry.meaning
         self.errors = list(errors)[:_MAX_ERRORS]
         self.headers = dict(headers or {})
+        self.hint = hint or HINTS.get(reason)
         self.extra = dict(extra or {})
 
     def document(self, instance: str | None = None, request_id: str | None = None) -> dict[str, Any]:
@@ -62,6 +65,8 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
             "reason": self.reason,
             "detail": self.detail,
         }
+        if self.hint is not None:
+            document["hint"] = self.hint
         if instance is not None:
             document["instance"] = instance
         if request_id is not None:
@@ -99,7 +104,7 @@ def problem_of(error: Exception) -> Problem:
         case RecordError():
             return Problem("CONFLICT")
         case RegnfError():
-            return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error))
+            return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error), hint=error.hint)
         case RedisError():
             return Problem("STORE_UNAVAILABLE", headers=RETRY_LATER)
         case StorageFullError():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
+from regnf_core.detections import Bounds, parse_detection, require_in_scene
+from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.dependencies import Services
 from regnf_service.http.problems import Problem
-from regnf_service.jobs.boxes import boxes_overlap
 from regnf_service.jobs.canonical import digest, job_id_of
 from regnf_state.ownership import ANONYMOUS, owned_request, reference_of
 from regnf_state.records import FieldRecord, JobRecord
@@ -31,12 +32,16 @@ def check_fields(services: Services, caller: str, request: dict[str, Any], named
     services.webhooks.check(caller, request)
     asked = [request["scene"], *named.values()]
     scene, *found = services.records.get_fields([reference_of(caller, sha256) for sha256 in asked])
-    _require_usable(dict(zip(named, found, strict=True)))
+    records = dict(zip(named, found, strict=True))
+    _require_usable(records)
     bounds = _bounds(scene)
-    box = request["detection"]
-    if bounds is None or boxes_overlap(box["center"], box["size"], box["rotation_quaternion_xyzw"], *bounds):
+    if bounds is None:
         return
-    raise Problem("DETECTION_OUTSIDE_SCENE", errors=[{"pointer": "/detection", "detail": "outside the scene's bounds"}])
+    try:
+        require_in_scene(parse_detection(request["detection"]), bounds, _bounds(records.get("/object")))
+    except InvalidDetectionError as error:
+        fault = {"pointer": "/detection", "detail": str(error)}
+        raise Problem(error.reason, str(error), errors=[fault], hint=error.hint) from error
 
 
 def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
@@ -52,9 +57,9 @@ def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
         raise Problem("FIELD_REJECTED", errors=rejected)
 
 
-def _bounds(scene: FieldRecord | None) -> tuple[Sequence[float], Sequence[float]] | None:
-    """Lowest and highest corner of a ready scene, as its import reported them."""
-    match scene.report.get("bounds") if scene is not None else None:
+def _bounds(found: FieldRecord | None) -> Bounds | None:
+    """Lowest and highest corner of a ready field, as its import reported them."""
+    match found.report.get("bounds") if found is not None else None:
         case [[_, _, _] as lower, [_, _, _] as upper]:
             return lower, upper
         case {"min": [_, _, _] as lower, "max": [_, _, _] as upper}:

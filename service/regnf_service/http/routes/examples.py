@@ -33,6 +33,18 @@ REGISTER_EXAMPLES: dict[str, Any] = {
             "seed": 7,
         },
     },
+    "open3d": {
+        "summary": "A box as Open3D has it; `centre`, `extents` and `rotation` are taken too",
+        "value": {
+            "scene": SCENE,
+            "object": OBJECT,
+            "detection": {
+                "center": [-0.15, -0.05, 0.2],
+                "extent": [0.5, 0.5, 0.4],
+                "R": [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+            },
+        },
+    },
     "published": {
         "summary": "The published method instead, with options of its own",
         "value": {

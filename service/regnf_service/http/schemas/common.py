@@ -43,6 +43,7 @@ class ProblemDocument(Outgoing):
     status: int
     reason: str
     detail: str
+    hint: str | None = Field(None, description="What to do next, for people.")
     instance: str | None = None
     request_id: str | None = None
     errors: list[ProblemEntry] = []

@@ -1,81 +1,149 @@
-"""The detection: an oriented box in the scene's frame, in either of its two spellings."""
+"""The detection of a request: read by the core's parser, shown in the contract in all the forms that it takes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import ConfigDict, Field, PlainValidator
+from pydantic.json_schema import SkipJsonSchema
+from pydantic_core import PydanticCustomError
 
+from regnf_core.detections import Detection as ParsedDetection
+from regnf_core.detections import parse_detection
+from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.schemas.common import Coordinate, Incoming, Label
-from regnf_service.jobs.boxes import IDENTITY, normal_quaternion
 
-Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
-Edge = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
-Component = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
-_LEAST_NORM_SQUARED = 1e-12
+DETECTION_FAULT = "invalid_detection"
+"""The type of a fault whose context says the place within the detection, the message and the hint."""
+_Edge = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+_Component = Annotated[float, Field(ge=-1e3, le=1e3, allow_inf_nan=False)]
+_Row = Annotated[list[_Component], Field(min_length=3, max_length=3)]
+_List = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+_Four = Annotated[list[_Component], Field(min_length=4, max_length=4)]
+_Nothing = SkipJsonSchema[None]
+
+
+class Point(Incoming):
+    """A point by its coordinates' names."""
+
+    x: Coordinate
+    y: Coordinate
+    z: Coordinate
+
+
+class Quaternion(Incoming):
+    """A quaternion by its components' names, as ROS has it."""
+
+    x: _Component
+    y: _Component
+    z: _Component
+    w: _Component
+
+
+class Edges(Incoming):
+    """Full edge lengths by their axes' names."""
+
+    x: _Edge
+    y: _Edge
+    z: _Edge
+
+
+_Point = _List | Point
+_Size = Annotated[list[_Edge], Field(min_length=3, max_length=3)] | Edges
+_Matrix = Annotated[
+    list[_Row], Field(min_length=3, max_length=3, description="Rows; the columns are the box's axes in the scene.")
+]
+_Rotation = _Matrix | Quaternion
 
 
 class _Labeled(Incoming):
     label: Label | None = Field(None, description="What the detector took it for. Not used by the registration.")
     score: Annotated[float, Field(ge=0, le=1)] | None = Field(None, description="The detector's confidence.")
 
-    def _as_record(self, center: Sequence[float], size: Sequence[float], xyzw: Sequence[float]) -> dict[str, Any]:
-        return {
-            # adding zero turns -0.0 into 0.0: one value, one spelling
-            "center": [float(value) + 0.0 for value in center],
-            "size": [float(value) for value in size],
-            "rotation_quaternion_xyzw": list(normal_quaternion(xyzw)),
-            "label": self.label,
-            "score": None if self.score is None else float(self.score),
-        }
+
+def _one_of_each(*groups: tuple[str, ...]) -> ConfigDict:
+    """A schema that requires one name of each group; what may be left out has no default to show."""
+
+    def change(schema: dict[str, Any]) -> None:
+        schema["allOf"] = [{"oneOf": [{"required": [name]} for name in group]} for group in groups]
+        for name, member in schema["properties"].items():
+            if name not in ("label", "score"):
+                member.pop("default", None)
+
+    return ConfigDict(json_schema_extra=change)
 
 
-class CenteredDetection(_Labeled):
-    """A box by center, full edge lengths and rotation (identity when left out), scene frame and units."""
+class CenteredBox(_Labeled):
+    """A box by center, full edge lengths and rotation, which is the identity when left out. `centre`, `extent`,
+    `extents`, `R` and `rotation_matrix` are other names: Open3D's OrientedBoundingBox is taken as it is."""
 
-    center: Point
-    size: Annotated[list[Edge], Field(min_length=3, max_length=3)]
-    rotation_quaternion_xyzw: Annotated[list[Component], Field(min_length=4, max_length=4)] = Field(list(IDENTITY))
+    model_config = _one_of_each(("center", "centre"), ("size", "extent", "extents"))
 
-    @model_validator(mode="after")
-    def _rotates(self) -> CenteredDetection:
-        if sum(value * value for value in self.rotation_quaternion_xyzw) < _LEAST_NORM_SQUARED:
-            raise ValueError("rotation_quaternion_xyzw must not be zero")
-        return self
-
-    def canonical(self) -> dict[str, Any]:
-        """The box as a job record holds it."""
-        return self._as_record(self.center, self.size, self.rotation_quaternion_xyzw)
-
-
-class CornerDetection(_Labeled):
-    """An axis-aligned box by its lowest and its highest corner, scene frame and units."""
-
-    min: Point
-    max: Point
-
-    @model_validator(mode="after")
-    def _extends(self) -> CornerDetection:
-        if not all(low < high for low, high in zip(self.min, self.max, strict=True)):
-            raise ValueError("min must lie below max along every axis")
-        return self
-
-    def canonical(self) -> dict[str, Any]:
-        """The same box by center and size."""
-        corners = list(zip(self.min, self.max, strict=True))
-        return self._as_record(
-            [(low + high) / 2 for low, high in corners], [high - low for low, high in corners], IDENTITY
-        )
+    center: _Point | _Nothing = None
+    centre: _Point | _Nothing = None
+    size: _Size | _Nothing = None
+    extent: _Size | _Nothing = None
+    extents: _Size | _Nothing = None
+    rotation_quaternion_xyzw: _Four | Quaternion | _Nothing = None
+    rotation_quaternion_wxyz: _Four | Quaternion | _Nothing = None
+    rotation: _Rotation | _Nothing = Field(
+        None, description="Box axes to scene axes. Four bare numbers are refused: they do not say their order."
+    )
+    R: _Rotation | _Nothing = None
+    rotation_matrix: _Rotation | _Nothing = None
+    color: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
+    class_name: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
+    version_major: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
+    version_minor: Any = Field(None, description="Of Open3D; ignored beside `extent` or `R`.")
 
 
-def _spelling(value: Any) -> str:
-    if isinstance(value, CornerDetection):
-        return "corners"
-    return "corners" if isinstance(value, dict) and value.keys() & {"min", "max"} else "centered"
+class CornerBox(_Labeled):
+    """An axis-aligned box by its lowest and its highest corner. `min_bound` and `max_bound` are Open3D's names."""
+
+    model_config = _one_of_each(("min", "min_bound"), ("max", "max_bound"))
+
+    min: _Point | _Nothing = None
+    min_bound: _Point | _Nothing = None
+    max: _Point | _Nothing = None
+    max_bound: _Point | _Nothing = None
+    color: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
+    class_name: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
+    version_major: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
+    version_minor: Any = Field(None, description="Of Open3D; ignored beside `min_bound` or `max_bound`.")
+
+
+def _nuscenes_extra(schema: dict[str, Any]) -> None:
+    for name in ("translation", "size", "rotation"):
+        schema["properties"][name].pop("title", None)
+
+
+class NuScenesBox(_Labeled):
+    """A box as nuScenes writes it, known by `translation`, `size` and `rotation` together. `size` is width (along the
+    box's y), length (along x), height (along z); `rotation` is w, x, y, z. Further members of its records are
+    ignored."""
+
+    model_config = ConfigDict(extra="ignore", json_schema_extra=_nuscenes_extra)
+
+    translation: _Point
+    size: _Size
+    rotation: _Four | Quaternion
+
+
+_Corners = Annotated[
+    list[_Point],
+    Field(min_length=2, max_length=2, description="Lowest and highest corner of an axis-aligned box."),
+]
+
+
+def _read(value: Any) -> ParsedDetection:
+    try:
+        return parse_detection(value)
+    except InvalidDetectionError as error:
+        context = {"message": str(error), "hint": error.hint, "place": list(error.place)}
+        raise PydanticCustomError(DETECTION_FAULT, "{message}", context) from error
 
 
 Detection = Annotated[
-    Annotated[CenteredDetection, Tag("centered")] | Annotated[CornerDetection, Tag("corners")], Discriminator(_spelling)
+    ParsedDetection,
+    PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | NuScenesBox | _Corners),
 ]
-SPELLINGS = frozenset({"centered", "corners"})

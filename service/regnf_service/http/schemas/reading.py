@@ -1,15 +1,18 @@
-"""Reading a JSON body as a schema, and saying what is wrong with it without repeating it."""
+"""Reading a JSON body as a schema, and saying what is wrong with it: where, what was expected, what to do next."""
 
 from __future__ import annotations
 
 import json
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from regnf_core.hints import suggestion
 from regnf_core.options import UNKNOWN_OPTION, did_you_mean
 from regnf_service.http.problems import Problem, json_pointer
-from regnf_service.http.schemas.detections import SPELLINGS as BOX_SPELLINGS
+from regnf_service.http.schemas.detections import DETECTION_FAULT
+from regnf_service.http.schemas.members import members_at
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
 from regnf_service.http.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
 from regnf_service.http.strict_json import parse_json
@@ -25,8 +28,19 @@ _REASONS_OF_FAULTS = {
     START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED",
     SEARCH_UNSUPPORTED: "LIBRARY_SEARCH_UNSUPPORTED",
 }
-_SPELLINGS = BOX_SPELLINGS | TRANSFORM_SPELLINGS
+_FIELDS = frozenset({"scene", "object", "candidates"})
+_HASH_DIGITS = 64
+_HASH_HINT = "A field is named by the SHA-256 of its file: `sha256sum FILE` prints it, and so does POST /fields."
 _Model = TypeVar("_Model")
+
+
+class _Fault(NamedTuple):
+    """One fault of a body."""
+
+    kind: str
+    place: tuple[str | int, ...]
+    detail: str
+    hint: str | None
 
 
 def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUEST") -> _Model:
@@ -38,28 +52,54 @@ def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUE
     try:
         return TypeAdapter(model).validate_json(text, strict=True)
     except ValidationError as error:
-        raise refusal(error, otherwise) from error
+        raise refusal(error, otherwise, model) from error
 
 
-def refusal(error: ValidationError, otherwise: str) -> Problem:
+def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     """The problem for what a schema refused: the reason goes by the first faulty member, every fault is listed."""
-    if any(fault["type"] == "json_invalid" for fault in error.errors(include_url=False, include_input=False)):
+    raw = error.errors(include_url=False)
+    if any(fault["type"] == "json_invalid" for fault in raw):
         return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
-    faults = error.errors(include_url=False, include_input=False, include_context=False)
-    places = [[part for part in fault["loc"] if part not in _SPELLINGS] for fault in faults]
-    reasons = [
-        _REASONS_OF_FAULTS.get(fault["type"]) or _REASONS.get(str(place[0]) if place else "")
-        for fault, place in zip(faults, places, strict=True)
-    ]
+    faults = [_fault(entry, model) for entry in raw]
+    reasons = [_REASONS_OF_FAULTS.get(one.kind) or _REASONS.get(str((*one.place, "")[0])) for one in faults]
     reason = next(filter(None, reasons), otherwise)
-    entries = [
-        {"pointer": json_pointer(place), "detail": _detail(place, fault["type"], fault["msg"])}
-        for place, fault in zip(places, faults, strict=True)
-    ]
-    return Problem(reason, errors=entries)
+    of_box = next((one.detail for one in faults if one.kind == DETECTION_FAULT), None)
+    return Problem(
+        reason,
+        of_box if reason == "INVALID_DETECTION" else None,
+        errors=[{"pointer": json_pointer(one.place), "detail": one.detail} for one in faults],
+        hint=next((one.hint for one in faults if one.hint), None),
+    )
 
 
-def _detail(place: list[str | int], kind: str, message: str) -> str:
-    """The fault in words; for an unknown option, with the name that may have been meant."""
-    unknown_option = kind == UNKNOWN_OPTION and place[0] == "options"
-    return message.removeprefix("Value error, ") + (did_you_mean(place[1:]) if unknown_option else "")
+def _fault(entry: Any, model: Any) -> _Fault:
+    kind = str(entry["type"])
+    place = tuple(part for part in entry["loc"] if part not in TRANSFORM_SPELLINGS)
+    detail = str(entry["msg"]).removeprefix("Value error, ")
+    if kind == DETECTION_FAULT:
+        context = entry["ctx"]
+        return _Fault(kind, (*place, *context["place"]), str(context["message"]), context["hint"])
+    if kind == UNKNOWN_OPTION and place[0] == "options":
+        meant = did_you_mean(place[1:])
+        return _Fault(kind, place, detail + meant, meant.replace("; did", "Did", 1) or _meant(place, model))
+    if kind in ("extra_forbidden", UNKNOWN_OPTION):
+        return _Fault(kind, place, "This member is not known.", _meant(place, model))
+    if kind == "string_pattern_mismatch" and place[:1] and place[0] in _FIELDS:
+        return _Fault(kind, place, _hash_fault(str(entry["input"])), _HASH_HINT)
+    return _Fault(kind, place, detail, None)
+
+
+def _meant(place: Sequence[str | int], model: Any) -> str | None:
+    known = members_at(model, place[:-1])
+    listed = ", ".join(f"`{name}`" for name in sorted(known))
+    return suggestion(str(place[-1]), known) or (f"Known here: {listed}." if known else None)
+
+
+def _hash_fault(text: str) -> str:
+    """What is wrong with a field's name, without repeating it."""
+    expected = f"expected {_HASH_DIGITS} lower-case hexadecimal digits"
+    if len(text) == _HASH_DIGITS and text.lower() != text:
+        return f"It has upper-case letters, {expected}."
+    if len(text) != _HASH_DIGITS:
+        return f"It has {len(text)} characters, {expected}."
+    return f"It has other characters than digits and a to f, {expected}."

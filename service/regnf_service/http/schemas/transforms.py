@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
+from regnf_core.detections.rotations import normal_quaternion, rotation_columns
 from regnf_core.geometry.similarity import similarity_fault
 from regnf_service.http.schemas.common import Coordinate, Incoming
-from regnf_service.jobs.boxes import normal_quaternion, rotation_columns
 
 Rows = list[list[float]]
 _AGREE = 1e-4
