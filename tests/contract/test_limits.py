@@ -16,16 +16,9 @@ from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
-from tests.redis_server import private_redis
 
 ALICE, BOB = {"Authorization": "Bearer one"}, {"Authorization": "Bearer two"}
 TOKENS = frozenset({"alice:one", "bob:two"})
-
-
-@pytest.fixture(scope="module")
-def redis_url() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
 
 
 @pytest.fixture

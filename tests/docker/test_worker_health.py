@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
@@ -15,7 +14,6 @@ from rq import Queue, Worker
 
 from regnf_state.queue import QUEUE_NAME
 from tests.docker.files import ROOT
-from tests.redis_server import private_redis
 
 SCRIPT = ROOT / "docker" / "worker_health.py"
 
@@ -28,19 +26,6 @@ def health() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.fixture(scope="module")
-def address() -> Iterator[str]:
-    with private_redis() as url:
-        yield url
-
-
-@pytest.fixture
-def redis(address: str) -> Iterator[Redis]:
-    with Redis.from_url(address) as client:
-        client.flushall()
-        yield client
 
 
 def worker_of(redis: Redis, hostname: str) -> Any:
@@ -82,8 +67,8 @@ def test_says_what_is_wrong(url: str | None, said: str) -> None:
     assert said in run.stderr
 
 
-def test_exit_status_follows_the_worker(address: str, redis: Redis) -> None:
-    environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": address}
+def test_exit_status_follows_the_worker(redis_url: str, redis: Redis) -> None:
+    environment = {"PYTHONPATH": str(ROOT), "REGNF_REDIS_URL": redis_url}
     run = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True, check=False)
     assert (run.returncode, run.stderr) == (1, "no worker of this host has reported lately\n")
     worker: Any = Worker([Queue(QUEUE_NAME, connection=redis)], connection=redis)

@@ -9,7 +9,6 @@ import pytest
 from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
-from tests.redis_server import private_redis
 from tests.worker.refusals import RefusingRedis
 
 
@@ -22,8 +21,9 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 @pytest.fixture
-def redis() -> Iterator[RefusingRedis]:
-    with private_redis() as url, RefusingRedis.from_url(url) as client:
+def redis(redis_url: str) -> Iterator[RefusingRedis]:
+    with RefusingRedis.from_url(redis_url) as client:
+        client.flushall()
         yield client
 
 

@@ -49,6 +49,16 @@ def test_a_job_succeeds(table: Bench) -> None:
     assert_next_job_runs(table)
 
 
+def test_a_job_succeeds_on_every_kind_of_redis(tmp_path: Path, redis_url: str) -> None:
+    with bench(tmp_path, redis_url=redis_url) as table:
+        table.redis.flushall()
+        table.add_ready_fields()
+        table.start_worker()
+        table.submit("succeed")
+        assert table.finished().status == "successful"
+        assert_next_job_runs(table)
+
+
 def test_the_parent_never_loads_torch(table: Bench) -> None:
     worker = table.start_worker("regnf_worker.main")
     maps = Path(f"/proc/{worker.pid}/maps").read_text()
