@@ -14,6 +14,8 @@ Operator = Callable[[Attributes, "list[Tensor | None]"], "Tensor | tuple[Tensor,
 
 _FLOAT_TYPES, _INT_TYPES, _BOOL_TYPE = (1, 10, 11, 16), (2, 3, 4, 5, 6, 7, 12, 13), 9
 """ONNX's numbers of types; here all real numbers are float32 and all whole ones int64."""
+MAX_ELEMENTS = 1 << 24
+"""Elements that any value of the graph may have, for one batch."""
 
 
 def needed(value: Tensor | None) -> Tensor:
@@ -21,6 +23,12 @@ def needed(value: Tensor | None) -> Tensor:
     if value is None:
         raise ValueError("an input is left out")
     return value
+
+
+def require_few(elements: float) -> None:
+    """Refuse a value before it is made. Raises ValueError."""
+    if elements > MAX_ELEMENTS:
+        raise ValueError(f"a value of more than {MAX_ELEMENTS} numbers")
 
 
 def together(*values: Tensor | None) -> list[Tensor]:

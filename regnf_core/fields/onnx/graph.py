@@ -12,14 +12,12 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.onnx.elementwise import ELEMENTWISE, Operator
+from regnf_core.fields.onnx.elementwise import ELEMENTWISE, MAX_ELEMENTS, Operator
 from regnf_core.fields.onnx.linear import LINEAR
 from regnf_core.fields.onnx.shaping import SHAPING
 from regnf_core.schema.kinds.onnx import OnnxDescription
 
 OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
-_MAX_ELEMENTS = 1 << 24
-"""Elements that any value of the graph may have, for one batch."""
 _TYPES = {"float32": torch.float32, "int64": torch.int64, "bool": torch.bool}
 _FAULTS = (ArithmeticError, AssertionError, IndexError, KeyError, RuntimeError, TypeError, ValueError)
 _NO_MEMORY = "allocate memory"
@@ -112,8 +110,8 @@ def run_step(step: Step, values: Mapping[str, Tensor | None]) -> dict[str, Tenso
             raise MemoryError(str(error)) from error
         raise FieldFormatError(f"{step.where}: {str(error)[:200]}", reason="ONNX_GRAPH_INVALID") from error
     outputs = found if isinstance(found, tuple) else (found,)
-    if len(outputs) < len(step.outputs) or any(value.numel() > _MAX_ELEMENTS for value in outputs):
-        message = f"{step.where}: fewer outputs than named, or more than {_MAX_ELEMENTS} numbers"
+    if len(outputs) < len(step.outputs) or any(value.numel() > MAX_ELEMENTS for value in outputs):
+        message = f"{step.where}: fewer outputs than named, or more than {MAX_ELEMENTS} numbers"
         raise FieldFormatError(message, reason="ONNX_GRAPH_INVALID")
     return dict(zip(step.outputs, outputs, strict=False))
 

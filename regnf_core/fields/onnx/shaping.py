@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from regnf_core.fields.onnx.elementwise import Attributes, Operator, needed, together
+from regnf_core.fields.onnx.elementwise import Attributes, Operator, needed, require_few, together
 
 Inputs = list[Tensor | None]
 
@@ -130,7 +130,9 @@ def _expand(attributes: Attributes, inputs: Inputs) -> Tensor:
 
 
 def _tile(attributes: Attributes, inputs: Inputs) -> Tensor:
-    return needed(inputs[0]).tile(numbers(attributes, "repeats", inputs, 1) or [])
+    value, repeats = needed(inputs[0]), numbers(attributes, "repeats", inputs, 1) or []
+    require_few(value.numel() * math.prod(repeats))
+    return value.tile(repeats)
 
 
 def _constant_of_shape(attributes: Attributes, inputs: Inputs) -> Tensor:
@@ -140,6 +142,7 @@ def _constant_of_shape(attributes: Attributes, inputs: Inputs) -> Tensor:
 
 def _range(_: Attributes, inputs: Inputs) -> Tensor:
     start, limit, delta = together(*inputs)
+    require_few((limit.item() - start.item()) / delta.item())
     return torch.arange(start.item(), limit.item(), delta.item(), dtype=start.dtype)
 
 

@@ -9,10 +9,12 @@ import onnx
 import onnxruntime
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field
+from regnf_core.fields.onnx.elementwise import MAX_ELEMENTS
 from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS
 from regnf_core.importing.families.onnx import convert_onnx
 from regnf_core.importing.upload_description import UploadDescription
@@ -241,6 +243,10 @@ def test_other_precisions_are_evaluated_in_single() -> None:
         ("y = Reshape x s", {"s": ints(7, 5)}),
         ("y = Tile x s", {"s": ints(1, 1 << 20)}),
         ("h = Expand x s" + SUM, {"s": ints(1 << 30, 1, 3), "axes": ints(0)}),
+        (
+            "i = Range zero many one; h = Cast i to:1; y = Add x h",
+            {"zero": ints(0), "many": ints(1 << 30), "one": ints(1)},
+        ),
         ("i = Cast x to:7; y = Gather w i", {"w": ROW}),
         ("y = BatchNormalization x w w w w training_mode:1", {"w": W[:, 0]}),
         ("h = Transpose x perm:[0,5]" + SUM, {"axes": AXES}),
@@ -248,7 +254,20 @@ def test_other_precisions_are_evaluated_in_single() -> None:
     ],
 )
 def test_graphs_that_contradict_themselves(text: str, initializers: Initializers) -> None:
-    field = field_of(model(text, initializers, made=None))
-    with pytest.raises(FieldFormatError) as caught:
-        field.signed_distance(points(2000) * 50)
+    """They are refused before a value is made that is larger than any may be."""
+    with LargestStorage() as made, pytest.raises(FieldFormatError) as caught:
+        field_of(model(text, initializers, made=None)).signed_distance(points(2000) * 50)
     assert caught.value.reason == "ONNX_GRAPH_INVALID"
+    assert made.bytes <= 8 * MAX_ELEMENTS
+
+
+class LargestStorage(TorchDispatchMode):
+    """The memory of the largest tensor that any operation makes."""
+
+    bytes = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = function(*args, **(kwargs or {}))
+        if isinstance(made, torch.Tensor):
+            self.bytes = max(self.bytes, made.untyped_storage().nbytes())
+        return made
