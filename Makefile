@@ -7,9 +7,9 @@ setup:
 demo: setup
 	@.venv/bin/regnf demo --state-dir .demo
 
-test: setup lint
+test: setup
 	@scripts/system-packages.sh test
-	@.venv/bin/python -m pytest
+	@scripts/run-tests.sh
 
 lint: setup
 	@.venv/bin/ruff check .
