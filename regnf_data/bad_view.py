@@ -19,8 +19,8 @@ _AZIMUTHS = 16
 _HEIGHTS_M = (0.35, 1.3)
 _NEARER = (1.0, 0.8, 0.65)
 _SAMPLES = 2000
-_LEAST_SHOWN = 0.8
-_LEAST_SEEN = 0.02
+_MIN_SHOWN = 0.8
+_MIN_SEEN = 0.02
 
 
 def bad_view(scene: MeshScene, thing: Thing, size: Size, intrinsics: Array, floor: float) -> Array:
@@ -42,7 +42,7 @@ def bad_view(scene: MeshScene, thing: Thing, size: Size, intrinsics: Array, floo
         for pose in _candidates(scene, bounds.mean(axis=0), distance, floor):
             seen = seen_points(scene, pose, size, intrinsics, samples).mean()
             shown = seen_points(alone, pose, size, intrinsics, samples).mean()
-            if seen >= max(_LEAST_SHOWN * shown, _LEAST_SEEN) and seen < least:
+            if seen >= max(_MIN_SHOWN * shown, _MIN_SEEN) and seen < least:
                 best, least = pose, seen
         if best is not None:
             return best

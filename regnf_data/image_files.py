@@ -37,7 +37,7 @@ def resolve(folder: Path, name: Any, what: str) -> Path:
     Raises DatasetError (DATASET_METADATA_INVALID, DATASET_PATH_OUTSIDE, DATASET_IMAGE_MISSING).
     """
     if not isinstance(name, str) or not name or "\0" in name:
-        raise DatasetError(f"{what} is no path", reason="DATASET_METADATA_INVALID")
+        raise DatasetError(f"{what} is not a path", reason="DATASET_METADATA_INVALID")
     try:
         path = (folder / name).resolve()
         inside = path.is_relative_to(folder.resolve())

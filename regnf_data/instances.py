@@ -52,7 +52,7 @@ def write_instance(instance: Instance) -> dict[str, Any]:
 def box_of_corners(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
     """Center (3,), edge lengths (3,) and axes (3, 3), as columns, of the box whose corners (8, 3) come in any order.
 
-    Raises DatasetError (DATASET_INSTANCE_INVALID) if they are no box's.
+    Raises DatasetError (DATASET_INSTANCE_INVALID) if they are not those of a box.
     """
     offsets = corners[1:] - corners[0]
     lengths = np.linalg.norm(offsets, axis=1)
@@ -86,7 +86,7 @@ def _entries(given: Any) -> Iterator[tuple[str | None, Any]]:
 
 def _read(entry: Any, name: str | None) -> Instance:
     if not isinstance(entry, dict):
-        raise DatasetError("an instance is no JSON object", reason=_REASON)
+        raise DatasetError("an instance is not a JSON object", reason=_REASON)
     label = str(next((entry[key] for key in _LABELS if entry.get(key) is not None), name or "instance"))
     label = "".join(letter if letter.isprintable() else "?" for letter in label[:_LONGEST_LABEL])
     object_world = entry.get("T_object_world")

@@ -14,7 +14,7 @@ _RIGID_TOLERANCE = 1e-3
 
 
 _LARGEST = 1e9
-"""Larger numbers are no places and no pixels, and their products overflow."""
+"""Larger numbers are neither places nor pixels, and their products overflow."""
 
 
 def array(value: Any, shapes: tuple[tuple[int, ...], ...], what: str, reason: str) -> NDArray[np.float64]:
@@ -38,7 +38,7 @@ def matrix4(value: Any, what: str, reason: str) -> NDArray[np.float64]:
     matrix = np.eye(4)
     matrix[: len(given)] = given
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-9):
-        raise DatasetError(f"{what} is no affine transform: its last row is not 0 0 0 1", reason=reason)
+        raise DatasetError(f"{what} is not an affine transform: its last row is not 0 0 0 1", reason=reason)
     return matrix
 
 
@@ -57,10 +57,10 @@ def similarity(value: Any, what: str, reason: str) -> NDArray[np.float64]:
     matrix = matrix4(value, what, reason)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     if determinant <= 0.0:
-        raise DatasetError(f"{what} is no similarity: its determinant is not positive", reason=reason)
+        raise DatasetError(f"{what} is not a similarity: its determinant is not positive", reason=reason)
     rotation = matrix[:3, :3] / np.cbrt(determinant)
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=_RIGID_TOLERANCE):
-        raise DatasetError(f"{what} is no similarity: it shears or scales unevenly", reason=reason)
+        raise DatasetError(f"{what} is not a similarity: it shears or scales unevenly", reason=reason)
     return matrix
 
 
@@ -68,7 +68,7 @@ def whole_number(value: Any, what: str, reason: str) -> int:
     """A positive whole number."""
     whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
     if isinstance(value, bool) or not whole:
-        raise DatasetError(f"{what} is no whole number", reason=reason)
+        raise DatasetError(f"{what} is not a whole number", reason=reason)
     if value < 1:
         raise DatasetError(f"{what} is not positive", reason=reason)
     return int(value)

@@ -55,7 +55,7 @@ def read_layout(path: str | os.PathLike[str], meshes: str | os.PathLike[str]) ->
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{source.name} is not JSON: {error}", reason=_REASON) from error
     if not isinstance(room, dict) or not isinstance(room.get("walls", []), list):
-        raise DatasetError(f"{source.name} is no layout: an object with floor, walls, instances", reason=_REASON)
+        raise DatasetError(f"{source.name} is not a layout: an object with floor, walls, instances", reason=_REASON)
     instances = room.get("instances")
     if not isinstance(instances, list) or not instances:
         raise DatasetError(f"{source.name} lists no instances", reason=_REASON)
@@ -91,7 +91,7 @@ def _furnishing(instance: Any, meshes: Path) -> Furnishing:
 
 def _box(given: Any, what: str) -> Array:
     if not isinstance(given, dict):
-        raise DatasetError(f"{what} is no box", reason=_REASON)
+        raise DatasetError(f"{what} is not a box", reason=_REASON)
     return _corners(given, "box_min", "box_max", what)
 
 

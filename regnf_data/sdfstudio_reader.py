@@ -21,8 +21,8 @@ _INVALID = "DATASET_METADATA_INVALID"
 _INTRINSICS = "DATASET_INTRINSICS_INVALID"
 _CAMERAS = ("OPENCV", "PINHOLE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_MOST_BYTES = 64 << 20
-_MOST_PIXELS = 1 << 30
+_MAX_BYTES = 64 << 20
+_MAX_PIXELS = 1 << 30
 _USUAL_BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 """sdfstudio's own: scenes are scaled into this cube."""
 
@@ -62,14 +62,14 @@ def _metadata(folder: Path) -> dict[str, Any]:
     path = folder / METADATA
     if not path.is_file():
         raise DatasetError(f"{folder.name} holds no {METADATA}", reason="DATASET_NO_METADATA")
-    if path.stat().st_size > _MOST_BYTES:
-        raise DatasetError(f"{METADATA} has more than {_MOST_BYTES} bytes", reason="DATASET_TOO_LARGE")
+    if path.stat().st_size > _MAX_BYTES:
+        raise DatasetError(f"{METADATA} has more than {_MAX_BYTES} bytes", reason="DATASET_TOO_LARGE")
     try:
         content = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{METADATA} is not JSON: {error}", reason=_INVALID) from error
     if not isinstance(content, dict):
-        raise DatasetError(f"{METADATA} is no JSON object", reason=_INVALID)
+        raise DatasetError(f"{METADATA} is not a JSON object", reason=_INVALID)
     return content
 
 
@@ -88,7 +88,7 @@ def _frames(metadata: dict[str, Any]) -> list[dict[str, Any]]:
     if not isinstance(frames, list) or not frames:
         raise DatasetError("the metadata lists no frames", reason="DATASET_NO_FRAMES")
     if not all(isinstance(frame, dict) for frame in frames):
-        raise DatasetError("a frame is no JSON object", reason=_INVALID)
+        raise DatasetError("a frame is not a JSON object", reason=_INVALID)
     return frames
 
 
@@ -100,9 +100,9 @@ def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) 
         height, width = (
             whole_number(value, name, _INVALID) for value, name in zip(stated, ("height", "width"), strict=True)
         )
-    if len(frames) * height * width > _MOST_PIXELS:
+    if len(frames) * height * width > _MAX_PIXELS:
         raise DatasetError(
-            f"{len(frames)} images of {height} x {width}: more than {_MOST_PIXELS} pixels", reason="DATASET_TOO_LARGE"
+            f"{len(frames)} images of {height} x {width}: more than {_MAX_PIXELS} pixels", reason="DATASET_TOO_LARGE"
         )
     return height, width
 
@@ -112,7 +112,7 @@ def _intrinsics(frame: dict[str, Any], metadata: dict[str, Any], index: int) -> 
     matrix = array(given, ((4, 4), (3, 3), (3, 4)), f"intrinsics of frame {index}", _INTRINSICS)[:3, :3]
     upright = np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], (0.0, 0.0, 0.0, 1.0))
     if not upright or matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
-        raise DatasetError(f"intrinsics of frame {index} are no camera matrix", reason=_INTRINSICS)
+        raise DatasetError(f"intrinsics of frame {index} are not a camera matrix", reason=_INTRINSICS)
     return matrix
 
 
@@ -123,7 +123,7 @@ def _pose_reason(frame: dict[str, Any]) -> str:
 def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
     scene_box = metadata.get("scene_box") or {}
     if not isinstance(scene_box, dict):
-        raise DatasetError("scene_box is no JSON object", reason=_INVALID)
+        raise DatasetError("scene_box is not a JSON object", reason=_INVALID)
     bounds = array(scene_box.get("aabb", _USUAL_BOUNDS), ((2, 3),), "aabb of scene_box", _INVALID)
     if not (bounds[0] < bounds[1]).all():
         raise DatasetError("aabb of scene_box: the lowest corner is not below the highest", reason=_INVALID)

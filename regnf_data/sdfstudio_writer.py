@@ -36,7 +36,7 @@ def write_dataset(images: PosedImages, folder: str | os.PathLike[str]) -> None:
 def check_target(folder: Path) -> None:
     """Raises DatasetError (DATASET_FOLDER_NOT_EMPTY) where a dataset would mix with other files, and OSError."""
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-        raise DatasetError(f"{folder} exists and is no empty folder", reason="DATASET_FOLDER_NOT_EMPTY")
+        raise DatasetError(f"{folder} exists and is not an empty folder", reason="DATASET_FOLDER_NOT_EMPTY")
     if not folder.parent.is_dir():
         raise DatasetError(f"no such folder: {folder.parent}", reason="DATASET_FOLDER_MISSING")
 

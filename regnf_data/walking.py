@@ -18,7 +18,7 @@ _CELL_M = 0.1
 _BODY_M = (0.3, 0.5, 0.75, 1.0, 1.25, 1.5, 1.7)
 """Heights above the floor at which the walker needs room."""
 _RADIUS_M = 0.2
-_LEAST_CELLS = 100
+_MIN_CELLS = 100
 _NEIGHBORS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
@@ -39,7 +39,7 @@ class WalkingGround:
         areas, _ = ndimage.label(clearance >= _RADIUS_M, structure=np.ones((3, 3)))
         sizes = np.bincount(areas.ravel(), minlength=2)
         largest = int(sizes[1:].argmax()) + 1
-        if sizes[largest] < _LEAST_CELLS:
+        if sizes[largest] < _MIN_CELLS:
             raise DatasetError("there is no room to walk between the furniture", reason="DATASET_NO_FREE_PATH")
         self._free = areas == largest
         self.cells: Array = grid[self._free]

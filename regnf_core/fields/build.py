@@ -17,7 +17,7 @@ from regnf_core.fields.neural_points import build_neural_points
 from regnf_core.fields.neus_facto import build_neus_facto
 from regnf_core.fields.observation import ObservedField, stored_observation
 from regnf_core.fields.onnx.graph import build_onnx
-from regnf_core.fields.scaled import AdjustedField
+from regnf_core.fields.scaled import ScaledField
 from regnf_core.fields.voxel_blocks import build_voxel_blocks
 from regnf_core.fields.voxel_grid import build_voxel_grid
 from regnf_core.schema.description import FieldDescription
@@ -56,7 +56,7 @@ def build_field(description: FieldDescription, tensors: Mapping[str, Tensor]) ->
         field = ObservedField(field, stored_observation(description.observation, tensors[OBSERVATION]))
     if description.world_scale == 1.0 and description.sign == 1:
         return field
-    return AdjustedField(field, description.world_scale, description.sign)
+    return ScaledField(field, description.world_scale, description.sign)
 
 
 def _build_kind(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:

@@ -63,7 +63,7 @@ class MeshField:
 
         Raises FieldFormatError (MESH_INVALID) when the file is malformed or holds no triangles, and OSError.
         """
-        with open(path, "rb"):  # what cannot be read is no matter of its content
+        with open(path, "rb"):  # what cannot be read is not a fault of its content
             pass
         try:
             scene = trimesh.load_scene(os.fspath(path), process=False)

@@ -1,4 +1,4 @@
-"""What a field rests on: where a surface was measured, what was seen to be free, and where nobody looked.
+"""What a field rests on: where a surface was measured, what was seen to be free, and what is unobserved.
 
 A field has a value everywhere, whether anything was measured there or not. Fields that were fitted to images or depths
 can say which is which; those that cannot have no observation.

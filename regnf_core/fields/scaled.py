@@ -10,7 +10,7 @@ from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.geometry.sim3 import Sim3
 
 
-class AdjustedField:
+class ScaledField:
     """S(x) = sign * scale * f(x / scale): ``scale`` is the length of one unit of f's coordinates, in the new unit.
 
     Coordinates and distances scale together, so the gradient's norm stays what it was.
@@ -37,9 +37,9 @@ class AdjustedField:
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
 
-    def to(self, device: torch.device | str) -> AdjustedField:
+    def to(self, device: torch.device | str) -> ScaledField:
         """The same field with its parameters on another device."""
-        return AdjustedField(self.field.to(device), self.scale, self.sign)
+        return ScaledField(self.field.to(device), self.scale, self.sign)
 
     def signed_distance(self, points: Tensor) -> Tensor:
         """Signed distance (N,) float32 at points (N, 3), new unit."""

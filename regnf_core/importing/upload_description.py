@@ -62,7 +62,7 @@ class UploadDescription:
     bounds: _Box | None = None
     """Lowest and highest corner of the region where the field has meaning, in its own frame, after ``world_scale``."""
     world_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
-    """Length, in the unit wanted, of one unit of the checkpoint's coordinates; distances scale with it."""
+    """Length, in the unit overrides, of one unit of the checkpoint's coordinates; distances scale with it."""
     sign: Annotated[int, Ge(-1), Le(1), AfterValidator(_whole_sign)] | None = None
     """1: the checkpoint's values are positive in free space; -1: they are negative there."""
     up_axis: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
@@ -76,7 +76,7 @@ class UploadDescription:
     label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None
     hash: GridDescription = field(default_factory=GridDescription)
 
-    def said(self) -> dict[str, Any]:
+    def non_default(self) -> dict[str, Any]:
         """The entries that say something, as plain (JSON) values."""
         values = asdict(self)
         values["hash"] = {name: value for name, value in values["hash"].items() if value is not None}

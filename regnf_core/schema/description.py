@@ -35,7 +35,7 @@ class FieldDescription(ABC):
     sign: Literal[1, -1] = 1
     """-1: the function is negative in free space."""
     up_axis: Axis | None = None
-    """Which axis points up, where somebody said so. Changes nothing about the function."""
+    """Which axis points up, where it is known. Changes nothing about the function."""
     label: Annotated[str, MaxLen(200)] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     """Free notes on the field's origin."""

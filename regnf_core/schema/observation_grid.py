@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 OBSERVATION = "observation"
 """The tensor's name, and the description's entry."""
 UNSEEN, FREE, SURFACE = 0, 1, 2
-"""A voxel's states: nobody looked; somebody looked through; a surface was measured in it."""
+"""A voxel's states: unobserved; seen to be free; a surface was measured in it."""
 _BITS, _PER_WORD = 2, 16
-_MOST = 512
+_MAX_VOXELS = 512
 _Coordinate = Annotated[float, Ge(-1e6), Le(1e6)]  # which no NaN is
-_Count = Annotated[int, Ge(1), Le(_MOST)]
+_Count = Annotated[int, Ge(1), Le(_MAX_VOXELS)]
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ def read_checkpoint(path: Path, key: str) -> dict[str, Any]:
     try:
         content = torch.load(path, weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError) as error:
-        raise InvalidInputError(f"{path.name} is no checkpoint of a fit", reason="CHECKPOINT_INVALID") from error
+        raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID") from error
     if not isinstance(content, dict) or content.get("version") != _VERSION:
-        raise InvalidInputError(f"{path.name} is no checkpoint of a fit", reason="CHECKPOINT_INVALID")
+        raise InvalidInputError(f"{path.name} is not a checkpoint of a fit", reason="CHECKPOINT_INVALID")
     if content.get("key") != key:
         raise InvalidInputError(
             f"{path.name} belongs to a fit of other data or options", reason="CHECKPOINT_OF_ANOTHER_FIT"

@@ -8,9 +8,9 @@ from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
 
 GRID_RADIUS = 2.0
-_LEAST_PIXELS = 100
-_LEAST_DEPTH_SHARE = 1e-4
-_LEAST_SPREAD = 2.0
+_MIN_PIXELS = 100
+_MIN_DEPTH_SHARE = 1e-4
+_MIN_SPREAD = 2.0
 """Standard deviation of the colors, of 255."""
 
 
@@ -25,15 +25,15 @@ def check_images(images: PosedImages) -> None:
     _check_cameras(images)
     _check_bounds(images.bounds)
     if images.depths is not None:
-        if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _LEAST_DEPTH_SHARE:
+        if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _MIN_DEPTH_SHARE:
             raise DatasetError("no image has depths worth the name", reason="DATASET_DEPTH_MISSING")
-    elif float(images.colors.reshape(-1, 3).std(axis=0).max()) < _LEAST_SPREAD:
+    elif float(images.colors.reshape(-1, 3).std(axis=0).max()) < _MIN_SPREAD:
         raise DatasetError("the images have no depths and are all of one color", reason="DATASET_NO_COLOR_VARIETY")
 
 
 def check_seen(pixels: int) -> None:
     """Raise DatasetError (DATASET_NOTHING_IN_BOUNDS) when too few pixels show anything within the bounds."""
-    if pixels < _LEAST_PIXELS:
+    if pixels < _MIN_PIXELS:
         raise DatasetError(f"only {pixels} pixels show anything within the bounds", reason="DATASET_NOTHING_IN_BOUNDS")
 
 

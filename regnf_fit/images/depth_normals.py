@@ -15,7 +15,7 @@ _REACH = 2
 _SAME_SURFACE = 0.04
 """Depths that differ by a larger share lie on different surfaces: on one seen at 60 degrees a pixel of a common camera
 makes a hundredth."""
-_LEAST_PIXELS = 8
+_MIN_PIXELS = 8
 _STEEPEST = 0.1
 _DEPTH_BINS = 20
 
@@ -65,7 +65,7 @@ def _of_one(depth: NDArray[np.float32], camera: Floats) -> tuple[NDArray[np.floa
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth, np.float64), where=valid)
     x, y = rays[..., 0], rays[..., 1]
     count, sums = _moments(x, y, inverse, valid)
-    known = valid & (count >= _LEAST_PIXELS)
+    known = valid & (count >= _MIN_PIXELS)
     mx, my, mi, xx, yy, xy, xi, yi, ii = sums / np.where(known, count, 1.0)
     # all relative to the pixel itself, see _moments
     xx, yy, xy = xx - mx * mx, yy - my * my, xy - mx * my

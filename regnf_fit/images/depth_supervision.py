@@ -26,7 +26,7 @@ _PRECISE = 0.25
 """Bands: the noise up to which a point tells where the surface is."""
 _ALONE = 3.0
 """Bands: noisier points count where no precise one is as near as this."""
-_MOST_TRUST = 4.0
+_MAX_TRUST = 4.0
 """At the most a depth counts so many times what the median one does, or so many times less."""
 
 
@@ -116,7 +116,7 @@ def _trust(deviations: Tensor) -> Tensor:
     """What depths of these deviations (R,) count: the maximum likelihood of L1, within limits, 1 in the mean."""
     if len(deviations) == 0 or not bool((deviations > 0.0).all()):
         return torch.ones_like(deviations)
-    weight = (deviations.median() / deviations).clamp(1.0 / _MOST_TRUST, _MOST_TRUST)
+    weight = (deviations.median() / deviations).clamp(1.0 / _MAX_TRUST, _MAX_TRUST)
     return weight / weight.mean()
 
 

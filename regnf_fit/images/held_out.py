@@ -14,7 +14,7 @@ from regnf_fit.images.rays import PixelRays
 _STEPS = 64
 _CHUNK = 4096
 _SHORTEST = 0.002
-"""Diagonals: the least step; a field that is no exact distance would otherwise be approached for ever."""
+"""Diagonals: the least step; a field that is not an exact distance would otherwise be approached for ever."""
 _BISECTIONS = 6
 
 

@@ -29,7 +29,7 @@ _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
 
 def observe(images: PosedImages, voxels: int) -> Observation | None:
     """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colors): what
-    a camera looked through is free, where a depth ends there is a surface, nobody looked at the rest.
+    a camera looked through is free, where a depth ends there is a surface, the rest is unobserved.
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
     Voxels are judged by their centers, in every image that shows them.

@@ -15,9 +15,9 @@ from regnf_fit.images.network import StartShape
 from regnf_fit.images.options import Start
 from regnf_fit.images.rays import PixelRays, rays_of_pixels
 
-_MOST_PIXELS = 3_000_000
+_MAX_PIXELS = 3_000_000
 _HELD_OUT_SHARE = 0.02
-_MOST_HELD_OUT = 4_000
+_MAX_HELD_OUT = 4_000
 _START_RADIUS = 0.2
 """Diagonals: smaller than most objects, so that what is seen grows from it."""
 
@@ -40,14 +40,14 @@ class PreparedImages:
 def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
     """The rays that meet the bounds, at most three million. Raises DatasetError, see :func:`check_images`."""
     check_images(images)
-    pixels = rng.permutation(images.colors[..., 0].size)[:_MOST_PIXELS]
+    pixels = rng.permutation(images.colors[..., 0].size)[:_MAX_PIXELS]
     planes = None if images.depths is None else local_planes(images.depths, images.intrinsics)
     rays = rays_of_pixels(images, pixels, planes)
     rays = rays.take(rays.far > rays.near)
     has_depth = images.depths is not None
     shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
     check_seen(int(shown.sum()) if has_depth else int((~rays.background).sum()))
-    judged = min(int(_HELD_OUT_SHARE * len(rays)), _MOST_HELD_OUT)
+    judged = min(int(_HELD_OUT_SHARE * len(rays)), _MAX_HELD_OUT)
     order = torch.arange(len(rays))
     return PreparedImages(
         training=rays.take(order[judged:]),

@@ -77,7 +77,7 @@ def _leading(data: memoryview, at: int, limits: PickleLimits) -> tuple[LeadingPi
 
 def _checked_keys(keys: object) -> list[str]:
     if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys) or len(set(keys)) != len(keys):
-        raise _malformed("the storages' keys are no list of names")
+        raise _malformed("the storages' keys are not a list of names")
     if len(keys) > MAX_ENTRIES:
         message = f"{len(keys)} storages; at most {MAX_ENTRIES} are read"
         raise FieldFormatError(message, reason="ARCHIVE_TOO_MANY_ENTRIES")

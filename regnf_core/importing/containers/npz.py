@@ -104,7 +104,7 @@ def _named(members: list[Member]) -> Mapping[str, Member]:
     named = {}
     for member in members:
         if "/" in member.name or not member.name.endswith(_SUFFIX):
-            raise malformed(f"{member.name[:80]} is no array of a .npz file", "ARCHIVE_ENTRY_NAME")
+            raise malformed(f"{member.name[:80]} is not an array of a .npz file", "ARCHIVE_ENTRY_NAME")
         named[member.name.removesuffix(_SUFFIX)] = member
     return named
 

@@ -68,7 +68,7 @@ def _parse(text: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise _malformed("the header is not JSON") from error
     if not isinstance(header, dict):
-        raise _malformed("the header is no JSON object")
+        raise _malformed("the header is not a JSON object")
     return header
 
 
@@ -79,7 +79,7 @@ def _check_metadata(metadata: object) -> None:
 
 def _tensor(name: str, entry: object, base: int) -> StoredTensor:
     if not name.isprintable() or len(name) > _MAX_NAME:
-        raise _malformed("a tensor's name is no plain text")
+        raise _malformed("a tensor's name is not plain text")
     match entry:
         case {"dtype": str() as dtype, "shape": list() as shape, "data_offsets": [begin, end], **rest} if not rest:
             numbers = [*shape, begin, end]

@@ -8,7 +8,7 @@ import struct
 MESH_FORMATS = ("glb", "obj", "ply", "stl")
 
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
-_STL_MOST = 1 << 26
+_MAX_STL_FACETS = 1 << 26
 _OBJ_NUMBERS = {b"v": 3, b"vn": 3, b"vt": 1}
 _OBJ_WORDS = (b"o", b"g", b"mtllib", b"usemtl", b"s")
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
@@ -28,7 +28,7 @@ def sniff_mesh(head: bytes) -> str | None:
 
 
 def _is_obj(head: bytes) -> bool:
-    """Text whose first line that is no comment says what a line of an OBJ file may say."""
+    """Text whose first line that is not a comment says what a line of an OBJ file may say."""
     if _CONTROL & set(head):
         return False
     lines = [line.split() for line in head.splitlines() if line.strip()]
@@ -53,7 +53,7 @@ def _is_binary_stl(head: bytes) -> bool:
     """Facets whose corners are ordinary numbers and whose normals have length one, or none at all."""
     facets = (len(head) - _STL_FACETS_AT) // _STL_FACET_BYTES
     claimed = int.from_bytes(head[80:84], "little")
-    if facets < 1 or not facets <= claimed <= _STL_MOST:
+    if facets < 1 or not facets <= claimed <= _MAX_STL_FACETS:
         return False
     for number in range(facets):
         values = struct.unpack_from("<12f", head, _STL_FACETS_AT + _STL_FACET_BYTES * number)

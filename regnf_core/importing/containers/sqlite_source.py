@@ -1,4 +1,4 @@
-"""A SQLite file that nobody vouches for: from memory, read-only, tables alone, no functions, and counted.
+"""A SQLite file from an untrusted source: from memory, read-only, tables alone, no functions, and counted.
 
 SQLite's own advice for such files is followed: the schema is not trusted, limits are low, an authorizer refuses all but
 reading, and statements end after so much work. It runs in the gate's throw-away process like everything else. The file
@@ -22,7 +22,7 @@ _MAX_VALUE_BYTES = 1 << 20
 _WORK_STEP, _MAX_WORK_STEPS = 100_000, 10_000
 """Virtual machine instructions between two looks, and how many looks: a thousand million instructions in all."""
 _FAULTS = (sqlite3.Error, UnicodeError)
-"""The second where SQLite's own words on a fault quote bytes that are no text."""
+"""The second where SQLite's own words on a fault quote bytes that are not text."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: _MAX_VALUE_BYTES,
@@ -93,7 +93,7 @@ class TableSource:
             text = statement.upper() if isinstance(statement, str) else ""
             plain = kind == "index" or (kind == "table" and text.startswith("CREATE TABLE") and "GENERATED" not in text)
             if count >= _MAX_TABLES or not plain:
-                message = f"the file holds a {str(kind)[:20]} that is no plain table, or too many tables"
+                message = f"the file holds a {str(kind)[:20]} that is not a plain table, or too many tables"
                 raise FieldFormatError(message, reason="SQLITE_NOT_PLAIN")
             if kind == "table" and isinstance(name, str) and _NAME.fullmatch(name):
                 tables.add(name)
@@ -113,7 +113,7 @@ def _check_header(data: memoryview) -> None:
     page = int.from_bytes(data[16:18], "big")
     page = 65536 if page == 1 else page
     if bytes(data[:16]) != _MAGIC or page < 512 or page & (page - 1):
-        raise _malformed("the header is none")
+        raise _malformed("the header is malformed")
     if data[18] != 1 or data[19] != 1:
         raise _malformed("part of it may lie in a write-ahead log; say PRAGMA journal_mode = DELETE and save it again")
     pages = int.from_bytes(data[28:32], "big")

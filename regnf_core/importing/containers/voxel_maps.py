@@ -1,4 +1,4 @@
-"""What maps of voxel blocks share, whatever wrote them: voxels that nobody saw, the bounds, the truncation."""
+"""What maps of voxel blocks share, whatever wrote them: unobserved voxels, the bounds, the truncation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FAR_APART = 1e6
 _VOXELS_AT_ONCE = 1 << 21
 _MIDDLE = 0.5
 """Of a truncated distance's range: within it slopes are neither cut off nor averaged with what is cut off."""
-_FEWEST_SLOPES = 100
+_MIN_SLOPES = 100
 
 
 def fill_unseen(values: Float32Array, seen: BoolArray, voxel_size: float, outward: int = 1) -> None:
@@ -60,7 +60,7 @@ def tell_truncation(values: Float32Array, seen: BoolArray) -> tuple[float, float
     the most usual one, where too little surface lies within the blocks.
     """
     slopes = _slopes(values, seen)
-    if slopes.size < _FEWEST_SLOPES:
+    if slopes.size < _MIN_SLOPES:
         return USUAL_TRUNCATION, None
     median = float(np.median(slopes))
     best = min(_TRUNCATIONS, key=lambda voxels: abs(math.log(max(voxels * median, 1e-9))))

@@ -118,7 +118,7 @@ def _tile(data: memoryview, headers: list[Header], data_end: int) -> list[Member
 def _member(header: Header, offset: int) -> Member:
     name = _decoded(header)
     if not all(_PART.fullmatch(part) and part not in (".", "..") for part in name.split("/")):
-        raise malformed("an entry's name leaves the archive's folder or is no name", "ARCHIVE_ENTRY_NAME")
+        raise malformed("an entry's name leaves the archive's folder or is not a valid name", "ARCHIVE_ENTRY_NAME")
     return Member(name, header.method, offset, header.compressed_size, header.size, header.crc32)
 
 

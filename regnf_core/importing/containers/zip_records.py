@@ -96,7 +96,7 @@ def _read_directory_end64(data: Bytes, locator_at: int) -> Directory:
 def read_central_header(data: Bytes, at: int, limit: int) -> Header:
     """The central header at ``at``; nothing of it may reach past ``limit``."""
     if at + _CENTRAL.size > limit or data[at : at + 4] != _CENTRAL_SIGNATURE:
-        raise malformed("the central directory holds something that is no entry")
+        raise malformed("the central directory holds something that is not an entry")
     values = _CENTRAL.unpack_from(data, at)
     flags, method, crc32, packed, size = values[3], values[4], values[7], values[8], values[9]
     name_length, extra_length, comment_length, disk, offset = *values[10:14], values[16]

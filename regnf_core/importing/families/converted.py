@@ -33,7 +33,7 @@ class ConvertedField:
     """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
     one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
     sign_is_open: bool = False
-    """Whether trainers of this family save fields of either sign, and nobody said which this is."""
+    """Whether trainers of this family save fields of either sign, and the upload does not say which this is."""
 
 
 def converted_of(

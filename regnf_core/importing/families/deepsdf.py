@@ -13,7 +13,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.pickle_values import TensorRef
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
@@ -24,35 +24,35 @@ _PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of one shape, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, LATENT_MISSING, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and
     what TensorSource raises.
     """
     network = checkpoint.get("model_state_dict")
-    prefix = next((p for p in _PREFIXES if below(network, p)), None)
+    prefix = next((p for p in _PREFIXES if strip_prefix(network, p)), None)
     if prefix is None:
         if network is None and _CODES in checkpoint:
             message = "DeepSDF's latent codes without its network; upload both in one file"
             raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("latent", "latent_index"))
-    state = below(network, prefix.removesuffix("lin"))
-    names = numbered(state, "lin")
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("latent", "latent_index"))
+    state = strip_prefix(network, prefix.removesuffix("lin"))
+    names = layer_names(state, "lin")
     layers = read_layers(state, names, source)
     width = layers.input_width - 3
     if width < 0:
         raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 or more", "TENSOR_SHAPE")
-    latent, whence = _latent(checkpoint, source, wanted, width)
+    latent, whence = _latent(checkpoint, source, overrides, width)
     whole = [i for i, extra in enumerate(layers.extra_columns) if extra == layers.input_width]
     seeing = [i for i, extra in enumerate(layers.extra_columns) if extra]
     require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
     norms = _norms(state, layers, source)
     description = {
         "kind": "mlp",
-        **shared_entries(wanted, UNIT_CUBE),
+        **shared_entries(overrides, UNIT_CUBE),
         "activation": "relu",
         "input_at": seeing,
         "normalized": sorted({int(name.split(".")[1]) for name in norms}),
@@ -68,14 +68,14 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
 
 
 def _latent(
-    checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription, width: int
+    checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription, width: int
 ) -> tuple[Float32Array, str]:
     """The shape's code (width,), and where it is from."""
-    if wanted.latent is not None:
-        if wanted.latent_index is not None or len(wanted.latent) != width:
+    if overrides.latent is not None:
+        if overrides.latent_index is not None or len(overrides.latent) != width:
             message = f"description.latent: expected {width} numbers, and no latent_index beside them"
             raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
-        return np.array(wanted.latent, dtype=np.float32), "latent code from the description"
+        return np.array(overrides.latent, dtype=np.float32), "latent code from the description"
     if width == 0:
         return np.zeros(0, dtype=np.float32), "no latent code: a network of one shape"
     if _CODES not in checkpoint:
@@ -85,7 +85,7 @@ def _latent(
         )
         raise FieldFormatError(message, reason="LATENT_MISSING")
     codes = _all_codes(checkpoint[_CODES], source, width)
-    index = wanted.latent_index or 0
+    index = overrides.latent_index or 0
     if index >= len(codes):
         message = f"description.latent_index: {index}, but the file has {len(codes)} codes, counted from 0"
         raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
@@ -94,7 +94,7 @@ def _latent(
 
 def _all_codes(stored: object, source: TensorSource, width: int) -> Float32Array:
     """(N, width): an embedding's state, or, of older runs and of single reconstructions, a tensor (N, 1, width)."""
-    value = stored if isinstance(stored, TensorRef) else lookup(below(stored, ""), "weight")
+    value = stored if isinstance(stored, TensorRef) else lookup(strip_prefix(stored, ""), "weight")
     codes = source.array(_CODES, value)
     if codes.ndim == 3:
         require_shape(_CODES, codes, (None, 1, width))

@@ -21,7 +21,7 @@ _SPACINGS = ("spacing", "voxel_size")
 _Vector = npt.NDArray[np.float64]
 
 
-def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
     """The grid in ``arrays``, or None where there is no array ``sdf`` or ``values``.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE, BOUNDS_INVALID and
@@ -30,8 +30,8 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     name = next((name for name in _VALUES if name in arrays), None)
     if name is None:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY)
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY)
     values = arrays.array(name)
     require_shape(name, values, (None, None, None))
     if min(values.shape) < 2:
@@ -40,7 +40,7 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     far = origin + spacing * (np.array(values.shape) - 1)
     description = {
         "kind": "voxel_grid",
-        **shared_entries(wanted, [origin.tolist(), far.tolist()]),
+        **shared_entries(overrides, [origin.tolist(), far.tolist()]),
         "origin": origin.tolist(),
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},

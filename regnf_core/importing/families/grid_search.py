@@ -25,14 +25,14 @@ class GridHabits:
     interpolation: Interpolation
 
 
-def find_grids(parameters: int, width: int, habits: GridHabits, wanted: GridDescription) -> tuple[HashGridConfig, ...]:
+def find_grids(parameters: int, width: int, habits: GridHabits, given: GridDescription) -> tuple[HashGridConfig, ...]:
     """The grids with ``parameters`` numbers whose encoding is ``width`` wide, the most usual first, at most MAX_GRIDS.
 
-    ``wanted`` narrows the search. Exact layouts are preferred to those in which another machine's rounding moved a
+    ``given`` narrows the search. Exact layouts are preferred to those in which another machine's rounding moved a
     level by one node. At the end come the ways in which the training device may have indexed the same tables.
     Raises FieldFormatError (HASH_GRID_NOT_RECOGNIZED).
     """
-    candidates = list(_candidates(parameters, width, habits, wanted))
+    candidates = list(_candidates(parameters, width, habits, given))
     fitting = [c for c in candidates if c.entries * c.features_per_level == parameters]
     if not fitting:
         fitting = [c for c in (_rounded(c, parameters) for c in candidates) if c is not None]
@@ -55,12 +55,12 @@ def grid_name(config: HashGridConfig) -> str:
     return f"{name}, indexed {' and '.join(moved)}" if moved else name
 
 
-def _candidates(parameters: int, width: int, habits: GridHabits, wanted: GridDescription) -> Iterator[HashGridConfig]:
-    for features in _choices(wanted.features_per_level, habits.features_per_level):
+def _candidates(parameters: int, width: int, habits: GridHabits, given: GridDescription) -> Iterator[HashGridConfig]:
+    for features in _choices(given.features_per_level, habits.features_per_level):
         levels, rest = divmod(width, features)
         if rest or parameters % features or not 1 <= levels <= _MAX_LEVELS:
             continue
-        for base, top in _resolutions(habits, wanted):
+        for base, top in _resolutions(habits, given):
             if levels > 1 and top > base * MAX_GROWTH ** (levels - 1):
                 continue
             for log2_size in _LOG2_SIZES:
@@ -70,16 +70,16 @@ def _candidates(parameters: int, width: int, habits: GridHabits, wanted: GridDes
                     features_per_level=features,
                     log2_table_size=log2_size,
                     base_resolution=base,
-                    interpolation=wanted.interpolation or habits.interpolation,
+                    interpolation=given.interpolation or habits.interpolation,
                 )
 
 
-def _choices(wanted: int | None, usual: Sequence[int]) -> Sequence[int]:
-    return usual if wanted is None else (wanted,)
+def _choices(given: int | None, usual: Sequence[int]) -> Sequence[int]:
+    return usual if given is None else (given,)
 
 
-def _resolutions(habits: GridHabits, wanted: GridDescription) -> list[tuple[int, int]]:
-    pairs = dict.fromkeys((wanted.base_resolution or b, wanted.top_resolution or t) for b, t in habits.resolutions)
+def _resolutions(habits: GridHabits, given: GridDescription) -> list[tuple[int, int]]:
+    pairs = dict.fromkeys((given.base_resolution or b, given.top_resolution or t) for b, t in habits.resolutions)
     return [(base, top) for base, top in pairs if top >= base]
 
 

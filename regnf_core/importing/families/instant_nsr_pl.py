@@ -14,7 +14,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import grid_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
-from regnf_core.importing.families.layers import Layers, below, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape
 from regnf_core.importing.upload_description import UploadDescription
@@ -27,30 +27,30 @@ _HABITS = GridHabits((2, 4, 8, 1), ((32, 2048), (16, 2048), (16, 1024), (32, 409
 _FIRST_LEVELS, _STEPS_A_LEVEL = 4, 1000
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, BOUNDS_INVALID,
     HASH_GRID_NOT_RECOGNIZED and what TensorSource raises.
     """
-    state = below(checkpoint.get("state_dict"), _PREFIX)
+    state = strip_prefix(checkpoint.get("state_dict"), _PREFIX)
     if not state:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("level_mask", "hash"))
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("level_mask", "hash"))
     layers = _layers(state, source)
     bounds, radius = _scene_cube(checkpoint["state_dict"], source)
     table_name = _PROGRESSIVE_TABLE if _PROGRESSIVE_TABLE in state else _TABLE
     table = source.array(table_name, lookup(state, table_name))
     require_shape(table_name, table, (None,))
-    grids = find_grids(table.size, layers.input_width - 3, _HABITS, wanted.hash)
+    grids = find_grids(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", f"scene_aabb: the scene lies within {radius:g} of 0"]
     warnings: list[str] = []
-    mask = wanted.level_mask
+    mask = overrides.level_mask
     if mask is None and table_name == _PROGRESSIVE_TABLE:
         mask = _open_levels(checkpoint, grids[0].levels, why, warnings)
     entries = {
-        **shared_entries(wanted, bounds),
+        **shared_entries(overrides, bounds),
         "grid_radius": radius,
         "level_mask": mask,
         "source": {"family": FAMILY},
@@ -79,7 +79,7 @@ def _scene_cube(state: dict[Any, Any], source: TensorSource) -> tuple[list[list[
     require_shape("model.scene_aabb", box, (6,))
     radius = float(box.max())
     if radius <= 0.0 or not np.array_equal(box, np.repeat(np.array((-radius, radius), dtype=np.float32), 3)):
-        raise FieldFormatError("the scene_aabb is no cube round the origin", reason="BOUNDS_INVALID")
+        raise FieldFormatError("the scene_aabb is not a cube round the origin", reason="BOUNDS_INVALID")
     return [[-radius] * 3, [radius] * 3], radius
 
 

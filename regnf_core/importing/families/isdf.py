@@ -13,7 +13,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import TensorSource, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
@@ -25,17 +25,17 @@ _REACH = 4.0
 """Half an edge of the bounds that are assumed, meters: a room's."""
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what
     TensorSource raises.
     """
-    state = below(checkpoint.get("model_state_dict"), "")
-    if not below(state, "in_layer.") or not below(state, "out_alpha."):
+    state = strip_prefix(checkpoint.get("model_state_dict"), "")
+    if not strip_prefix(state, "in_layer.") or not strip_prefix(state, "out_alpha."):
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("input_scale", "output_scale"))
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("input_scale", "output_scale"))
     if any("B_layer" in name for name in state):
         raise FieldFormatError("an encoding along random directions is not supported", reason="FAMILY_NOT_SUPPORTED")
     first, second = (_names(state, block) for block in ("mid1.", "mid2."))
@@ -47,27 +47,27 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     if rest or degree < 1:
         message = f"in_layer.0 has {layers.input_width} columns, expected 3 and {2 * _DIRECTIONS} for each frequency"
         raise tensor_error(message, "TENSOR_SHAPE")
-    scale = wanted.input_scale or _INPUT_SCALE
+    scale = overrides.input_scale or _INPUT_SCALE
     description = {
         "kind": "mlp",
-        **shared_entries(wanted, [[-_REACH] * 3, [_REACH] * 3]),
+        **shared_entries(overrides, [[-_REACH] * 3, [_REACH] * 3]),
         "activation": "softplus",
         "positional_encoding": {"degree": degree, "base_frequency": scale, "off_axis": True},
         "input_at": [again],
         "source": {"family": FAMILY},
     }
-    factor = wanted.output_scale or _OUTPUT_SCALE
+    factor = overrides.output_scale or _OUTPUT_SCALE
     why = (
         f"keys in_layer, cat_layer and out_alpha, {degree} frequencies along {_DIRECTIONS} directions",
-        f"coordinates times {scale:g}, results times {factor:g}: {_told(wanted)}",
+        f"coordinates times {scale:g}, results times {factor:g}: {_told(overrides)}",
     )
     tensors = _with_input_scaled(layers, again, scale).times(factor).tensors()
-    return ConvertedField(FAMILY, why, description, tensors, _warnings(wanted))
+    return ConvertedField(FAMILY, why, description, tensors, _warnings(overrides))
 
 
 def _names(state: dict[str, Any], block: str) -> list[str]:
     """The layers of one of the two blocks, which may have none."""
-    return [f"{name}.0" for name in numbered(state, block, least=0)]
+    return [f"{name}.0" for name in layer_names(state, block, minimum=0)]
 
 
 def _with_input_scaled(layers: Layers, again: int, scale: float) -> Layers:
@@ -81,12 +81,12 @@ def _with_input_scaled(layers: Layers, again: int, scale: float) -> Layers:
     return Layers(tuple(weights), layers.biases)
 
 
-def _told(wanted: UploadDescription) -> str:
-    said = [name for name in ("input_scale", "output_scale") if getattr(wanted, name) is not None]
+def _told(overrides: UploadDescription) -> str:
+    said = [name for name in ("input_scale", "output_scale") if getattr(overrides, name) is not None]
     return f"{' and '.join(said)} as the description says" if said else "the usual ones"
 
 
-def _warnings(wanted: UploadDescription) -> tuple[str, ...]:
-    if wanted.bounds is not None:
+def _warnings(overrides: UploadDescription) -> tuple[str, ...]:
+    if overrides.bounds is not None:
         return ()
     return (f"BOUNDS_ASSUMED: no file says how large the scene is; [-{_REACH:g}, {_REACH:g}] along every axis",)

@@ -48,16 +48,16 @@ class Layers:
         return named | {f"layers.{i}.bias": bias for i, bias in enumerate(self.biases)}
 
 
-def numbered(state: Mapping[str, Any], prefix: str, least: int = 2) -> list[str]:
+def layer_names(state: Mapping[str, Any], prefix: str, minimum: int = 2) -> list[str]:
     """The names ``<prefix>0``, ``<prefix>1`` ... of the layers in ``state``.
 
-    Raises FieldFormatError: TENSOR_MISSING (a gap in the numbers) or FAMILY_NOT_SUPPORTED (fewer than ``least``).
+    Raises FieldFormatError: TENSOR_MISSING (a gap in the numbers) or FAMILY_NOT_SUPPORTED (fewer than ``minimum``).
     """
     numbers = {key.removeprefix(prefix).split(".")[0] for key in state if key.startswith(prefix)}
     layers = len(numbers)
     if layers > MAX_LAYERS or numbers != {str(i) for i in range(layers)}:
         raise FieldFormatError("the geometry network's layers are not numbered from 0 on", reason="TENSOR_MISSING")
-    if layers < least:
+    if layers < minimum:
         raise FieldFormatError(f"a geometry network of {layers} layers", reason="FAMILY_NOT_SUPPORTED")
     return [f"{prefix}{i}" for i in range(layers)]
 
@@ -108,7 +108,7 @@ def folded_weight(state: Mapping[str, Any], name: str, source: TensorSource) -> 
     return np.asarray(length * (direction / norm), dtype=np.float32)
 
 
-def below(values: object, prefix: str) -> dict[str, Any]:
+def strip_prefix(values: object, prefix: str) -> dict[str, Any]:
     """The entries of a state dictionary whose keys begin with ``prefix``, without it; empty where there are none."""
     if not isinstance(values, dict):
         return {}

@@ -11,18 +11,18 @@ from regnf_core.importing.meshes.geometry import malformed
 from regnf_core.importing.upload_description import UploadDescription
 
 
-def convert_mesh(format_: str, data: memoryview, wanted: UploadDescription) -> ConvertedField:
+def convert_mesh(format_: str, data: memoryview, overrides: UploadDescription) -> ConvertedField:
     """The exact distance to the mesh in ``data``, a file of the format that ``sniff_format`` named.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
-    POINT_CLOUD_WITHOUT_NORMALS, and what ``wanted`` is refused for.
+    POINT_CLOUD_WITHOUT_NORMALS, and what ``overrides`` is refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
         geometry = MESH_READERS[format_](data)
     if len(geometry.faces) > 0:
-        return mesh_field(geometry, f"a {format_} file", wanted)
+        return mesh_field(geometry, f"a {format_} file", overrides)
     if format_ != "ply" or len(geometry.vertices) == 0:
         raise malformed(f"the {format_} file holds no triangles")
     from regnf_core.importing.families.point_cloud import convert_cloud  # loads scipy and Open3D
 
-    return convert_cloud(geometry, f"a {format_} file", wanted)
+    return convert_cloud(geometry, f"a {format_} file", overrides)

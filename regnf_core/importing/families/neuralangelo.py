@@ -15,7 +15,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import grid_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape
 from regnf_core.importing.upload_description import UploadDescription
@@ -33,34 +33,34 @@ _UNTRAINED = 1.01e-4
 """tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNIZED and what
     TensorSource raises.
     """
     model = checkpoint.get("model")
-    prefix = next((p for p in _PREFIXES if below(model, p)), None)
+    prefix = next((p for p in _PREFIXES if strip_prefix(model, p)), None)
     if prefix is None:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("level_mask", "hash"))
-    state = below(model, prefix)
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("level_mask", "hash"))
+    state = strip_prefix(model, prefix)
     layers = _layers(state, source)
     table = source.array(_TABLE, lookup(state, _TABLE))
     require_shape(_TABLE, table, (None,))
-    grids = find_grids(table.size, layers.input_width - 3, _HABITS, wanted.hash)
+    grids = find_grids(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {prefix}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
     warnings: list[str] = []
-    mask = wanted.level_mask or _open_levels(checkpoint, table, grids[0], why, warnings)
-    entries = {**shared_entries(wanted, UNIT_CUBE), "level_mask": mask, "source": {"family": FAMILY}}
+    mask = overrides.level_mask or _open_levels(checkpoint, table, grids[0], why, warnings)
+    entries = {**shared_entries(overrides, UNIT_CUBE), "level_mask": mask, "source": {"family": FAMILY}}
     readings = grid_readings(table, grids, layers.tensors(), entries)
     return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
 
 
 def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     """The hidden layers, then the one for the distance. The last of ``linears`` makes color's features alone."""
-    names: Sequence[str] = [*numbered(state, "mlp.linears.")[:-1], "mlp.linear_sdf"]
+    names: Sequence[str] = [*layer_names(state, "mlp.linears.")[:-1], "mlp.linear_sdf"]
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     if len(names) > 4:

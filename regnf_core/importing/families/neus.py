@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
@@ -21,17 +21,17 @@ FAMILY = "neus"
 _MAX_DEGREE = 24
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
     """
     if "sdf_network_fine" not in checkpoint:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY)
-    state = below(checkpoint["sdf_network_fine"], "")
-    names = numbered(state, "lin")
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY)
+    state = strip_prefix(checkpoint["sdf_network_fine"], "")
+    names = layer_names(state, "lin")
     layers = read_layers(state, names, source)
     degree, rest = divmod(layers.input_width - 3, 6)
     if rest or not 0 <= degree <= _MAX_DEGREE:
@@ -40,7 +40,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     require_extra_columns(layers, names, dict.fromkeys(skips, layers.input_width))
     description = {
         "kind": "mlp",
-        **shared_entries(wanted, UNIT_CUBE),
+        **shared_entries(overrides, UNIT_CUBE),
         "activation": "softplus",
         "positional_encoding": {"degree": degree},
         "input_at": skips,

@@ -8,7 +8,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
@@ -16,27 +16,27 @@ from regnf_core.importing.upload_description import UploadDescription
 FAMILY = "nglod"
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint at its finest level, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what
     TensorSource raises.
     """
-    state = below(checkpoint, "")
-    if "features.0.fm" not in state or not below(state, "louts."):
+    state = strip_prefix(checkpoint, "")
+    if "features.0.fm" not in state or not strip_prefix(state, "louts."):
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("level_mask",))
-    levels = len(numbered(state, "features.", least=1))
-    if wanted.level_mask is not None and wanted.level_mask > levels:
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("level_mask",))
+    levels = len(layer_names(state, "features.", minimum=1))
+    if overrides.level_mask is not None and overrides.level_mask > levels:
         raise FieldFormatError(f"level_mask is above the {levels} levels", reason="INVALID_DESCRIPTION")
-    used = wanted.level_mask or levels
-    decoders = len(numbered(state, "louts.", least=1))
+    used = overrides.level_mask or levels
+    decoders = len(layer_names(state, "louts.", minimum=1))
     names = [f"louts.{min(used, decoders) - 1}.{part}" for part in (0, 2)]
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names)
     tensors = {f"volumes.{i}": _volume(state, i, layers.input_width - 3, source) for i in range(used)}
-    description = {"kind": "feature_volumes", **shared_entries(wanted, UNIT_CUBE), "source": {"family": FAMILY}}
+    description = {"kind": "feature_volumes", **shared_entries(overrides, UNIT_CUBE), "source": {"family": FAMILY}}
     why = (
         f"keys features.*.fm and louts.*: {used} of {levels} levels of detail, decoded by {names[0][:-2]}",
         "bounds [-1, 1]: the cube of the volumes",

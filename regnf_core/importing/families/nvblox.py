@@ -20,27 +20,27 @@ _DATA, _SETTINGS = "_data", "_metadata"
 _EDGE = 8
 _VOXELS = np.dtype([("distance", "<f4"), ("weight", "<f4")])
 _BLOCK_BYTES = _EDGE**3 * _VOXELS.itemsize
-_MOST_BLOCKS, _MOST_SETTINGS = 1 << 20, 1000
+_MAX_BLOCKS, _MAX_SETTINGS = 1 << 20, 1000
 _FARTHEST = 1 << 31
 
 
-def convert_database(tables: TableSource, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
+def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDescription) -> ConvertedField:
     """The map's truncated distances as a field.
 
     Raises FieldFormatError: FIELD_NOT_RECOGNIZED, FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING,
     TENSOR_SHAPE, TENSOR_TOO_LARGE, TENSOR_NOT_FINITE and what TableSource raises.
     """
     layer = _layer(tables)
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY)
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY)
     voxel_size = _block_size(tables, layer) / _EDGE
     blocks, values, seen = _read(tables, layer, tensor_bytes)
-    fill_unseen(values, seen, voxel_size, wanted.sign or 1)
+    fill_unseen(values, seen, voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks, seen)
     middle = voxel_size / 2.0
     description = {
         "kind": "voxel_blocks",
-        **shared_entries(wanted, [(middle + voxel_size * corner).tolist() for corner in (low, high)]),
+        **shared_entries(overrides, [(middle + voxel_size * corner).tolist() for corner in (low, high)]),
         "origin": [middle] * 3,
         "voxel_size": voxel_size,
         "source": {"family": FAMILY},
@@ -69,7 +69,7 @@ def _layer(tables: TableSource) -> str:
 def _block_size(tables: TableSource, layer: str) -> float:
     """Edge of a block, meters."""
     columns = ("param_name", "value_float")
-    settings = dict(tables.rows(layer + _SETTINGS, columns, _MOST_SETTINGS))
+    settings = dict(tables.rows(layer + _SETTINGS, columns, _MAX_SETTINGS))
     size = settings.get("block_size")
     if not isinstance(size, float) or not 1e-6 <= size <= 1e6:
         raise tensor_error(f"{layer}{_SETTINGS} has no block_size", "TENSOR_MISSING")
@@ -78,12 +78,12 @@ def _block_size(tables: TableSource, layer: str) -> float:
 
 def _read(tables: TableSource, layer: str, tensor_bytes: int) -> tuple[IntArray, Float32Array, BoolArray]:
     """The blocks (B, 3) in which something was seen, their distances (B, 8, 8, 8), x first, and which were seen."""
-    most = min(_MOST_BLOCKS, tensor_bytes // (_EDGE**3 * 4))
+    most = min(_MAX_BLOCKS, tensor_bytes // (_EDGE**3 * 4))
     indices: list[tuple[int, ...]] = []
     parts: list[npt.NDArray[Any]] = []
     for *index, data in tables.rows(layer + _DATA, ("index_x", "index_y", "index_z", "data"), most):
         if not all(isinstance(i, int) and abs(i) < _FARTHEST for i in index):
-            raise tensor_error("a block's index is no whole number", "TENSOR_SHAPE")
+            raise tensor_error("a block's index is not a whole number", "TENSOR_SHAPE")
         if not isinstance(data, bytes) or len(data) != _BLOCK_BYTES:
             raise tensor_error(f"a block is not {_EDGE}^3 voxels of a distance and a weight", "TENSOR_SHAPE")
         voxels = np.frombuffer(data, dtype=_VOXELS)

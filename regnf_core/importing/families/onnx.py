@@ -18,28 +18,28 @@ from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
 from regnf_core.schema.onnx_operators import OPERATORS
 
 _BATCH = 1024
-_LEAST_FIXED_BATCH = 64
+_MIN_FIXED_BATCH = 64
 _REAL_TYPES = (1, 10, 11)
 _SMALL = 64
 _MAX_TENSORS = 1_000
 _INT32 = np.iinfo(np.int32)
 
 
-def convert_onnx(data: memoryview, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
+def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescription) -> ConvertedField:
     """The field of the ONNX model in ``data``.
 
     Raises FieldFormatError: ONNX_MALFORMED, ONNX_NOT_SUPPORTED, ONNX_EXTERNAL_DATA, TENSOR_DTYPE, TENSOR_NOT_FINITE,
-    TENSOR_TOO_LARGE, and what ``wanted`` is refused for.
+    TENSOR_TOO_LARGE, and what ``overrides`` is refused for.
     """
-    require_family(wanted, "onnx")
-    refuse_other_entries(wanted, "onnx")
+    require_family(overrides, "onnx")
+    refuse_other_entries(overrides, "onnx")
     model = read_model(data)
     parts = _Parts(model, tensor_bytes)
     batch, told = _batch(model.input, model.output)
     description = {
         "kind": "onnx",
         "source": {"family": "onnx"},
-        **shared_entries(wanted, UNIT_CUBE),
+        **shared_entries(overrides, UNIT_CUBE),
         "nodes": parts.nodes,
         "constants": parts.constants,
         "input": parts.names[model.input.name],
@@ -48,7 +48,7 @@ def convert_onnx(data: memoryview, tensor_bytes: int, wanted: UploadDescription)
         "opset": model.opset,
     }
     why = (f"an ONNX model: {len(model.nodes)} nodes, operator set {model.opset}", told)
-    warnings = () if wanted.bounds else ("BOUNDS_ASSUMED: [-1, 1]^3; say bounds if the field's region is another",)
+    warnings = () if overrides.bounds else ("BOUNDS_ASSUMED: [-1, 1]^3; say bounds if the field's region is another",)
     return ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
 
 
@@ -62,14 +62,14 @@ def _batch(given: Port, made: Port) -> tuple[int, str]:
     fixed = given.shape[0] if given.shape is not None else None
     if fixed is None:
         return _BATCH, f"any number of points; evaluated {_BATCH} at a time"
-    if _LEAST_FIXED_BATCH <= fixed <= MAX_BATCH:
+    if _MIN_FIXED_BATCH <= fixed <= MAX_BATCH:
         return fixed, f"exactly {fixed} points at a time"
     return _BATCH, f"made for {fixed} points, evaluated for {_BATCH} at a time: export with an open number of points"
 
 
-def _fits(shape: tuple[int | None, ...], wanted: tuple[int | None, ...]) -> bool:
-    return len(shape) == len(wanted) and all(
-        have is None or want is None or have == want for have, want in zip(shape, wanted, strict=True)
+def _fits(shape: tuple[int | None, ...], overrides: tuple[int | None, ...]) -> bool:
+    return len(shape) == len(overrides) and all(
+        have is None or want is None or have == want for have, want in zip(shape, overrides, strict=True)
     )
 
 
@@ -156,5 +156,5 @@ def _plain(op: str, name: str, value: Attribute) -> Any:
         raise unsupported(f"the operator {op} with the attribute {name} of so many numbers")
     numbers = [] if isinstance(value, str) else value if isinstance(value, list) else [value]
     if not all(math.isfinite(number) for number in numbers):
-        raise unsupported(f"the operator {op} with the attribute {name} that is no finite number")
+        raise unsupported(f"the operator {op} with the attribute {name} that is not a finite number")
     return value

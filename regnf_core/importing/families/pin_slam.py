@@ -12,7 +12,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.pickle_values import Placeholder
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
@@ -37,7 +37,7 @@ class _Settings:
     distance_scale: float
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a map, or None where there are no neural points.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what
@@ -45,8 +45,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     """
     if "neural_points" not in checkpoint:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY)
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY)
     attributes = _attributes(checkpoint["neural_points"], _OBJECT)
     settings = _settings(attributes)
     layers = _decoder(checkpoint.get("sdf"), source, settings.distance_scale)
@@ -56,7 +56,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         raise tensor_error(f"sdf.layers.0 has {layers.input_width} columns, expected {width}", "TENSOR_SHAPE")
     description = {
         "kind": "neural_points",
-        **shared_entries(wanted, [(low - settings.cell_size).tolist(), (high + settings.cell_size).tolist()]),
+        **shared_entries(overrides, [(low - settings.cell_size).tolist(), (high + settings.cell_size).tolist()]),
         "cell_size": settings.cell_size,
         "buffer_size": settings.buffer_size,
         "reach": settings.neighbor_cells + settings.search_alpha,
@@ -112,10 +112,10 @@ def _number(values: Mapping[Any, Any], name: str) -> float:
 
 def _decoder(value: object, source: TensorSource, scale: float) -> Layers:
     """The decoder's layers, the factor of its result folded into the last."""
-    state = below(value, "")
+    state = strip_prefix(value, "")
     if not state:
         raise tensor_error("sdf, the decoder's weights, is missing", "TENSOR_MISSING")
-    names = [*numbered(state, "layers.", least=1), "lout"]
+    names = [*layer_names(state, "layers.", minimum=1), "lout"]
     layers = read_layers(state, names, source, has_biases="lout.bias" in state)
     require_extra_columns(layers, names)
     return layers.times(scale)
@@ -126,9 +126,9 @@ def _map(
 ) -> tuple[dict[str, Float32Array], Float32Array, Float32Array]:
     """The map's tensors by their names in the field file, and the points' lowest and highest coordinates (3,)."""
     held = {
-        **below(attributes, ""),
-        **below(attributes.get("_parameters"), ""),
-        **below(attributes.get("_buffers"), ""),
+        **strip_prefix(attributes, ""),
+        **strip_prefix(attributes.get("_parameters"), ""),
+        **strip_prefix(attributes.get("_buffers"), ""),
     }
     points = source.array("neural_points", lookup(held, "neural_points"))
     require_shape("neural_points", points, (None, 3))

@@ -14,18 +14,18 @@ from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
 
-_LEAST = 100
-_MOST = 300_000
+_MIN_POINTS = 100
+_MAX_POINTS = 300_000
 """Points beyond this are thinned: they cost time and the surface, 256 cells wide, hardly shows them."""
 _DEPTH = 8
 _REACH_SPACINGS, _REACH_SHARE = 4.0, 0.01
 """The surface ends where no point is within this many times their usual spacing, or this share of their diagonal."""
 
 
-def convert_cloud(geometry: Geometry, origin: str, wanted: UploadDescription) -> ConvertedField:
+def convert_cloud(geometry: Geometry, origin: str, overrides: UploadDescription) -> ConvertedField:
     """The field of points with normals that point to free space.
 
-    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, and what ``wanted`` is refused for.
+    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, and what ``overrides`` is refused for.
     """
     if geometry.normals is None:
         message = f"{origin} with points and no faces needs normals (nx, ny, nz) that point to free space"
@@ -43,7 +43,7 @@ def convert_cloud(geometry: Geometry, origin: str, wanted: UploadDescription) ->
     if len(faces) == 0:
         raise malformed("no surface passes near the points: are the normals theirs?")
     surface = Geometry(vertices * diagonal + low, faces, left_out=geometry.left_out)
-    found = mesh_field(surface, "their screened Poisson surface, 256 cells wide", wanted, "point_cloud")
+    found = mesh_field(surface, "their screened Poisson surface, 256 cells wide", overrides, "point_cloud")
     beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(unit)[0], 0.95)
     why = (f"{origin}: {len(geometry.vertices)} points with normals", *found.why)
     text = f"what lies between the points is a guess; 19 of 20 points are within {beside:.2g} % of the diagonal of it"
@@ -58,10 +58,10 @@ def _usable(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, 
             np.isfinite(points).all(axis=1) & (np.abs(points) < 1e30).all(axis=1) & np.isfinite(length) & (length > 0)
         )
     points, normals = points[sound], normals[sound] / length[sound, None]
-    if len(points) < _LEAST:
-        raise malformed(f"{len(points)} usable points, at least {_LEAST} are needed")
-    if len(points) > _MOST:
-        chosen = np.random.default_rng(0).permutation(len(points))[:_MOST]
+    if len(points) < _MIN_POINTS:
+        raise malformed(f"{len(points)} usable points, at least {_MIN_POINTS} are needed")
+    if len(points) > _MAX_POINTS:
+        chosen = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
         points, normals = points[chosen], normals[chosen]
     return points, normals
 

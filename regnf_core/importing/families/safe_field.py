@@ -20,8 +20,8 @@ _OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
 
 
-def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: UploadDescription) -> ConvertedField:
-    """The field in ``data``, the mapped bytes of ``path``, with what ``wanted`` overrides.
+def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, overrides: UploadDescription) -> ConvertedField:
+    """The field in ``data``, the mapped bytes of ``path``, with what ``overrides`` overrides.
 
     Raises FieldFormatError: the SAFETENSORS_* reasons, SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, TENSOR_*,
     FIELD_KIND_UNKNOWN, FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
@@ -29,21 +29,21 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, wanted: 
     header = read_header(data)
     if sum(tensor.size for tensor in header.values()) > tensor_bytes:
         raise FieldFormatError("the tensors exceed the limit", reason="TENSOR_TOO_LARGE")
-    description = _overruled(read_description(path), wanted)
+    description = _overruled(read_description(path), overrides)
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
     why = ("a regnf field file",)
     return ConvertedField(FAMILY, why, description, tensors)
 
 
-def _overruled(description: dict[str, Any], wanted: UploadDescription) -> dict[str, Any]:
+def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dict[str, Any]:
     """``description`` with what was said instead; a new scale takes the bounds along, unless they were said too."""
-    require_family(wanted, FAMILY)
+    require_family(overrides, FAMILY)
     refuse_other_entries(
-        wanted, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
+        overrides, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
     )
-    changed = description | wanted.said()
+    changed = description | overrides.non_default()
     changed.pop("family", None)
-    if wanted.bounds is None:
+    if overrides.bounds is None:
         ratio = changed["world_scale"] / description["world_scale"]
         changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]
     return changed

@@ -15,7 +15,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_field import grid_readings
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
 from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.pickle.tensors import TensorSource, as_tensor, lookup, require_shape
@@ -51,7 +51,7 @@ _VARIANTS = {
 }
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, HASH_GRID_NOT_RECOGNIZED and what
@@ -60,25 +60,25 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
     pipeline = checkpoint.get("pipeline")
     if isinstance(pipeline, (Placeholder, GlobalRef)):
         as_tensor("pipeline", pipeline)
-    prefix = next((p for p in _PREFIXES if below(pipeline, p + "glin")), None)
+    prefix = next((p for p in _PREFIXES if strip_prefix(pipeline, p + "glin")), None)
     if prefix is None:
         return None
-    state = below(pipeline, prefix)
-    refuse_other_entries(wanted, "a checkpoint of sdfstudio or nerfstudio", ("contraction", "level_mask", "hash"))
-    names = numbered(state, "glin")
-    variant, why = _tell_variant(state, len(names), wanted)
+    state = strip_prefix(pipeline, prefix)
+    refuse_other_entries(overrides, "a checkpoint of sdfstudio or nerfstudio", ("contraction", "level_mask", "hash"))
+    names = layer_names(state, "glin")
+    variant, why = _tell_variant(state, len(names), overrides)
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names, {SKIP_LAYER: layers.input_width})
     evidence = (f"keys {prefix}glin*, {len(names)} layers", why)
-    return _assemble(state, layers, variant, evidence, source, wanted)
+    return _assemble(state, layers, variant, evidence, source, overrides)
 
 
-def _tell_variant(state: dict[str, Any], layers: int, wanted: UploadDescription) -> tuple[_Variant, str]:
-    if wanted.family is not None:
-        if wanted.family not in _VARIANTS:
-            message = f"the file is one of {sorted(_VARIANTS)}, the description says {wanted.family}"
+def _tell_variant(state: dict[str, Any], layers: int, overrides: UploadDescription) -> tuple[_Variant, str]:
+    if overrides.family is not None:
+        if overrides.family not in _VARIANTS:
+            message = f"the file is one of {sorted(_VARIANTS)}, the description says {overrides.family}"
             raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-        return _VARIANTS[wanted.family], "the description names the family"
+        return _VARIANTS[overrides.family], "the description names the family"
     if not any(key.startswith("laplace_density.") for key in state):
         return _VARIANTS["nerfstudio_neus_facto"], "no laplace_density: nerfstudio, not sdfstudio"
     name = "sdfstudio_neus_facto"
@@ -95,7 +95,7 @@ def _assemble(
     variant: _Variant,
     why: tuple[str, ...],
     source: TensorSource,
-    wanted: UploadDescription,
+    overrides: UploadDescription,
 ) -> ConvertedField:
     warnings: list[str] = []
     width = layers.input_width - _PLAIN_WIDTH
@@ -106,17 +106,17 @@ def _assemble(
     require_shape("encoding.params", table, (None,))
     uses_sines = _uses_columns(layers, 3, _PLAIN_WIDTH)
     entries = {
-        **shared_entries(wanted, _bounds(state, source, wanted, warnings)),
+        **shared_entries(overrides, _bounds(state, source, overrides, warnings)),
         "positional_encoding": {"degree": _DEGREE, "two_pi": variant.two_pi, "used": uses_sines},
-        "contraction": wanted.contraction or variant.contraction,
-        "level_mask": wanted.level_mask,
+        "contraction": overrides.contraction or variant.contraction,
+        "level_mask": overrides.level_mask,
         "source": {"family": variant.name},
     }
     if _uses_columns(layers, _PLAIN_WIDTH, None):
-        grids = find_grids(table.size, width, variant.habits, wanted.hash)
+        grids = find_grids(table.size, width, variant.habits, overrides.hash)
         readings = grid_readings(table, grids, layers.tensors(), entries)
     else:
-        unused = asdict(_unused_grid(table.size, width, variant, wanted))
+        unused = asdict(_unused_grid(table.size, width, variant, overrides))
         description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}
         readings = (Reading("no grid", description, layers.tensors()),)
     return converted_of(variant.name, why, readings, tuple(warnings))
@@ -130,10 +130,10 @@ def _uses_columns(layers: Layers, start: int, stop: int | None) -> bool:
     return any(bool(weight[:, start:stop].any()) for weight in seen)
 
 
-def _unused_grid(size: int, width: int, variant: _Variant, wanted: UploadDescription) -> HashGridConfig:
+def _unused_grid(size: int, width: int, variant: _Variant, overrides: UploadDescription) -> HashGridConfig:
     """A grid that stands for the columns alone: no table is kept."""
     try:
-        return find_grids(size, width, variant.habits, wanted.hash)[0]
+        return find_grids(size, width, variant.habits, overrides.hash)[0]
     except FieldFormatError:
         if width > 32:
             raise
@@ -141,10 +141,10 @@ def _unused_grid(size: int, width: int, variant: _Variant, wanted: UploadDescrip
 
 
 def _bounds(
-    state: dict[str, Any], source: TensorSource, wanted: UploadDescription, warnings: list[str]
+    state: dict[str, Any], source: TensorSource, overrides: UploadDescription, warnings: list[str]
 ) -> Sequence[Sequence[float]]:
     if "aabb" not in state:
-        if wanted.bounds is None:
+        if overrides.bounds is None:
             warnings.append("BOUNDS_ASSUMED: the checkpoint has no aabb; [-1, 1] is assumed along every axis")
         return UNIT_CUBE
     box = source.array("aabb", state["aabb"])

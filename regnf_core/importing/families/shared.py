@@ -14,7 +14,7 @@ _SHARED = frozenset({"family", "bounds", "world_scale", "sign", "up_axis", "labe
 
 
 def shared_entries(
-    wanted: UploadDescription,
+    overrides: UploadDescription,
     bounds: Sequence[Sequence[float]],
     world_scale: float = 1.0,
     sign: int = 1,
@@ -23,27 +23,27 @@ def shared_entries(
 
     bounds: lowest and highest corner in the coordinates of the checkpoint's function · world_scale: length of one unit
     of those coordinates in the family's own unit · sign: -1 where the family's functions are negative in free space.
-    What ``wanted`` says goes before.
+    What ``overrides`` says goes before.
     """
-    scale = world_scale * (wanted.world_scale or 1.0)
+    scale = world_scale * (overrides.world_scale or 1.0)
     return {
-        "bounds": wanted.bounds or [[scale * value for value in corner] for corner in bounds],
+        "bounds": overrides.bounds or [[scale * value for value in corner] for corner in bounds],
         "world_scale": scale,
-        "sign": wanted.sign or sign,
-        "up_axis": wanted.up_axis,
-        "label": wanted.label,
+        "sign": overrides.sign or sign,
+        "up_axis": overrides.up_axis,
+        "label": overrides.label,
     }
 
 
-def refuse_other_entries(wanted: UploadDescription, family: str, meant: Sequence[str] = ()) -> None:
-    """Raise FieldFormatError (INVALID_DESCRIPTION) if ``wanted`` has an entry that is neither shared nor ``meant``."""
-    said = [name for name, value in wanted.said().items() if name not in _SHARED and name not in meant]
-    if said:
-        raise FieldFormatError(f"description.{said[0]} means nothing for {family}", reason="INVALID_DESCRIPTION")
+def refuse_other_entries(overrides: UploadDescription, family: str, meant: Sequence[str] = ()) -> None:
+    """Raise FieldFormatError (INVALID_DESCRIPTION) for an entry that neither all families share nor is ``meant``."""
+    others = [name for name, value in overrides.non_default().items() if name not in _SHARED and name not in meant]
+    if others:
+        raise FieldFormatError(f"description.{others[0]} means nothing for {family}", reason="INVALID_DESCRIPTION")
 
 
-def require_family(wanted: UploadDescription, family: str) -> None:
-    """Raise FieldFormatError (FAMILY_NOT_SUPPORTED) if ``wanted`` names another family than the file's."""
-    if wanted.family not in (None, family):
-        message = f"the file is {family}, the description says {wanted.family}"
+def require_family(overrides: UploadDescription, family: str) -> None:
+    """Raise FieldFormatError (FAMILY_NOT_SUPPORTED) if ``overrides`` names another family than the file's."""
+    if overrides.family not in (None, family):
+        message = f"the file is {family}, the description says {overrides.family}"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import TensorSource, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
@@ -17,24 +17,24 @@ _OMEGA = 30.0
 _PREFIX = "net.net."
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
     """
-    state = below(checkpoint, _PREFIX)
+    state = strip_prefix(checkpoint, _PREFIX)
     if not state:
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY)
-    names = [f"{name}.0" for name in numbered(state, "")]
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY)
+    names = [f"{name}.0" for name in layer_names(state, "")]
     layers = read_layers(state, names, source)
     if layers.input_width != 3:
         raise tensor_error(f"{_PREFIX}{names[0]} has {layers.input_width} columns, expected 3", "TENSOR_SHAPE")
     require_extra_columns(layers, names)
     description = {
         "kind": "mlp",
-        **shared_entries(wanted, UNIT_CUBE),
+        **shared_entries(overrides, UNIT_CUBE),
         "activation": "sine",
         "source": {"family": FAMILY},
     }
@@ -43,7 +43,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
         "bounds [-1, 1]: beyond the cube in which SIREN trains its sines repeat",
         f"sines of {_OMEGA:g} times the layers' results, as usual",
     )
-    return ConvertedField(FAMILY, why, description, _with_frequency(layers).tensors(), sign_is_open=wanted.sign is None)
+    return ConvertedField(
+        FAMILY, why, description, _with_frequency(layers).tensors(), sign_is_open=overrides.sign is None
+    )
 
 
 def _with_frequency(layers: Layers) -> Layers:

@@ -16,7 +16,7 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids, grid_name
-from regnf_core.importing.families.layers import Layers, below, numbered, read_layers, require_extra_columns
+from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
 from regnf_core.importing.upload_description import GridDescription, UploadDescription
@@ -28,26 +28,26 @@ _TOPS = (2048, 1024, 512, 4096, 256, 8192, 128)
 _HABITS = GridHabits((2, 4, 1, 8), tuple((16, top) for top in _TOPS), "linear")
 _USUAL_WIDTHS = (32, 16, 64, 128, 8)
 _USUAL_NEURONS = (64, 128, 32, 16)
-_MOST_HIDDEN = 8
+_MAX_HIDDEN = 8
 _PADDING = 16
 """tiny-cuda-nn's fused network takes and gives this many columns, or a multiple."""
 
 
-def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
     """The signed distance field of such a checkpoint, or None where the keys are not theirs.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE,
     HASH_GRID_NOT_RECOGNIZED and what TensorSource raises.
     """
-    state = below(checkpoint.get("model", checkpoint), "")
+    state = strip_prefix(checkpoint.get("model", checkpoint), "")
     own = all(name in state for name in _OWN)
     if not own and not all(name in state for name in _TCNN):
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("hash",))
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("hash",))
     read = _read_own if own else _read_tcnn
-    table, layers, grids = read(state, source, wanted.hash)
-    entries = {**shared_entries(wanted, UNIT_CUBE), "source": {"family": FAMILY}}
+    table, layers, grids = read(state, source, overrides.hash)
+    entries = {**shared_entries(overrides, UNIT_CUBE), "source": {"family": FAMILY}}
     readings = tuple(
         Reading(
             f"{grid_name(grid)}, growing by {grid.per_level_scale:.6g}",
@@ -65,9 +65,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, wanted: UploadDesc
 _Parts = tuple[Float32Array, Layers, Sequence[HashGridConfig]]
 
 
-def _read_own(state: dict[str, Any], source: TensorSource, wanted: GridDescription) -> _Parts:
+def _read_own(state: dict[str, Any], source: TensorSource, overrides: GridDescription) -> _Parts:
     """Table, network and possible grids of the trainer's own kernel."""
-    names = numbered(state, "backbone.")
+    names = layer_names(state, "backbone.")
     layers = read_layers(state, names, source, has_biases=False)
     require_extra_columns(layers, names)
     table = source.array("encoder.embeddings", state["encoder.embeddings"])
@@ -79,20 +79,20 @@ def _read_own(state: dict[str, Any], source: TensorSource, wanted: GridDescripti
         raise tensor_error("encoder.offsets do not divide encoder.embeddings into levels", "TENSOR_SHAPE")
     if layers.input_width != levels * features or levels > 32 or features > 32:
         raise tensor_error(f"{levels} levels of {features} features, but {layers.input_width} columns", "TENSOR_SHAPE")
-    grids = [grid for grid in _own_grids(levels, features, max(entries), wanted) if grid.level_entries() == entries]
+    grids = [grid for grid in _own_grids(levels, features, max(entries), overrides) if grid.level_entries() == entries]
     if not grids:
         raise _not_recognized(f"no usual hash grid has levels of {entries} entries")
     return table, layers, grids
 
 
-def _own_grids(levels: int, features: int, most: int, wanted: GridDescription) -> Iterator[HashGridConfig]:
+def _own_grids(levels: int, features: int, max_count: int, overrides: GridDescription) -> Iterator[HashGridConfig]:
     """Grids as the trainer lays them out: a level of resolution r has r + 1 nodes along an edge, and rows as long."""
-    log2_size = math.ceil(math.log2(max(most, 8)))
+    log2_size = math.ceil(math.log2(max(max_count, 8)))
     if log2_size > 24:
-        raise _not_recognized(f"a level of {most} entries is larger than any that is taken")
-    bases = (16, 8, 32, 4, 64) if wanted.base_resolution is None else (wanted.base_resolution,)
+        raise _not_recognized(f"a level of {max_count} entries is larger than any that is taken")
+    bases = (16, 8, 32, 4, 64) if overrides.base_resolution is None else (overrides.base_resolution,)
     for base in bases:
-        for top in _TOPS if wanted.top_resolution is None else (wanted.top_resolution,):
+        for top in _TOPS if overrides.top_resolution is None else (overrides.top_resolution,):
             growth = float(np.exp2(np.log2(top / base) / max(levels - 1, 1)))
             if not 1.0 <= growth <= 8.0:
                 continue
@@ -100,7 +100,7 @@ def _own_grids(levels: int, features: int, most: int, wanted: GridDescription) -
             yield HashGridConfig(levels, features, log2_size, base, growth, nodes, None, "linear")
 
 
-def _read_tcnn(state: dict[str, Any], source: TensorSource, wanted: GridDescription) -> _Parts:
+def _read_tcnn(state: dict[str, Any], source: TensorSource, overrides: GridDescription) -> _Parts:
     """Table, network and possible grids of tiny-cuda-nn's encoding and fused network."""
     table = source.array("encoder.params", lookup(state, "encoder.params"))
     network = source.array("backbone.params", lookup(state, "backbone.params"))
@@ -111,7 +111,7 @@ def _read_tcnn(state: dict[str, Any], source: TensorSource, wanted: GridDescript
         if layers is None:
             continue
         try:
-            exact = find_grids(table.size, width, _HABITS, wanted)
+            exact = find_grids(table.size, width, _HABITS, overrides)
         except FieldFormatError:
             continue
         return table, layers, [*_with_short_growth(exact), *exact]
@@ -127,14 +127,14 @@ def _with_short_growth(grids: Sequence[HashGridConfig]) -> Iterator[HashGridConf
 
 
 def _split(network: Float32Array, width: int) -> Layers | None:
-    """The fused network's layers, row-major and without biases; None where its size is no usual network's.
+    """The fused network's layers, row-major and without biases; None where no usual network has that size.
 
     Columns beyond ``width`` are always fed ones, so they are a bias; of the result only row 0 is used.
     """
     padded = -(-width // _PADDING) * _PADDING
     for neurons in _USUAL_NEURONS:
         hidden, rest = divmod(network.size - (padded + _PADDING) * neurons, neurons * neurons)
-        if rest or not 0 <= hidden < _MOST_HIDDEN:
+        if rest or not 0 <= hidden < _MAX_HIDDEN:
             continue
         shapes = [(neurons, padded), *[(neurons, neurons)] * hidden, (_PADDING, neurons)]
         ends = np.cumsum([rows * columns for rows, columns in shapes])[:-1]

@@ -19,10 +19,10 @@ _FAR = 1e4
 """Coordinates beyond this many diagonals leave float32 too few digits."""
 
 
-def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, family: str = "mesh") -> ConvertedField:
+def mesh_field(geometry: Geometry, origin: str, overrides: UploadDescription, family: str = "mesh") -> ConvertedField:
     """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
-    require_family(wanted, family)
-    refuse_other_entries(wanted, family)
+    require_family(overrides, family)
+    refuse_other_entries(overrides, family)
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
     inside_out = _is_inside_out(vertices, faces)
@@ -42,7 +42,7 @@ def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, famil
     return ConvertedField(
         family,
         why,
-        {"kind": "mesh", "source": {"family": family}, **shared_entries(wanted, bounds)},
+        {"kind": "mesh", "source": {"family": family}, **shared_entries(overrides, bounds)},
         {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
         _warnings(inside_out, max(np.abs(low).max(), np.abs(high).max()) / diagonal),
     )
@@ -50,7 +50,7 @@ def mesh_field(geometry: Geometry, origin: str, wanted: UploadDescription, famil
 
 def _check(geometry: Geometry) -> None:
     if not np.isfinite(geometry.vertices).all() or np.abs(geometry.vertices).max(initial=0.0) > 1e30:
-        raise malformed("the mesh has a vertex that is no finite number")
+        raise malformed("the mesh has a vertex that is not a finite number")
     if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
         raise malformed("a face names a vertex that does not exist")
 

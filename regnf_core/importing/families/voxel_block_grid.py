@@ -43,7 +43,7 @@ class _Blocks:
     voxel_size: float
 
 
-def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | None:
+def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
     """The map in ``arrays``, or None where they are not those of a VoxelBlockGrid with truncated distances.
 
     Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what
@@ -51,16 +51,16 @@ def convert(arrays: ArraySource, wanted: UploadDescription) -> ConvertedField | 
     """
     if not all(name in arrays for name in _NEEDED):
         return None
-    require_family(wanted, FAMILY)
-    refuse_other_entries(wanted, FAMILY, ("truncation",))
+    require_family(overrides, FAMILY)
+    refuse_other_entries(overrides, FAMILY, ("truncation",))
     blocks = _read(arrays)
-    truncation, why, warnings = _truncation(blocks, wanted)
+    truncation, why, warnings = _truncation(blocks, overrides)
     values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
-    fill_unseen(values, blocks.seen, blocks.voxel_size, wanted.sign or 1)
+    fill_unseen(values, blocks.seen, blocks.voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks.keys, blocks.seen)
     description = {
         "kind": "voxel_blocks",
-        **shared_entries(wanted, [(blocks.voxel_size * corner).tolist() for corner in (low, high)]),
+        **shared_entries(overrides, [(blocks.voxel_size * corner).tolist() for corner in (low, high)]),
         "voxel_size": blocks.voxel_size,
         "source": {"family": FAMILY},
     }
@@ -87,10 +87,10 @@ def _read(arrays: ArraySource) -> _Blocks:
     return _Blocks(tsdf[kept], seen[kept], keys[kept], voxel_size)
 
 
-def _truncation(blocks: _Blocks, wanted: UploadDescription) -> tuple[float, str, tuple[str, ...]]:
+def _truncation(blocks: _Blocks, overrides: UploadDescription) -> tuple[float, str, tuple[str, ...]]:
     """The distance that the value 1 stands for, how it was told, and warnings."""
-    if wanted.truncation is not None:
-        return wanted.truncation, "the description tells the truncation", ()
+    if overrides.truncation is not None:
+        return overrides.truncation, "the description tells the truncation", ()
     voxels, slope = tell_truncation(blocks.tsdf, blocks.seen)
     distance = voxels * blocks.voxel_size
     if slope is None:
@@ -107,7 +107,7 @@ def _attribute(arrays: ArraySource, name: str) -> str:
     number = _one(arrays, f"attr_name_{name}")
     text = f"{number:g}"
     if not _INDEX.fullmatch(text):
-        raise tensor_error(f"attr_name_{name} is no number of an array", "TENSOR_SHAPE")
+        raise tensor_error(f"attr_name_{name} is not the number of an array", "TENSOR_SHAPE")
     return f"value_{int(text):03d}"
 
 

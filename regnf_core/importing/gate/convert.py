@@ -83,7 +83,7 @@ def convert_file(
 
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
-    """A picture, if one can be made: it is no condition of the import."""
+    """A picture, if one can be made: it is not a condition of the import."""
     from regnf_core.viewing.field_picture import field_picture
 
     with contextlib.suppress(RegnfError, MemoryError):
@@ -101,33 +101,33 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     from regnf_core.importing.pickle.tensors import TensorSource
     from regnf_core.importing.upload_description import UploadDescription
 
-    wanted = UploadDescription.from_dict(description)
+    overrides = UploadDescription.from_dict(description)
     data = _mapped(upload)
     head = bytes(data[:HEAD_BYTES])
     kind = sniff_format(head)
     if kind == "torch-zip":
         archive = read_archive(data)
-        return convert_checkpoint(read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes), wanted)
+        return convert_checkpoint(read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes), overrides)
     if kind == "torch-legacy":
         values, legacy = read_legacy(data)
-        return convert_checkpoint(values, TensorSource(legacy, tensor_bytes), wanted)
+        return convert_checkpoint(values, TensorSource(legacy, tensor_bytes), overrides)
     if kind == "npz":
-        return convert_arrays(ArraySource(data, tensor_bytes), wanted)
+        return convert_arrays(ArraySource(data, tensor_bytes), overrides)
     if kind == "safetensors":
-        return convert_safe_field(upload, data, tensor_bytes, wanted)
+        return convert_safe_field(upload, data, tensor_bytes, overrides)
     if kind == "onnx":
         from regnf_core.importing.families.onnx import convert_onnx
 
-        return convert_onnx(data, tensor_bytes, wanted)
+        return convert_onnx(data, tensor_bytes, overrides)
     if kind == "sqlite":
         from regnf_core.importing.containers.sqlite_source import TableSource
         from regnf_core.importing.families.nvblox import convert_database
 
-        return convert_database(TableSource(data), tensor_bytes, wanted)
+        return convert_database(TableSource(data), tensor_bytes, overrides)
     if kind in MESH_FORMATS:
         from regnf_core.importing.families.mesh import convert_mesh
 
-        return convert_mesh(kind, data, wanted)
+        return convert_mesh(kind, data, overrides)
     reason, detail = explain_refusal(head)
     raise FieldFormatError(detail, reason=reason)
 

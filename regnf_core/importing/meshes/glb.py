@@ -56,9 +56,9 @@ def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
     try:
         document = json.loads(bytes(text).decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise malformed("the glTF file's JSON is none") from error
+        raise malformed("the glTF file's JSON is malformed") from error
     if not isinstance(document, dict):
-        raise malformed("the glTF file's JSON is no object")
+        raise malformed("the glTF file's JSON is not an object")
     return document, found.get(_BIN, memoryview(b""))
 
 

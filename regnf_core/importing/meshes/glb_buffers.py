@@ -69,5 +69,5 @@ def _scaled(items: Float64Array, component: str, normalized: bool) -> Float64Arr
 
 def _whole(value: object) -> int:
     if type(value) is not int or not 0 <= value < 1 << 48:
-        raise malformed("a glTF count, offset or index that is no number")
+        raise malformed("a glTF count, offset or index that is not a number")
     return value

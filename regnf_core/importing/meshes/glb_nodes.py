@@ -15,10 +15,10 @@ _MAX_NODES = 100_000
 def placed_meshes(document: dict[str, Any]) -> Iterator[tuple[int, Float64Array]]:
     """Every node's mesh: its number, and the (4, 4) matrix from its frame to the scene's.
 
-    Raises FieldFormatError (MESH_INVALID) for a graph that is no tree; KeyError, TypeError ... for a faulty document.
+    Raises FieldFormatError (MESH_INVALID) for a graph that is not a tree; KeyError, TypeError ... for faulty JSON.
     """
     nodes = document.get("nodes", [])
-    if not nodes:  # meshes that nobody has placed
+    if not nodes:  # meshes that no node places
         yield from ((number, np.eye(4)) for number in range(len(document.get("meshes", []))))
         return
     if len(nodes) > _MAX_NODES:

@@ -54,7 +54,7 @@ def _index(word: bytes, so_far: int) -> int:
     try:
         number = int(word.partition(b"/")[0])
     except ValueError as error:
-        raise malformed("an OBJ face has a corner that is no number") from error
+        raise malformed("an OBJ face has a corner that is not a number") from error
     if number == 0 or abs(number) >= 1 << 62:
         raise malformed("an OBJ face has a corner of no vertex")
     return number - 1 if number > 0 else so_far + number

@@ -126,7 +126,7 @@ class TextBody(Body):
                 warnings.simplefilter("error")
                 self._numbers = np.fromstring(bytes(data).decode("ascii"), dtype=np.float64, sep=" ")
         except (ValueError, DeprecationWarning) as error:
-            raise malformed("the PLY file holds a word that is no number") from error
+            raise malformed("the PLY file holds a word that is not a number") from error
 
     def scalars(self, element: Element) -> dict[str, Float64Array]:
         if any(p.count_type is not None for p in element.properties):
@@ -172,5 +172,5 @@ class TextBody(Body):
 def _whole(values: Float64Array) -> Int64Array:
     """Numbers as indices. Raises FieldFormatError (MESH_INVALID) for what is none."""
     if not (np.isfinite(values) & (np.abs(values) < 2.0**53)).all():
-        raise malformed("a PLY index that is no number")
+        raise malformed("a PLY index that is not a number")
     return values.astype(np.int64)

@@ -86,5 +86,5 @@ def _elements(lines: list[list[str]]) -> tuple[Element, ...]:
         if not properties or len(properties) > _MAX_PARTS or len(set(properties)) != len(properties):
             raise malformed(f"the PLY element {element.name[:40]} has no properties, too many, or one twice")
         if any(p.count_type is not None and p.count_type.startswith("f") for p in element.properties):
-            raise malformed("a PLY list whose length is no whole number")
+            raise malformed("a PLY list whose length is not an integer")
     return elements

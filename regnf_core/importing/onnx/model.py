@@ -139,7 +139,7 @@ def _port(data: memoryview) -> Port:
     types = [wire.read_message(part) for part in wire.messages(message, 2)]
     tensors = [wire.read_message(part) for type_ in types for part in wire.messages(type_, 1)]
     if len(tensors) != 1:
-        raise unsupported(f"{name[:40]} is no tensor")
+        raise unsupported(f"{name[:40]} is not a tensor")
     shapes = wire.messages(tensors[0], 2)
     shape = tuple(_extent(part) for part in wire.messages(wire.read_message(shapes[-1]), 1)) if shapes else None
     return Port(name, wire.integer(tensors[0], 1), shape)

@@ -62,6 +62,6 @@ def _in_our_types(values: Array) -> Array:
     with np.errstate(over="ignore"):
         single = np.ascontiguousarray(values, dtype=np.float32)
     if np.isnan(single).any():
-        raise FieldFormatError("an ONNX tensor holds a number that is none", reason="TENSOR_NOT_FINITE")
+        raise FieldFormatError("an ONNX tensor holds NaN or an infinity", reason="TENSOR_NOT_FINITE")
     # an infinite bound of a clamp, or where a maximum starts: no safe file holds it
     return np.clip(single, -_LARGEST, _LARGEST)

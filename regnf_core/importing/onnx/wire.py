@@ -14,7 +14,7 @@ Message = dict[int, list[Value]]
 
 
 def malformed(message: str) -> FieldFormatError:
-    """The error for bytes that are no ONNX model."""
+    """The error for bytes that are not an ONNX model."""
     return FieldFormatError(message, reason="ONNX_MALFORMED")
 
 
@@ -78,7 +78,7 @@ def decoded(value: memoryview) -> str:
     try:
         return bytes(value).decode("utf-8")
     except UnicodeDecodeError as error:
-        raise malformed("a name that is no text") from error
+        raise malformed("a name that is not text") from error
 
 
 def integers(message: Message, number: int) -> list[int]:

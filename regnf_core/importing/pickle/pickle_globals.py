@@ -27,11 +27,11 @@ _NUMPY_SCALARS |= {"u8": "<Q", "u4": "<I", "u2": "<H", "u1": "<B", "b1": "<?"}
 def call(function: object, args: object) -> Any:
     """What ``function(*args)`` stands for. Raises FieldFormatError (PICKLE_MALFORMED) where that makes no sense."""
     if not isinstance(args, tuple):
-        raise pickle_error("arguments that are no tuple")
+        raise pickle_error("arguments that are not a tuple")
     if isinstance(function, Placeholder):
         return Placeholder(function.full_name)
     if not isinstance(function, GlobalRef):
-        raise pickle_error("a call of something that is no global")
+        raise pickle_error("a call of something that is not a global")
     handler = HANDLERS.get((function.module, function.name))
     return handler(function, args) if handler else Placeholder(function.full_name)
 
@@ -47,11 +47,11 @@ def storage(identifier: object) -> StorageRef | Placeholder:
             if not known:
                 return Placeholder(kind.full_name)
             if not _STORAGE_KEY.fullmatch(key) or not 0 <= count < _MAX_EXTENT or len(device) > _MAX_SCALAR_TEXT:
-                raise pickle_error("a storage's key, device or size is none")
+                raise pickle_error("a storage's key, device or size is malformed")
             return StorageRef(key, DTYPES.get(kind.name), kind.full_name, count, device)
         case ("storage", Placeholder() as kind, *_):
             return Placeholder(kind.full_name)
-    raise pickle_error("a persistent id that is no storage")
+    raise pickle_error("a persistent id that is not a storage")
 
 
 def _tensor(_function: GlobalRef, args: tuple[Any, ...]) -> TensorRef | Placeholder:
@@ -94,7 +94,7 @@ def _default_mapping(function: GlobalRef, args: tuple[Any, ...]) -> Any:
 
 
 def _sequence(function: GlobalRef, args: tuple[Any, ...]) -> Any:
-    """A list, tuple or set of the given items; kept in the container they came in, since nobody asks for more."""
+    """A list, tuple or set of the given items; kept in the container they came in, which is enough here."""
     if not args:
         return []
     if len(args) == 1 and isinstance(args[0], (list, tuple)):
@@ -143,7 +143,7 @@ def dict_key(value: Any, depth: int = 2) -> Any:
         return value
     if isinstance(value, tuple) and depth > 0 and len(value) <= _MAX_DIMENSIONS:
         return tuple(dict_key(part, depth - 1) for part in value)
-    raise pickle_error("a dictionary's key is no plain value")
+    raise pickle_error("a dictionary's key is not a plain value")
 
 
 def key_work(key: object) -> int:

@@ -161,7 +161,7 @@ class _Machine:
         if isinstance(target, list):
             target.extend(items)
         elif not isinstance(target, Placeholder):
-            raise pickle_error("items for something that is no list")
+            raise pickle_error("items for something that is not a list")
 
     def append(self) -> None:
         item = self.pop()
@@ -176,7 +176,7 @@ class _Machine:
                 self.charge(key_work(key))
                 target[dict_key(key)] = value
         elif not isinstance(target, Placeholder):
-            raise pickle_error("keys for something that is no dictionary")
+            raise pickle_error("keys for something that is not a dictionary")
 
     def set_item(self) -> None:
         value, key = self.pop(), self.pop()
@@ -191,7 +191,7 @@ class _Machine:
     def name_global(self, module: Any, name: Any) -> None:
         for part in (module, name):
             if not isinstance(part, str) or not 0 < len(part) <= _MAX_GLOBAL_NAME or not part.isprintable():
-                raise pickle_error("a global's name is no plain text")
+                raise pickle_error("a global's name is not plain text")
         self.push(GlobalRef(module, name))
 
     def stack_global(self) -> None:
@@ -208,7 +208,7 @@ class _Machine:
         keywords, args, kind = self.pop(), self.pop(), self.pop()
         known = isinstance(kind, (GlobalRef, Placeholder)) and isinstance(args, tuple) and isinstance(keywords, dict)
         if not known:
-            raise pickle_error("an object of something that is no class")
+            raise pickle_error("an object of something that is not a class")
         self.push(Placeholder(kind.full_name))
 
     def build(self) -> None:

@@ -10,7 +10,7 @@ from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.layers import check_layers, count_layers, layer_tensor_names
 from regnf_core.schema.tensor_check import TensorSpec, require, require_names, require_shape
 
-_MOST_VOLUMES = 16
+_MAX_VOLUMES = 16
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,7 @@ class FeatureVolumesDescription(FieldDescription):
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         volumes = count_volumes(tensors)
-        require(1 <= volumes <= _MOST_VOLUMES, f"the field has {volumes} volumes, expected 1 to {_MOST_VOLUMES}")
+        require(1 <= volumes <= _MAX_VOLUMES, f"the field has {volumes} volumes, expected 1 to {_MAX_VOLUMES}")
         names = layer_tensor_names(count_layers(tensors))
         require_names(tensors, names | {f"volumes.{i}" for i in range(volumes)})
         features = tensors["volumes.0"].shape[-1] if tensors["volumes.0"].shape else 0

@@ -79,7 +79,9 @@ class OnnxDescription(FieldDescription):
                 continue
             require(signature.least <= len(node.inputs) <= signature.most, f"{where}: {len(node.inputs)} inputs")
             require(1 <= len(node.outputs) <= signature.outputs, f"{where}: {len(node.outputs)} outputs")
-            require(all(name == "" or name in by_points for name in node.inputs), f"{where}: an input nobody made")
+            require(
+                all(name == "" or name in by_points for name in node.inputs), f"{where}: an input that no node computes"
+            )
             require(all(name and name not in by_points for name in node.outputs), f"{where}: an output made twice")
             moving = [by_points.get(name, False) for name in node.inputs]
             settled = not any(moving[i] for i in signature.settled if i < len(moving))

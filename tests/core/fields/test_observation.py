@@ -12,7 +12,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.counting import CountingField
 from regnf_core.fields.observation import Observation, ObservedField, observation_of
-from regnf_core.fields.scaled import AdjustedField
+from regnf_core.fields.scaled import ScaledField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN, ObservationGrid
@@ -62,7 +62,7 @@ def test_every_frame_sees_the_same() -> None:
     seen = observation_of(TransformedField(TransformedField(CountingField(field), T), T))
     assert seen is not None
     assert (seen.at((T @ T).inverse().apply(points)) == there).all()
-    larger = observation_of(AdjustedField(field, scale=4.0))
+    larger = observation_of(ScaledField(field, scale=4.0))
     assert larger is not None
     assert (larger.at(4.0 * points) == there).all()
     assert observation_of(TransformedField(sphere(0.5), T)) is None

@@ -33,9 +33,9 @@ def sampled(field: SdfField, low: Any, high: Any, nodes: Any) -> np.ndarray[Any,
 BALL = sampled(sphere(0.5), LOW, HIGH, NODES)
 
 
-def converted(folder: Path, wanted: dict[str, Any] | None = None, **arrays: Any) -> dict[str, Any]:
+def converted(folder: Path, overrides: dict[str, Any] | None = None, **arrays: Any) -> dict[str, Any]:
     np.savez(folder / "grid.npz", **arrays)
-    return convert_file(folder / "grid.npz", folder, wanted, ImportLimits())
+    return convert_file(folder / "grid.npz", folder, overrides, ImportLimits())
 
 
 @pytest.mark.parametrize(
@@ -80,8 +80,8 @@ def test_other_arrays_are_left_alone_even_pickled_ones(tmp_path: Path) -> None:
 
 
 def test_what_the_uploader_says_goes_before(tmp_path: Path) -> None:
-    wanted = {"world_scale": 0.001, "sign": -1, "up_axis": "y", "label": "ball", "family": "dense_sdf_grid"}
-    converted(tmp_path, wanted, sdf=-BALL, origin=LOW, spacing=SPACING)
+    overrides = {"world_scale": 0.001, "sign": -1, "up_axis": "y", "label": "ball", "family": "dense_sdf_grid"}
+    converted(tmp_path, overrides, sdf=-BALL, origin=LOW, spacing=SPACING)
     description = read_description(tmp_path / FIELD_NAME)
     assert {key: description[key] for key in ("sign", "up_axis", "label")} == {
         "sign": -1,

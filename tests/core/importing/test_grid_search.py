@@ -12,12 +12,12 @@ from tests.core.importing.archives import assert_refused
 HABITS = GridHabits((2, 4, 8), ((16, 2048), (16, 512), (64, 4096)), "smoothstep")
 
 
-def find(parameters: int, width: int, **wanted: Any) -> tuple[HashGridConfig, ...]:
-    return find_grids(parameters, width, HABITS, GridDescription(**wanted))
+def find(parameters: int, width: int, **overrides: Any) -> tuple[HashGridConfig, ...]:
+    return find_grids(parameters, width, HABITS, GridDescription(**overrides))
 
 
-def only(parameters: int, width: int, **wanted: Any) -> HashGridConfig:
-    (config,) = find(parameters, width, **wanted)
+def only(parameters: int, width: int, **overrides: Any) -> HashGridConfig:
+    (config,) = find(parameters, width, **overrides)
     return config
 
 

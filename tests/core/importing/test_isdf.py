@@ -58,22 +58,22 @@ def evaluate(state: dict[str, Any], blocks: int, point: Array, scales: tuple[flo
     return float(scales[1] * layer("out_alpha", h)[0])
 
 
-def converted(folder: Path, values: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+def converted(folder: Path, values: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
     torch.save(values, folder / "step_900.pth")
-    return convert_file(folder / "step_900.pth", folder, wanted, ImportLimits())
+    return convert_file(folder / "step_900.pth", folder, overrides, ImportLimits())
 
 
 @pytest.mark.parametrize("blocks", [0, 1, 2])
 @pytest.mark.parametrize("scales", [None, (0.4, 0.3)])
 def test_values_and_gradients(tmp_path: Path, blocks: int, scales: tuple[float, float] | None) -> None:
     values = checkpoint(blocks)
-    wanted: dict[str, Any] = {"bounds": BOUNDS}
+    overrides: dict[str, Any] = {"bounds": BOUNDS}
     if scales is not None:
-        wanted |= {"input_scale": scales[0], "output_scale": scales[1]}
+        overrides |= {"input_scale": scales[0], "output_scale": scales[1]}
     values["model_state_dict"]["out_alpha.bias"] -= evaluate(
         values["model_state_dict"], blocks, np.zeros(3), (1.0, 1.0)
     )  # a zero level through the middle
-    report = converted(tmp_path, values, wanted)
+    report = converted(tmp_path, values, overrides)
     assert report["family"] == "isdf"
     assert "BOUNDS_ASSUMED" not in str(report["warnings"])
     points = np.random.default_rng(1).uniform(*BOUNDS, size=(40, 3))

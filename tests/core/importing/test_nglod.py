@@ -49,9 +49,9 @@ def evaluate(state: dict[str, Tensor], points: Tensor, levels: int) -> Tensor:
     return (hidden @ lout["2.weight"].T + lout["2.bias"])[:, 0]
 
 
-def converted(folder: Path, state: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+def converted(folder: Path, state: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
     torch.save(state, folder / "sdf.pth")
-    return convert_file(folder / "sdf.pth", folder, wanted, ImportLimits())
+    return convert_file(folder / "sdf.pth", folder, overrides, ImportLimits())
 
 
 @pytest.mark.parametrize("levels", [None, 2, 1])

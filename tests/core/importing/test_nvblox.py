@@ -62,8 +62,8 @@ def write_map(path: Path, rows: list[Any] | None = None, more: str = "", block_s
     return path
 
 
-def converted(path: Path, wanted: dict[str, Any] | None = None) -> dict[str, Any]:
-    return convert_file(path, path.parent, wanted, ImportLimits())
+def converted(path: Path, overrides: dict[str, Any] | None = None) -> dict[str, Any]:
+    return convert_file(path, path.parent, overrides, ImportLimits())
 
 
 def test_a_map_of_a_ball_through_the_gate(tmp_path: Path) -> None:
@@ -176,9 +176,9 @@ def test_entries_that_mean_nothing_are_refused(tmp_path: Path) -> None:
 
 def test_rows_bytes_and_work_are_capped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = memoryview(write_map(tmp_path / "m").read_bytes())
-    monkeypatch.setattr(nvblox, "_MOST_BLOCKS", 5)
+    monkeypatch.setattr(nvblox, "_MAX_BLOCKS", 5)
     assert_refused(lambda: converted(tmp_path / "m"), "TENSOR_TOO_LARGE")
-    monkeypatch.setattr(nvblox, "_MOST_BLOCKS", 1 << 20)
+    monkeypatch.setattr(nvblox, "_MAX_BLOCKS", 1 << 20)
     assert_refused(
         lambda: convert_file(tmp_path / "m", tmp_path, None, ImportLimits(tensor_bytes=8192)), "TENSOR_TOO_LARGE"
     )

@@ -57,9 +57,9 @@ def floor(change: Any = None) -> dict[str, Any]:
     return checkpoint
 
 
-def converted(folder: Path, checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+def converted(folder: Path, checkpoint: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
     torch.save(checkpoint, folder / "map.pth")
-    return convert_file(folder / "map.pth", folder, wanted, ImportLimits())
+    return convert_file(folder / "map.pth", folder, overrides, ImportLimits())
 
 
 def test_a_map_of_a_floor(tmp_path: Path) -> None:

@@ -106,9 +106,9 @@ def tcnn_checkpoint(log2_size: int = 9) -> dict[str, Any]:
     return {"epoch": 9, "model": model}
 
 
-def converted(folder: Path, checkpoint: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+def converted(folder: Path, checkpoint: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
     torch.save(checkpoint, folder / "ngp_ep0009.pth.tar")
-    return convert_file(folder / "ngp_ep0009.pth.tar", folder, wanted, ImportLimits())
+    return convert_file(folder / "ngp_ep0009.pth.tar", folder, overrides, ImportLimits())
 
 
 def assert_evaluates(field: SdfField, slow: Any) -> None:

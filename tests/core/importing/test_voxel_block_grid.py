@@ -50,9 +50,9 @@ def ball(voxels: float = 4.0, **changes: Any) -> dict[str, Any]:
     return {name: array for name, array in arrays.items() if array is not None}
 
 
-def converted(folder: Path, arrays: dict[str, Any], wanted: dict[str, Any] | None = None) -> dict[str, Any]:
+def converted(folder: Path, arrays: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
     np.savez(folder / "map.npz", **arrays)
-    return convert_file(folder / "map.npz", folder, wanted, ImportLimits())
+    return convert_file(folder / "map.npz", folder, overrides, ImportLimits())
 
 
 def near_surface(count: int) -> NDArray[np.float64]:

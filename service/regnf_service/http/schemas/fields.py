@@ -15,7 +15,7 @@ from regnf_state.records import FieldRecord
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
     """What the import needs of a description: everything that was said but the label."""
-    return {name: value for name, value in description.said().items() if name != "label"}
+    return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
 class FieldDocument(Outgoing):

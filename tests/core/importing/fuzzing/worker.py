@@ -31,7 +31,7 @@ from tests.core.importing.fuzzing.stages import PARTS, Watch, run_stage
 
 MEMORY_BYTES = 2 << 30
 CASE_S = 5.0
-_MOST_FINDS = 400
+_MAX_FINDS = 400
 _TRACED_SHARE = 0.5
 
 
@@ -107,7 +107,7 @@ class Fuzzer:
             outcome, fault = type(error).__name__, f"{error!r:.300}"
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
-        if len(self.coverage.steps) > before and len(self.finds[stage]) < _MOST_FINDS:
+        if len(self.coverage.steps) > before and len(self.finds[stage]) < _MAX_FINDS:
             self.finds[stage].append(data)
         return outcome, fault or self._traces(known)
 
