@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
-from regnf_core.geometry.similarity import similarity_fault
+from regnf_core.geometry.similarity_check import similarity_fault
 from regnf_core.options import Preset, RegistrationOptions
 
 if TYPE_CHECKING:

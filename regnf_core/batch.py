@@ -19,7 +19,7 @@ from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import Run
-from regnf_core.surface.clouds import with_clouds
+from regnf_core.surface.result_clouds import with_clouds
 
 _T = TypeVar("_T")
 

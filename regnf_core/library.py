@@ -32,7 +32,7 @@ from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.robust.report import result_of
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import STARTS, Run
-from regnf_core.surface.clouds import with_clouds
+from regnf_core.surface.result_clouds import with_clouds
 
 Stage = Literal["refined", "coarse", "signature"]
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from torch import Tensor
-
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
-from regnf_core.paper.pipeline import register_paper
-from regnf_core.paper.sampling import in_detection
+from regnf_core.paper import pipeline as paper
 from regnf_core.result import ProgressCallback, RegistrationResult
 from regnf_core.robust.register import WarmStart, cloud_region, register_robust
 from regnf_core.run import Run
-from regnf_core.surface.clouds import with_clouds
+from regnf_core.surface.result_clouds import with_clouds
 
 __all__ = ["WarmStart", "register"]
 
@@ -45,14 +40,11 @@ def register(
     run = Run(progress)
     if options.preset == "robust":
         result = register_robust(scene, obj, detection, options, seed, run, warm_start)
+        region = cloud_region(detection)
     else:
-        result = register_paper(scene, obj, detection, options, seed, run)
-    region = _paper_region(detection, options) if options.preset == "paper" else cloud_region(detection)
+        result = paper.register_paper(scene, obj, detection, options, seed, run)
+        region = paper.cloud_region(detection, options)
     return run.finish(result, (lambda found: with_clouds(found, scene, obj, detection, region)) if clouds else None)
-
-
-def _paper_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:
-    return lambda points: in_detection(points, detection, options.sampling, options.up_axis or "z")
 
 
 def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:

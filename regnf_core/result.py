@@ -9,20 +9,13 @@ from typing import Any, Literal
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 
 Verdict = Literal["registered", "ambiguous", "rejected"]
 Phase = Literal["loading", "sampling", "initializing", "optimizing", "verifying", "exporting"]
 
 ProgressCallback = Callable[[Phase, float], None]
 """Called with the phase and the overall progress 0..1. May raise CancelledError to stop the work."""
-
-
-@dataclass(frozen=True)
-class SurfaceSamples:
-    """Points on a field's zero level and the unit normals there. points, normals: (N, 3) float32, field frame."""
-
-    points: Tensor
-    normals: Tensor
 
 
 @dataclass(frozen=True)

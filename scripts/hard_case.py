@@ -24,10 +24,10 @@ from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.metrics import errors_against_truth
-from regnf_core.geometry.nearest_neighbors import gaps
+from regnf_core.geometry.points import gaps
 from regnf_core.surface.cameras import Rays
 from regnf_core.surface.sphere_tracing import clip_to_region, first_hits
-from regnf_core.viewing.preview import OBJECT_COLOR, SCENE_COLOR
+from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR
 from regnf_core.viewing.splats import Surfels, render, view_from
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from regnf_core import Sim3
 from regnf_core.errors import InitializationError
-from regnf_core.result import SurfaceSamples
+from regnf_core.geometry.surface_samples import SurfaceSamples
 
 VOXEL = 0.08
 """Edge of the voxels, in root mean square radii of the object's cloud: a fortieth of its diameter, about."""

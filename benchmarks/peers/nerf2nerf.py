@@ -40,7 +40,6 @@ from regnf_core.fields.base import differentiable_signed_distance
 from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.exponential_map import rotation_exp
 from regnf_core.paper.kernel import AdaptiveKernel
-from regnf_core.paper.sampling import thin_out
 
 STEPS = 10_000
 _KEYPOINTS, _KEYPOINT_NOISE = 5, 0.01  # noise in diameters
@@ -119,7 +118,7 @@ class _Run:
         center = case.object_samples.points.double().mean(0)
         self.motion = RigidMotion(rigid_fit(*self.marked), center, case.diameter)
         self.kernel = AdaptiveKernel()
-        self.samples = thin_out(case.scene_samples, _SAMPLES, self.generator).points
+        self.samples = case.scene_samples.subsample(_SAMPLES, self.generator).points
         self.own_distance = self.scene.signed_distance(self.samples)
         pose = {"params": [self.motion.turn, self.motion.shift], "lr": _RATE}
         self.adam = torch.optim.Adam([pose, {"params": [self.kernel.latents], "lr": _KERNEL_RATE}])

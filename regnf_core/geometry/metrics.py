@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.euler import euler_from_rotation
-from regnf_core.geometry.nearest_neighbors import NearestNeighbors
-from regnf_core.geometry.shape import diameter
+from regnf_core.geometry.points import NearestNeighbors, diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
 

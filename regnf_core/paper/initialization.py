@@ -12,8 +12,8 @@ from torch import Tensor
 
 from regnf_core.errors import InitializationError
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import InitializationOptions
-from regnf_core.result import SurfaceSamples
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 
 _FEATURE_RADIUS_VOXELS = 5.0
@@ -26,11 +26,11 @@ def initial_transform(
     object_samples: SurfaceSamples,
     options: InitializationOptions,
     seed: int,
-    disagreement: Callable[[Sim3], float] = lambda T_object_scene: 0.0,
+    score: Callable[[Sim3], float] = lambda T_object_scene: 0.0,
 ) -> Sim3:
     """T_object_scene with scale 1 from the surface points of both fields, float64 on the CPU.
 
-    Of ``options.draws`` RANSAC draws the one with the least ``disagreement`` is kept; one draw is the published method.
+    Of ``options.draws`` RANSAC draws the one with the lowest ``score`` is kept; one draw is the published method.
     Deterministic for a seed, whatever the number of threads.
     Raises InitializationError (NO_INITIAL_TRANSFORM) when the features give no transform.
     """
@@ -45,7 +45,7 @@ def initial_transform(
                 found.append(Sim3.from_translation(object_center) @ T_centered @ Sim3.from_translation(-scene_center))
     if not found:
         raise InitializationError("feature matching found no transform between the two surfaces")
-    return found[0] if len(found) == 1 else min(found, key=disagreement)
+    return found[0] if len(found) == 1 else min(found, key=score)
 
 
 def _center(samples: SurfaceSamples) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField, differentiable_signed_distance
-from regnf_core.geometry.nearest_neighbors import NearestNeighbors
+from regnf_core.geometry.points import NearestNeighbors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.paper.kernel import AdaptiveKernel
 

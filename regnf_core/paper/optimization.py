@@ -12,18 +12,19 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.euler import euler_from_rotation, rotation_from_euler
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import OptimizationOptions, RegistrationOptions
 from regnf_core.paper.kernel import AdaptiveKernel
 from regnf_core.paper.loss import LossTerms, SampleSet, bidirectional_loss
 from regnf_core.paper.resampling import resample
-from regnf_core.result import IterationRecord, SurfaceSamples
+from regnf_core.result import IterationRecord
 
-_SMALLEST_SCALE = 1e-3  # the published scale is additive and may step over zero, which would mirror the object
+_MIN_SCALE = 1e-3  # the published scale is additive and may step over zero, which would mirror the object
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Where the optimizer ended, how it went there, and whether the residuals fell under the stopping value."""
+    """The last iterate, the history of all iterations, and whether the residuals fell under the stopping value."""
 
     T_object_scene: Sim3
     trace: list[IterationRecord]
@@ -53,7 +54,7 @@ class PoseParameters:
     def keep_valid(self) -> None:
         """Hold the scale above zero."""
         with torch.no_grad():
-            self.scale.clamp_(min=_SMALLEST_SCALE)
+            self.scale.clamp_(min=_MIN_SCALE)
 
 
 def refine(
@@ -78,12 +79,12 @@ def refine(
     for iteration in range(options.optimization.iterations):
         T = pose.transform()
         if iteration > 0 and iteration % options.resampling.every == 0:
-            forth = pose.snapshot()
-            A = resample(A, scene, obj, forth, options.resampling, generator)
-            B = resample(B, obj, scene, forth.inverse(), options.resampling, generator)
+            T_now = pose.snapshot()
+            A = resample(A, scene, obj, T_now, options.resampling, generator)
+            B = resample(B, obj, scene, T_now.inverse(), options.resampling, generator)
         count = options.optimization.samples_per_iteration
-        some_A, some_B = A.batch(count, generator), B.batch(count, generator)
-        terms = bidirectional_loss(scene, obj, some_A, some_B, T, kernel, options.optimization.regularizer_weight)
+        batch_A, batch_B = A.batch(count, generator), B.batch(count, generator)
+        terms = bidirectional_loss(scene, obj, batch_A, batch_B, T, kernel, options.optimization.regularizer_weight)
         trace.append(_record(iteration, terms, kernel, pose.snapshot(), (A, B)))
         on_iteration(trace[-1])
         if _converged(trace[-1], options.optimization):

@@ -1,28 +1,41 @@
-"""The preset `paper`, top to bottom: sample, initialize, refine, verify."""
+"""The preset `paper`: the method of Reg-NF in the paper's own order. docs/method.md follows the same numbers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.shape import diameter
+from regnf_core.geometry.points import diameter
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RegistrationOptions
+from regnf_core.geometry.surface_samples import SurfaceSamples
+from regnf_core.options import Axis, RegistrationOptions
 from regnf_core.paper.initialization import initial_transform
 from regnf_core.paper.optimization import refine
-from regnf_core.paper.sampling import sample_object, sample_scene, thin_out
-from regnf_core.paper.verification import verify
-from regnf_core.result import IterationRecord, RegistrationResult, SurfaceSamples
+from regnf_core.paper.sampling import in_detection, sample_object, sample_scene
+from regnf_core.paper.verification import Verification, verify
+from regnf_core.result import IterationRecord, RegistrationResult
 from regnf_core.run import STARTS, Run
-from regnf_core.surface.agreement import disagreement
-from regnf_core.surface.extent import surface_extent
+from regnf_core.surface.field_residuals import mean_residual
+from regnf_core.surface.surface_bounds import surface_bounds
 
 _SCORING_SAMPLES = 400
-_SCORING_CAP = 0.1  # object diameters; a residual beyond it says no more than "wrong"
+_MAX_SCORING_RESIDUAL = 0.1  # object diameters; a residual beyond it says no more than "wrong"
+
+
+@dataclass(frozen=True, eq=False)
+class _Surfaces:
+    """Surface points of both fields, each in its own frame; the object's bounding box and diameter, object frame."""
+
+    scene: SurfaceSamples
+    object: SurfaceSamples
+    object_bounds: OrientedBox
+    object_diameter: float
 
 
 def register_paper(
@@ -33,48 +46,46 @@ def register_paper(
     seed: int,
     run: Run,
 ) -> RegistrationResult:
-    """T_object_scene by the published method; see docs/method.md.
+    """T_object_scene by the published method.
 
     Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE).
     """
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
 
+    # 1. Surface points of scene and object, as virtual cameras see them (section III-C.1).
     with run.phase("sampling"):
-        up_axis = options.up_axis or "z"
-        scene_samples = sample_scene(scene, detection, options.sampling, up_axis=up_axis)
-        run.report("sampling", 0.08)
-        extent = surface_extent(obj)
-        object_samples = sample_object(obj, options.sampling, extent=extent, up_axis=up_axis)
-        object_diameter = diameter(object_samples.points)
-        A = thin_out(scene_samples, options.resampling.max_samples, generator)
-        B = thin_out(object_samples, options.resampling.max_samples, generator)
+        surfaces = _sample(scene, obj, detection, options, run)
+        A = surfaces.scene.subsample(options.resampling.max_samples, generator)
+        B = surfaces.object.subsample(options.resampling.max_samples, generator)
 
+    # 2. Initial transform from feature matches and ICP, scale 1 (section III-C.2).
     with run.phase("initializing"):
-        score = _disagreement_on_few(scene, obj, A, B, _SCORING_CAP * object_diameter, generator)
-        T_initial = initial_transform(scene_samples, object_samples, options.initialization, seed, score)
+        score = _scoring(scene, obj, A, B, _MAX_SCORING_RESIDUAL * surfaces.object_diameter, generator)
+        T_initial = initial_transform(surfaces.scene, surfaces.object, options.initialization, seed, score)
 
+    # 3. to 6. Loss, robust kernel, optimizer and resampling (sections III-C to III-E, Algorithm 1).
     with run.phase("optimizing"):
         refined = refine(scene, obj, A, B, T_initial, options, generator, _on_iteration(options, run))
 
+    # 7. Verdict on fresh surface points. Ours: the paper has none.
     with run.phase("verifying"):
-        T = refined.T_object_scene
-        verification = verify(scene, obj, detection, extent, T, options.sampling, object_diameter, up_axis)
-    metrics = {
-        **verification.metrics,
-        "object_diameter": object_diameter,
-        "iterations": float(len(refined.trace)),
-        "converged": float(refined.converged),
-        "field_evaluations": float(scene.evaluations + obj.evaluations),
-    }
+        verification = _verify(scene, obj, detection, surfaces, refined.T_object_scene, options)
+
     return RegistrationResult(
         verdict=verification.verdict,
         verdict_reason=verification.reason,
-        T_object_scene=T,
+        T_object_scene=refined.T_object_scene,
         T_object_scene_initial=T_initial,
-        scene_samples=scene_samples,
-        object_samples=object_samples,
-        metrics=metrics,
+        scene_samples=surfaces.scene,
+        object_samples=surfaces.object,
+        metrics={
+            **verification.metrics,
+            "object_diameter": surfaces.object_diameter,
+            "iterations": float(len(refined.trace)),
+            "converged": float(refined.converged),
+            "field_evaluations": float(scene.evaluations + obj.evaluations),
+        },
         trace=refined.trace,
         residuals={},
         seed=seed,
@@ -82,12 +93,44 @@ def register_paper(
     )
 
 
-def _disagreement_on_few(
+def cloud_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:
+    """Tells which points (N, 3) of the scene may belong to a result's clouds, (N,) bool: those that step 1 keeps."""
+    return lambda points: in_detection(points, detection, options.sampling, _up_axis(options))
+
+
+def _sample(
+    scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions, run: Run
+) -> _Surfaces:
+    up_axis = _up_axis(options)
+    scene_samples = sample_scene(scene, detection, options.sampling, up_axis=up_axis)
+    run.report("sampling", 0.08)
+    object_bounds = surface_bounds(obj)
+    object_samples = sample_object(obj, options.sampling, extent=object_bounds, up_axis=up_axis)
+    return _Surfaces(scene_samples, object_samples, object_bounds, diameter(object_samples.points))
+
+
+def _verify(
+    scene: SdfField,
+    obj: SdfField,
+    detection: OrientedBox,
+    surfaces: _Surfaces,
+    T_object_scene: Sim3,
+    options: RegistrationOptions,
+) -> Verification:
+    bounds, size = surfaces.object_bounds, surfaces.object_diameter
+    return verify(scene, obj, detection, bounds, T_object_scene, options.sampling, size, _up_axis(options))
+
+
+def _up_axis(options: RegistrationOptions) -> Axis:
+    return options.up_axis or "z"
+
+
+def _scoring(
     scene: SdfField, obj: SdfField, A: SurfaceSamples, B: SurfaceSamples, cap: float, generator: torch.Generator
 ) -> Callable[[Sim3], float]:
-    """How far the fields disagree under a transform, on a few samples of each: what chooses among RANSAC's draws."""
-    few_A, few_B = thin_out(A, _SCORING_SAMPLES, generator), thin_out(B, _SCORING_SAMPLES, generator)
-    return lambda T: disagreement(scene, obj, few_A.points, few_B.points, T, cap)
+    """The mean residual under a transform on a few samples of each field: what chooses among RANSAC's draws."""
+    few_A, few_B = A.subsample(_SCORING_SAMPLES, generator), B.subsample(_SCORING_SAMPLES, generator)
+    return lambda T: mean_residual(scene, obj, few_A.points, few_B.points, T, cap)
 
 
 def _on_iteration(options: RegistrationOptions, run: Run) -> Callable[[IterationRecord], None]:

@@ -1,6 +1,6 @@
 """Multi-view surface sampling (paper, section III-C.1): points on the scene's and the object's surface.
 
-Cameras look at the detected thing from several sides; every ray returns the first point where the field is zero.
+Cameras look at the object from several sides; every ray returns the first point where the field is zero.
 """
 
 from __future__ import annotations
@@ -8,18 +8,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.detections import require_in_scene
-from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, SamplingOptions
-from regnf_core.result import SurfaceSamples
 from regnf_core.surface.cameras import axis_vector, camera_positions, cast_rays
-from regnf_core.surface.extent import surface_extent
+from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
 from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, shortest_step
+from regnf_core.surface.surface_bounds import surface_bounds
 
-MIN_POINTS = 50
-BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
+_BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
 _CLEARANCE = 0.75  # a camera keeps this many box diagonals from the center at least: outside the box, with room to see
 
@@ -33,14 +31,11 @@ def sample_scene(
     Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION) when fewer than
     50 points are found, InvalidInputError (FIELD_NOT_FINITE).
     """
-    check_box_meets_scene(scene, detection)
+    require_box_in_scene(scene, detection)
     positions = _camera_positions(detection, options.scene_camera_distance, options.views, turn, up_axis)
     points = _trace_views(scene, detection, positions, options)
     points = points[_above_ground(points, detection, options, up_axis)]
-    if points.shape[0] < MIN_POINTS:
-        raise NoSurfaceError(
-            f"only {points.shape[0]} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION"
-        )
+    require_scene_surface(len(points))
     return _with_normals(scene, points)
 
 
@@ -53,31 +48,15 @@ def sample_object(
 ) -> SurfaceSamples:
     """Points of the object's surface. Object frame, object units.
 
-    The cameras stand round the object's own surface, not round the field's bounds, which may be much larger;
-    ``extent`` is that surface's box where it is known already.
+    The cameras stand around the object's surface, not around the field's bounds, which may be much larger.
+    ``extent`` is that surface's bounding box, where it is known already.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
-    extent = extent or surface_extent(obj)
+    extent = extent or surface_bounds(obj)
     positions = _camera_positions(extent, options.object_camera_distance, options.views, turn, up_axis)
     points = _trace_views(obj, extent, positions, options)
-    if points.shape[0] < MIN_POINTS:
-        raise NoSurfaceError(f"only {points.shape[0]} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
+    require_object_surface(len(points))
     return _with_normals(obj, points)
-
-
-def thin_out(samples: SurfaceSamples, limit: int, generator: torch.Generator) -> SurfaceSamples:
-    """At most ``limit`` of the samples, chosen at random by the (CPU) generator."""
-    count = samples.points.shape[0]
-    if count <= limit:
-        return samples
-    chosen = torch.randperm(count, generator=generator)[:limit].sort().values.to(samples.points.device)
-    return SurfaceSamples(samples.points[chosen], samples.normals[chosen])
-
-
-def check_box_meets_scene(scene: SdfField, detection: OrientedBox) -> None:
-    """Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE) when the box lies wholly outside the scene's bounds."""
-    low, high = scene.bounds.tolist()
-    require_in_scene(detection.to_detection(), (low, high))
 
 
 def _camera_positions(box: OrientedBox, distance: float, views: int, turn: float, up_axis: Axis) -> Tensor:
@@ -87,13 +66,13 @@ def _camera_positions(box: OrientedBox, distance: float, views: int, turn: float
 
 def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: SamplingOptions) -> Tensor:
     """(M, 3) first surface points, seen from the cameras at ``positions`` (V, 3), within the slightly grown box."""
-    grown = OrientedBox(box.center, box.size * (1.0 + BOX_MARGIN), box.rotation)
+    grown = OrientedBox(box.center, box.size * (1.0 + _BOX_MARGIN), box.rotation)
     rays = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)
     rays = type(rays)(rays.origins.to(field.device), rays.directions.to(field.device))
     entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
     local = type(rays)(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))
     box_entry, box_exit = clip_to_region(local, -grown.size / 2, grown.size / 2)
-    # A ray is followed from the camera, since what stands before the box hides it, but no farther than through the box.
+    # A ray starts at the camera, since surface before the box occludes it, and ends where it leaves the box.
     last = torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
     hits = first_hits(field, rays, entry, last, shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal)
     return hits.points[grown.contains(hits.points)]
@@ -101,7 +80,7 @@ def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: 
 
 def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis = "z") -> Tensor:
     """(N,) bool: which points (N, 3) of the scene lie in the slightly grown box and above the ground."""
-    return detection.contains(points, BOX_MARGIN) & _above_ground(points, detection, options, up_axis)
+    return detection.contains(points, _BOX_MARGIN) & _above_ground(points, detection, options, up_axis)
 
 
 def _above_ground(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis) -> Tensor:

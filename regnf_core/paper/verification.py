@@ -17,10 +17,11 @@ from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
-from regnf_core.result import SurfaceSamples, Verdict
-from regnf_core.surface.agreement import object_residuals, scene_residuals
+from regnf_core.result import Verdict
+from regnf_core.surface.field_residuals import object_residuals, scene_residuals
 
 INLIER_DISTANCE = 0.015
 """Largest |residual| of an inlier, object diameters."""
@@ -51,17 +52,17 @@ def verify(
     object_diameter: float,
     up_axis: Axis = "z",
 ) -> Verification:
-    """Judge the transform on fresh samples of both surfaces, seen by cameras half way between the first ones."""
+    """The verdict on the transform, from fresh samples of both surfaces, seen by cameras between the first ones."""
     turn = math.pi / options.views
     scene_points = _fresh_points(lambda chosen: sample_scene(scene, detection, chosen, turn, up_axis), options)
     object_points = _fresh_points(lambda chosen: sample_object(obj, chosen, turn, object_extent, up_axis), options)
-    forth = scene_residuals(scene, obj, scene_points, T_object_scene) / object_diameter
-    back = object_residuals(scene, obj, object_points, T_object_scene) / object_diameter
-    return judge(forth, back)
+    scene_to_object = scene_residuals(scene, obj, scene_points, T_object_scene) / object_diameter
+    object_to_scene = object_residuals(scene, obj, object_points, T_object_scene) / object_diameter
+    return evaluate(scene_to_object, object_to_scene)
 
 
 def _fresh_points(sample: Callable[[SamplingOptions], SurfaceSamples], options: SamplingOptions) -> Tensor:
-    """(N, 3) what ``sample`` finds with rays farther apart than ``options`` has them, or closer where that is too few.
+    """(N, 3) points by ``sample`` with fewer rays than ``options`` names; with more rays where these find too few.
 
     Raises NoSurfaceError when even four times the rays of the first sampling find too few.
     """
@@ -75,15 +76,15 @@ def _fresh_points(sample: Callable[[SamplingOptions], SurfaceSamples], options: 
         stride = max(1, stride // _STRIDE_FACTOR)
 
 
-def judge(forth: Tensor, back: Tensor) -> Verification:
-    """The verdict for signed residuals (N,) of scene points and (M,) of object points, in object diameters."""
-    share_scene, share_object = _inlier_share(forth), _inlier_share(back)
-    rms = float(torch.cat([forth, back.to(forth)]).double().square().mean().sqrt())
+def evaluate(scene_to_object: Tensor, object_to_scene: Tensor) -> Verification:
+    """The verdict for signed residuals (N,) at scene points and (M,) at object points, in object diameters."""
+    share_scene, share_object = _inlier_share(scene_to_object), _inlier_share(object_to_scene)
+    rms = float(torch.cat([scene_to_object, object_to_scene.to(scene_to_object)]).double().square().mean().sqrt())
     metrics = {
         "residual_rms": rms,
         "inlier_share_scene": share_scene,
         "inlier_share_object": share_object,
-        "free_space_violations": float((back > INLIER_DISTANCE).double().mean()),
+        "free_space_violations": float((object_to_scene > INLIER_DISTANCE).double().mean()),
     }
     # Written so that a residual that is not a number can only lead to a rejection.
     if not min(share_scene, share_object) >= MIN_INLIER_SHARE:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import IterationRecord, RegistrationResult, SurfaceSamples
+from regnf_core.result import IterationRecord, RegistrationResult
 from regnf_core.robust.pipeline import Outcome, Problem
 from regnf_core.robust.refine.pose_candidates import Trail
 from regnf_core.robust.residuals import Samples

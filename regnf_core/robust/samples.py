@@ -12,15 +12,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.errors import NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.shape import diameter
-from regnf_core.paper.sampling import MIN_POINTS, check_box_meets_scene
+from regnf_core.geometry.points import diameter
 from regnf_core.robust.residuals import Samples
 from regnf_core.robust.working_frame import WorkingField, WorkingFrame
-from regnf_core.surface.cells import Cells, surface_cells, tighten
 from regnf_core.surface.projection import project_to_surface
+from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
+from regnf_core.surface.surface_cells import Cells, surface_cells, tighten
 
 REGION_GROWTH = 1.2
 """The scene is sampled in the box grown by this: boxes are often too small or off center."""
@@ -55,8 +54,7 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     found = found[space.sees(found.points, found.normals)]
     inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
     found = found[inside]
-    if len(found) < MIN_POINTS:
-        raise NoSurfaceError(f"only {len(found)} surface points on the object", reason="NO_SURFACE_IN_OBJECT")
+    require_object_surface(len(found))
     surface = found.on_surface()
     size = diameter(surface)
     center = surface.double().mean(0)
@@ -73,7 +71,7 @@ def sample_scene_surface(
     Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
     InvalidInputError (FIELD_NOT_FINITE).
     """
-    check_box_meets_scene(scene, detection)
+    require_box_in_scene(scene, detection)
     frame = WorkingFrame(detection.center.double(), detection.diagonal)
     field = WorkingField(scene, frame)
     half = detection.size.double() / detection.diagonal * (REGION_GROWTH / 2)
@@ -89,8 +87,7 @@ def sample_scene_surface(
     found = found[space.sees(found.points @ axes, found.normals @ axes)]
     bounds = frame.into(scene.bounds)
     found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
-    if len(found) < MIN_POINTS:
-        raise NoSurfaceError(f"only {len(found)} surface points in the detection box", reason="NO_SURFACE_IN_DETECTION")
+    require_scene_surface(len(found))
     return SampledField(field, frame, found, cells.edge)
 
 

@@ -10,11 +10,12 @@ import numpy as np
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.geometry.symmetry import Symmetries
-from regnf_core.result import RegistrationResult, SurfaceSamples
+from regnf_core.result import RegistrationResult
 from regnf_core.viewing.document import result_document, trace_document
 from regnf_core.viewing.ply import write_ply
-from regnf_core.viewing.preview import OBJECT_COLOR, SCENE_COLOR, preview
+from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
 
 CONTEXT_COLOR = (0.80, 0.82, 0.85)
 _ALWAYS = (
@@ -46,8 +47,7 @@ def write_artifacts(
     trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
     """
     scene, obj = result.scene_samples, result.object_samples
-    back = result.T_object_scene.inverse()
-    placed = SurfaceSamples(back.apply(obj.points.double().cpu()), obj.normals.double().cpu() @ back.rotation.mT)
+    placed = obj.transformed(result.T_object_scene.inverse())
     _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
     _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
@@ -59,7 +59,7 @@ def write_artifacts(
     np.savez(directory / "residuals.npz", **arrays)
     _write_json(directory / "trace.json", trace_document(result.trace))
     np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
-    preview(result).save(directory / "preview.png")
+    registration_picture(result).save(directory / "preview.png")
     device = scene.points.device
     document = result_document(result, truth, symmetries, device, object_name=object_name, candidates=candidates)
     _write_json(directory / "result.json", document)

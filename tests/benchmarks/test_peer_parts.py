@@ -15,7 +15,7 @@ from benchmarks.peers.nerf2nerf import RigidMotion, one_way_residuals
 from benchmarks.peers.splats import _turn_z_to
 from regnf_core import Sim3
 from regnf_core.errors import InitializationError
-from regnf_core.result import SurfaceSamples
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from tests.core.analytic import sphere
 from tests.core.robust.shapes import random_pose
 

@@ -18,7 +18,7 @@ from regnf_core.geometry.metrics import (
     scale_error,
     translation_rmse,
 )
-from regnf_core.geometry.shape import diameter
+from regnf_core.geometry.points import diameter
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import ContinuousSymmetry, Symmetries
 

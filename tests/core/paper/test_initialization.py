@@ -8,11 +8,11 @@ import torch
 from regnf_core.errors import InitializationError
 from regnf_core.geometry.metrics import rotation_error
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import InitializationOptions, SamplingOptions
 from regnf_core.paper.initialization import initial_transform
 from regnf_core.paper.sampling import sample_object, sample_scene
-from regnf_core.result import SurfaceSamples
-from regnf_core.surface.agreement import disagreement
+from regnf_core.surface.field_residuals import mean_residual
 from tests.core.analytic import chair, chair_box, chair_pose, room
 
 OPTIONS = InitializationOptions()
@@ -44,7 +44,7 @@ def test_of_several_draws_the_one_the_fields_agree_with_is_kept() -> None:
     scene, obj = room(T), chair()
 
     def score(candidate: Sim3) -> float:
-        return disagreement(scene, obj, A.points[::8], B.points[::8], candidate, 0.1)
+        return mean_residual(scene, obj, A.points[::8], B.points[::8], candidate, 0.1)
 
     seen: list[float] = []
 

@@ -12,12 +12,11 @@ from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfac
 from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
-from regnf_core.paper.sampling import sample_object, sample_scene, thin_out
-from regnf_core.result import SurfaceSamples
+from regnf_core.paper.sampling import sample_object, sample_scene
 from regnf_core.surface.cameras import Rays, camera_positions, cast_rays
-from regnf_core.surface.densify import densify
-from regnf_core.surface.extent import surface_extent
 from regnf_core.surface.sphere_tracing import first_hits
+from regnf_core.surface.surface_bounds import surface_bounds
+from regnf_core.surface.upsampling import upsample
 from tests.core.analytic import AnalyticField, boxes, chair, chair_box, chair_pose, room, sphere
 
 OPTIONS = SamplingOptions(pixel_stride=16)
@@ -127,7 +126,7 @@ def test_the_ground_follows_the_up_axis() -> None:
 
 def test_an_object_smaller_than_its_bounds_is_found_and_filled() -> None:
     small = sphere(0.1, (0.6, -0.5, 0.4), bounds=[[-1, -1, -1], [1, 1, 1]])
-    extent = surface_extent(small)
+    extent = surface_bounds(small)
     torch.testing.assert_close(extent.center, torch.tensor([0.6, -0.5, 0.4], dtype=torch.float64), rtol=0, atol=0.02)
     torch.testing.assert_close(extent.size, torch.full((3,), 0.2, dtype=torch.float64), rtol=0.15, atol=0)
     assert len(sample_object(small, OPTIONS).points) > 1000
@@ -142,20 +141,20 @@ def test_other_views_give_other_points() -> None:
     assert float(torch.cdist(first, second).amin(1).median()) > 1e-4
 
 
-def test_thinning_is_by_the_generator_alone() -> None:
+def test_subsampling_is_by_the_generator_alone() -> None:
     samples = sample_object(chair(), OPTIONS)
-    one, two = (thin_out(samples, 100, torch.Generator().manual_seed(3)) for _ in range(2))
+    one, two = (samples.subsample(100, torch.Generator().manual_seed(3)) for _ in range(2))
     assert one.points.shape == (100, 3)
     assert torch.equal(one.points, two.points)
-    assert thin_out(samples, 10**6, torch.Generator()) is samples
+    assert samples.subsample(10**6, torch.Generator()) is samples
 
 
-def test_densified_points_lie_on_the_surface_and_inside() -> None:
+def test_upsampled_points_lie_on_the_surface_and_inside() -> None:
     ball = sphere(0.25)
     samples = sample_scene(ball, BALL_BOX, OPTIONS)
     upper = samples.points[:, 2] > 0
-    half = SurfaceSamples(samples.points[upper], samples.normals[upper])
-    dense = densify(ball, half, 3000, torch.Generator().manual_seed(0), lambda points: points[:, 2] > 0)
+    half = samples[upper]
+    dense = upsample(ball, half, 3000, torch.Generator().manual_seed(0), lambda points: points[:, 2] > 0)
     assert 2000 < len(dense.points) <= 3000
     assert float((dense.points.norm(dim=1) - 0.25).abs().max()) < 1e-3
     assert bool((dense.points[:, 2] > 0).all())

@@ -12,9 +12,9 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import SamplingOptions
 from regnf_core.paper.sampling import sample_scene
-from regnf_core.paper.verification import INLIER_DISTANCE, Verification, judge, verify
-from regnf_core.surface.agreement import object_residuals, scene_residuals
-from regnf_core.surface.extent import surface_extent
+from regnf_core.paper.verification import INLIER_DISTANCE, Verification, evaluate, verify
+from regnf_core.surface.field_residuals import object_residuals, scene_residuals
+from regnf_core.surface.surface_bounds import surface_bounds
 from tests.core.analytic import chair, chair_box, chair_pose, room, sphere, table
 
 OPTIONS = SamplingOptions()
@@ -41,7 +41,7 @@ def residuals(near: int, far: int, distance: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("forth", "back", "expected"),
+    ("scene_to_object", "object_to_scene", "expected"),
     [
         (residuals(100, 0, 0), residuals(100, 0, 0), "SURFACES_AGREE"),
         (residuals(85, 15, 0.02), residuals(100, 0, 0), "SURFACES_AGREE"),
@@ -52,19 +52,19 @@ def residuals(near: int, far: int, distance: float) -> torch.Tensor:
         (torch.tensor([0.0, 0, 0, 0, 0, math.nan]), residuals(5, 0, 0), "LARGE_RESIDUAL"),
     ],
 )
-def test_judgment_by_hand(forth: torch.Tensor, back: torch.Tensor, expected: str) -> None:
-    judged = judge(forth, back)
-    assert judged.reason == expected
-    assert judged.verdict == ("registered" if expected == "SURFACES_AGREE" else "rejected")
+def test_verdicts_by_hand(scene_to_object: torch.Tensor, object_to_scene: torch.Tensor, expected: str) -> None:
+    found = evaluate(scene_to_object, object_to_scene)
+    assert found.reason == expected
+    assert found.verdict == ("registered" if expected == "SURFACES_AGREE" else "rejected")
 
 
-def test_the_numbers_of_a_judgment() -> None:
-    metrics = judge(residuals(9, 1, 0.1), residuals(8, 2, -0.1)).metrics
+def test_the_numbers_behind_a_verdict() -> None:
+    metrics = evaluate(residuals(9, 1, 0.1), residuals(8, 2, -0.1)).metrics
     assert metrics["inlier_share_scene"] == pytest.approx(0.9)
     assert metrics["inlier_share_object"] == pytest.approx(0.8)
     assert metrics["residual_rms"] == pytest.approx(math.sqrt(3 * 0.01 / 20))
     assert metrics["free_space_violations"] == 0.0  # the scene has more matter there, not less
-    assert judge(residuals(9, 1, 0.1), residuals(8, 2, 0.1)).metrics["free_space_violations"] == pytest.approx(0.2)
+    assert evaluate(residuals(9, 1, 0.1), residuals(8, 2, 0.1)).metrics["free_space_violations"] == pytest.approx(0.2)
 
 
 def test_views_that_see_too_little_are_looked_at_more_closely() -> None:
@@ -73,28 +73,28 @@ def test_views_that_see_too_little_are_looked_at_more_closely() -> None:
     options = SamplingOptions(pixel_stride=40)
     first = sample_scene(room(truth), chair_box(truth), options)
     assert 50 <= len(first.points) < 150
-    judged = verify(room(truth), obj, chair_box(truth), surface_extent(obj), truth, options, 1.1)
-    assert judged.verdict == "registered"
+    found = verify(room(truth), obj, chair_box(truth), surface_bounds(obj), truth, options, 1.1)
+    assert found.verdict == "registered"
 
 
 def test_no_surface_for_the_verdict_is_said_in_the_end() -> None:
     truth, obj = chair_pose(), chair()
     far = OrientedBox.from_corners([-0.9, -0.9, 0.7], [-0.7, -0.7, 0.9])
     with pytest.raises(NoSurfaceError) as caught:
-        verify(room(truth), obj, far, surface_extent(obj), truth, SamplingOptions(pixel_stride=40), 1.1)
+        verify(room(truth), obj, far, surface_bounds(obj), truth, SamplingOptions(pixel_stride=40), 1.1)
     assert caught.value.reason == "NO_SURFACE_IN_DETECTION"
 
 
 def verdict_of(T: Sim3, obj_name: str = "chair") -> Verification:
     truth = chair_pose()
     obj = chair() if obj_name == "chair" else table()
-    return verify(room(truth), obj, chair_box(truth), surface_extent(obj), T, OPTIONS, 1.1)
+    return verify(room(truth), obj, chair_box(truth), surface_bounds(obj), T, OPTIONS, 1.1)
 
 
 def test_the_truth_is_accepted() -> None:
-    judged = verdict_of(chair_pose())
-    assert judged.verdict == "registered"
-    assert judged.metrics["residual_rms"] < INLIER_DISTANCE / 3
+    found = verdict_of(chair_pose())
+    assert found.verdict == "registered"
+    assert found.metrics["residual_rms"] < INLIER_DISTANCE / 3
 
 
 @pytest.mark.parametrize("k", range(7))

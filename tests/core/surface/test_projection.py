@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import CountingField
+from regnf_core.fields.counting import CountingField
 from regnf_core.surface.projection import newton_step, project_to_surface
 from tests.core.analytic import sphere
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.surface.surroundings import surroundings
+from regnf_core.surface.scene_surroundings import sample_surroundings
 from tests.core.analytic import AnalyticField, sphere
 
 FLOOR_AND_BALL = AnalyticField(
@@ -16,7 +16,7 @@ ROUND_THE_BALL = OrientedBox.from_corners([-0.3, -0.3, 0.1], [0.3, 0.3, 0.8])
 
 
 def test_points_lie_on_the_floor_and_leave_the_box_out() -> None:
-    cloud = surroundings(FLOOR_AND_BALL, ROUND_THE_BALL, 2000, torch.Generator().manual_seed(0))
+    cloud = sample_surroundings(FLOOR_AND_BALL, ROUND_THE_BALL, 2000, torch.Generator().manual_seed(0))
     assert len(cloud.points) > 1500
     assert not ROUND_THE_BALL.contains(cloud.points).any()
     assert cloud.points[:, 2].abs().max() < 0.01
@@ -25,11 +25,11 @@ def test_points_lie_on_the_floor_and_leave_the_box_out() -> None:
 
 
 def test_every_quarter_of_the_floor_is_covered() -> None:
-    points = surroundings(FLOOR_AND_BALL, ROUND_THE_BALL, 2000, torch.Generator().manual_seed(1)).points
+    points = sample_surroundings(FLOOR_AND_BALL, ROUND_THE_BALL, 2000, torch.Generator().manual_seed(1)).points
     quarters = (points[:, 0] > 0).long() * 2 + (points[:, 1] > 0).long()
     assert torch.bincount(quarters, minlength=4).min() > 0.15 * len(points)
 
 
 def test_a_scene_without_a_surface_has_no_surroundings() -> None:
     empty = sphere(0.5, (5.0, 5.0, 5.0))
-    assert len(surroundings(empty, ROUND_THE_BALL, 500, torch.Generator().manual_seed(0)).points) == 0
+    assert len(sample_surroundings(empty, ROUND_THE_BALL, 500, torch.Generator().manual_seed(0)).points) == 0

@@ -11,10 +11,11 @@ from torch import Tensor
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.result import RegistrationResult, SurfaceSamples
-from regnf_core.surface.agreement import object_residuals, scene_residuals
-from regnf_core.surface.densify import densify
-from regnf_core.surface.surroundings import surroundings
+from regnf_core.geometry.surface_samples import SurfaceSamples
+from regnf_core.result import RegistrationResult
+from regnf_core.surface.field_residuals import object_residuals, scene_residuals
+from regnf_core.surface.scene_surroundings import sample_surroundings
+from regnf_core.surface.upsampling import upsample
 
 _DENSE = 4_200
 _COARSE = 5_500
@@ -36,15 +37,15 @@ def with_clouds(
     scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
     generator = torch.Generator().manual_seed(result.seed)
     extent = _extent(result.object_samples)
-    A = densify(scene, result.scene_samples, _DENSE, generator, in_region)
-    B = densify(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
+    A = upsample(scene, result.scene_samples, _DENSE, generator, in_region)
+    B = upsample(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
     residuals = {
         "scene_points": A.points,
         "scene_residuals": scene_residuals(scene, obj, A.points, T),
         "object_points": B.points,
         "object_residuals": object_residuals(scene, obj, B.points, T),
     }
-    around = surroundings(scene, detection, _COARSE, generator)
+    around = sample_surroundings(scene, detection, _COARSE, generator)
     metrics = {**result.metrics, "field_evaluations_clouds": float(scene.evaluations + obj.evaluations)}
     return replace(result, scene_samples=A, object_samples=B, residuals=residuals, surroundings=around, metrics=metrics)
 

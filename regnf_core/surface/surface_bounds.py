@@ -14,7 +14,7 @@ _GRID = 32  # cells along the longest edge; 32,768 evaluations at most
 _MARGIN = 0.02
 
 
-def surface_extent(field: SdfField) -> OrientedBox:
+def surface_bounds(field: SdfField) -> OrientedBox:
     """The axis-aligned box of the field's zero level, field frame.
 
     Looks at a grid of cell centers; where a cell may hold surface, one Newton step carries its center there.

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.surface.exterior import FreeSpace
+from regnf_core.surface.free_space import FreeSpace
 
 _REACH = 1.15 * 0.5 * 3**0.5
 """Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""

@@ -7,16 +7,18 @@ from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.result import SurfaceSamples
-from regnf_core.surface.densify import densify
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.surface.projection import project_to_surface
+from regnf_core.surface.upsampling import upsample
 
 _SEED_SHARE = 0.2
 _NEWTON_STEPS = 3
 _TOLERANCE = 1e-3  # of the bounds' diagonal: largest |S| at a point that is kept
 
 
-def surroundings(scene: SdfField, detection: OrientedBox, count: int, generator: torch.Generator) -> SurfaceSamples:
+def sample_surroundings(
+    scene: SdfField, detection: OrientedBox, count: int, generator: torch.Generator
+) -> SurfaceSamples:
     """About ``count`` points of the scene's surface outside the detection box, scene frame, with unit normals.
 
     Random points of the bounds are drawn onto the surface by Newton's method along the gradient; those that do not
@@ -33,4 +35,4 @@ def surroundings(scene: SdfField, detection: OrientedBox, count: int, generator:
     kept = (found.distance.abs() <= _TOLERANCE * float((high - low).norm())) & shown(found.points)
     normals = torch.nn.functional.normalize(found.gradient[kept], dim=-1)
     seeds = SurfaceSamples(found.points[kept], normals)
-    return densify(scene, seeds, count, generator, shown) if len(seeds.points) else seeds
+    return upsample(scene, seeds, count, generator, shown) if len(seeds.points) else seeds

@@ -1,4 +1,4 @@
-"""How well two fields agree under a transform: residuals that, unlike the published loss, keep the scale.
+"""Residuals between two fields under a transform. Unlike those of the published loss, they keep the scale.
 
 Under x_object = T x the two fields describe one surface when S_object(T x) = s S_scene(x).
 """
@@ -27,10 +27,10 @@ def object_residuals(scene: SdfField, obj: SdfField, points: Tensor, T_object_sc
     return float(T_object_scene.scale) * moved - obj.signed_distance(points).to(points)
 
 
-def disagreement(
+def mean_residual(
     scene: SdfField, obj: SdfField, scene_points: Tensor, object_points: Tensor, T_object_scene: Sim3, cap: float
 ) -> float:
-    """Mean residual of both directions, each residual capped at ``cap`` (object units): a score, smaller is better."""
-    forth = scene_residuals(scene, obj, scene_points, T_object_scene).abs()
-    back = object_residuals(scene, obj, object_points, T_object_scene).abs()
-    return float(torch.cat([forth, back.to(forth)]).clamp_max(cap).mean())
+    """Mean |residual| of both directions, each at most ``cap`` (object units): a score, smaller is better."""
+    scene_to_object = scene_residuals(scene, obj, scene_points, T_object_scene).abs()
+    object_to_scene = object_residuals(scene, obj, object_points, T_object_scene).abs()
+    return float(torch.cat([scene_to_object, object_to_scene.to(scene_to_object)]).clamp_max(cap).mean())

@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from regnf_core.geometry.nearest_neighbors import gaps
+from regnf_core.geometry.points import gaps
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.paper.verification import INLIER_DISTANCE
-from regnf_core.result import RegistrationResult, SurfaceSamples
+from regnf_core.geometry.surface_samples import SurfaceSamples
+from regnf_core.result import RegistrationResult
 from regnf_core.surface.cameras import axis_vector
 from regnf_core.viewing.splats import Floats, Surfels, View, nearest_surfels, paint, view_from
 
@@ -24,13 +24,14 @@ _PANEL = 480
 _OVERSAMPLING = 2
 _CAPTION = 52
 _ELEVATION = np.radians(28.0)
+_RAMP_TOP = 0.015  # object diameters: largest residual of an inlier, by the defaults of both presets
 _DISC_SHARE = 1.5  # disc radius over the typical gap of the cloud: closes the gaps
 _RAMP = np.array(  # dark blue over teal to yellow: even in brightness, readable without telling red from green
     [[0.18, 0.20, 0.46], [0.19, 0.42, 0.56], [0.16, 0.62, 0.54], [0.53, 0.79, 0.34], [0.98, 0.88, 0.18]]
 )
 
 
-def preview(result: RegistrationResult) -> Image.Image:
+def registration_picture(result: RegistrationResult) -> Image.Image:
     """Three panels side by side in the scene frame: at the start, at the end, and the residuals of both surfaces."""
     scene = _surfels(result.scene_samples, SCENE_COLOR)
     start = _placed(result.object_samples, result.T_object_scene_initial, OBJECT_COLOR)
@@ -76,13 +77,11 @@ def _surfels(samples: SurfaceSamples, color: tuple[float, float, float]) -> Surf
 
 def _placed(samples: SurfaceSamples, T_object_scene: Sim3, color: tuple[float, float, float]) -> Surfels:
     """The object's samples in the scene frame."""
-    back = T_object_scene.inverse()
-    moved = SurfaceSamples(back.apply(samples.points.double().cpu()), samples.normals.double().cpu() @ back.rotation.mT)
-    return _surfels(moved, color)
+    return _surfels(samples.transformed(T_object_scene.inverse()), color)
 
 
 def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfels) -> Surfels:
-    top = INLIER_DISTANCE * result.metrics["object_diameter"]
+    top = _RAMP_TOP * result.metrics["object_diameter"]
     parts = []
     for cloud, name in ((scene, "scene_residuals"), (placed, "object_residuals")):
         sizes = result.residuals[name].double().abs().cpu().numpy()
@@ -132,4 +131,4 @@ def _color_bar(
     bar = np.broadcast_to((255 * ramp).astype(np.uint8), (height, width, 3))
     sheet.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
     draw.text((left, top + 20), "0", fill=_INK, font=font)
-    draw.text((left + width, top + 20), f"{100 * INLIER_DISTANCE:g} % of diameter", fill=_INK, font=font, anchor="ra")
+    draw.text((left + width, top + 20), f"{100 * _RAMP_TOP:g} % of diameter", fill=_INK, font=font, anchor="ra")

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
-from regnf_core.geometry.nearest_neighbors import gaps
-from regnf_core.result import SurfaceSamples
+from regnf_core.geometry.points import gaps
+from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.surface.projection import project_to_surface
 
 _REACH = 1.5  # new points lie up to this many gaps from an old one
@@ -18,7 +18,7 @@ _NEWTON_STEPS = 1  # new points start within a gap of the surface
 _TOLERANCE_SHARE = 0.05  # of a typical gap: largest |S| at a new point
 
 
-def densify(
+def upsample(
     field: SdfField,
     samples: SurfaceSamples,
     count: int,
@@ -44,7 +44,4 @@ def densify(
     found = project_to_surface(field.signed_distance_and_gradient, points, _NEWTON_STEPS)
     kept = (found.distance.abs() <= _TOLERANCE_SHARE * gap) & inside(found.points)
     unit = torch.nn.functional.normalize(found.gradient, dim=-1)
-    return SurfaceSamples(
-        torch.cat([samples.points, found.points[kept]]),
-        torch.cat([samples.normals, unit[kept]]),
-    )
+    return SurfaceSamples.cat([samples, SurfaceSamples(found.points[kept], unit[kept])])

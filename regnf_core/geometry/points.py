@@ -1,9 +1,11 @@
-"""Nearest neighbors among points, by a k-d tree on the CPU: exact, deterministic, fast enough for any device."""
+"""Neighbors, spacing and size of point sets, computed on the CPU: exact, and the same on any device."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial.distance import pdist
 from torch import Tensor
 
 
@@ -25,3 +27,17 @@ def gaps(points: Tensor) -> Tensor:
     array = points.detach().cpu().numpy()
     distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
     return torch.as_tensor(distance.reshape(len(array), -1)[:, -1]).to(points)
+
+
+def diameter(points: Tensor) -> float:
+    """The largest distance between any two of the points (N, 3), N >= 1; found among the convex hull's corners."""
+    array = points.detach().double().cpu().numpy()
+    if array.shape[0] < 2:
+        return 0.0
+    try:
+        array = array[ConvexHull(array).vertices]
+    except QhullError:  # flat or tiny clouds have no hull; their own extreme points are few enough below
+        directions = np.random.default_rng(0).normal(size=(512, 3))
+        heights = array @ directions.T
+        array = array[np.unique(np.concatenate([heights.argmin(0), heights.argmax(0)]))]
+    return float(pdist(array).max(initial=0.0))
