@@ -21,7 +21,7 @@ _WORLD: dict[str, Any] = json.loads(Path(os.environ["REGNF_FUZZ_WORLD"]).read_te
 _FILES: list[bytes] = [Path(name).read_bytes() for name in _WORLD["files"]]
 _FIELD_FILES = st.one_of(st.sampled_from(_FILES), st.binary(min_size=1, max_size=400))
 _REAL_OF_FOUR = 3
-_LONGEST_WAIT_S = 1
+_MAX_WAIT_S = 1
 _LONGER_WAITS = frozenset(str(seconds) for seconds in range(2, 31))
 _NOT_THERE_YET = "EnsureResourceAvailability"
 
@@ -88,7 +88,7 @@ def refusals_beyond_schemas(ctx: Any, response: Any, case: Any) -> None:  # noqa
 def before_call(ctx: Any, case: Any, kwargs: Any) -> None:  # noqa: ARG001
     """Put real ids into requests that keep to the contract."""
     if case.query and str(case.query.get("wait")) in _LONGER_WAITS:
-        case.query["wait"] = _LONGEST_WAIT_S
+        case.query["wait"] = _MAX_WAIT_S
     if not _keeps_to_the_contract(case):
         return
     if case.meta.phase.name.value == "stateful":

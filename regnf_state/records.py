@@ -141,7 +141,7 @@ class RecordStore(Protocol):
         """The store's clock, seconds since the epoch."""
         ...
 
-    def remember(self, key: str, value: str, ttl_s: int) -> str:
+    def set_if_absent(self, key: str, value: str, ttl_s: int) -> str:
         """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic."""
         ...
 

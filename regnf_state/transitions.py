@@ -53,7 +53,7 @@ def changed_job(record: JobRecord, attempt: int, changes: dict[str, Any], now: f
     return replace(record, version=record.version + 1, updated=now, **(changes | derived))
 
 
-def beaten_job(record: JobRecord, attempt: int, now: float) -> JobRecord:
+def with_heartbeat(record: JobRecord, attempt: int, now: float) -> JobRecord:
     """The running job with a fresh heartbeat. Raises StaleAttemptError."""
     _require_attempt(record, attempt)
     if record.status != "running":

@@ -15,7 +15,7 @@ from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair
 from regnf_cli.remote import RemoteService
 
 ENDS = ("successful", "failed", "dismissed")
-_PATIENCE_S = 180.0
+_MAX_WAIT_S = 180.0
 _TIMES = 5
 """How often a job that was lost for good by two deaths is posted again."""
 _OPTIONS = {"up_axis": "z"}
@@ -97,10 +97,10 @@ class Client:
         job = self._ask("POST", "/register", (200, 202), json=request)
         if cancel:
             self._ask("POST", f"/jobs/{job['id']}/cancel", (200, 202, 409))
-        end = time.monotonic() + _PATIENCE_S
+        end = time.monotonic() + _MAX_WAIT_S
         while job["status"] not in ENDS:
             if time.monotonic() > end:
-                raise TimeoutError(f"{job['id']} is {job['status']} after {_PATIENCE_S:.0f} s")
+                raise TimeoutError(f"{job['id']} is {job['status']} after {_MAX_WAIT_S:.0f} s")
             job = self._ask("GET", f"/jobs/{job['id']}", (200,), params={"wait": 10})
         return job
 
@@ -143,9 +143,9 @@ class Client:
 
 
 def _until(look: Callable[[], dict[str, Any] | None], what: str) -> dict[str, Any]:
-    end = time.monotonic() + _PATIENCE_S
+    end = time.monotonic() + _MAX_WAIT_S
     while (found := look()) is None:
         if time.monotonic() > end:
-            raise TimeoutError(f"{what}: no answer within {_PATIENCE_S:.0f} s")
+            raise TimeoutError(f"{what}: no answer within {_MAX_WAIT_S:.0f} s")
         time.sleep(0.3)
     return found

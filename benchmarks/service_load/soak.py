@@ -44,16 +44,16 @@ _SETTINGS: dict[str, object] = {
 
 @dataclass(frozen=True)
 class Plan:
-    """What to run. ``deeds`` weighs what is done to the service, ``pauses_s`` bounds the time between two of them."""
+    """What to run. ``actions`` weighs what is done to the service, ``pauses_s`` bounds the time between two of them."""
 
     jobs: int
     seed: int
     clients: int = 8
     workers: int = 2
     questions: int = 6
-    deeds: tuple[tuple[str, int], ...] = (("worker", 4), ("job", 4), ("redis", 2), ("emptied", 1))
+    actions: tuple[tuple[str, int], ...] = (("worker", 4), ("job", 4), ("redis", 2), ("emptied", 1))
     pauses_s: tuple[float, float] = (4.0, 16.0)
-    most_deeds: int = 1_000_000
+    max_actions: int = 1_000_000
 
 
 @dataclass
@@ -72,8 +72,8 @@ class Samples:
 
 def disturb(house: House, plan: Plan, stop: threading.Event, done: Counter[str]) -> None:
     """Kill something every few seconds."""
-    random, (names, weights) = Random(plan.seed), zip(*plan.deeds, strict=True)
-    while done.total() < plan.most_deeds and not stop.wait(random.uniform(*plan.pauses_s)):
+    random, (names, weights) = Random(plan.seed), zip(*plan.actions, strict=True)
+    while done.total() < plan.max_actions and not stop.wait(random.uniform(*plan.pauses_s)):
         what = random.choices(names, weights)[0]
         worker = random.randrange(len(house.workers))
         if what == "worker":

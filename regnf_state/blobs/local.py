@@ -47,7 +47,7 @@ class LocalBlobWriter(AbstractContextManager["LocalBlobWriter"]):
             file.close()  # a sweep took it between its creation and its lock
 
     def write(self, data: bytes) -> int:
-        with self._store.told_apart():
+        with self._store.translate_errors():
             return self._file.write(data)
 
     def commit(self, key: str) -> None:
@@ -92,11 +92,11 @@ class LocalBlobStore:
     """A BlobStore in the folder ``root``, shared by any number of processes of one machine or one network volume.
 
     The folder for temporary files is made with the store: where it is missing, the volume is away, and that is waited
-    for, ``patience_s`` seconds at most; then StorageUnavailableError is raised. ``existing``: nothing is made.
+    for, ``wait_s`` seconds at most; then StorageUnavailableError is raised. ``existing``: nothing is made.
     """
 
-    def __init__(self, root: Path, patience_s: float = 0.0, existing: bool = False) -> None:
-        self._patience_s = patience_s
+    def __init__(self, root: Path, wait_s: float = 0.0, existing: bool = False) -> None:
+        self._wait_s = wait_s
         if not existing:
             root.mkdir(mode=0o700, parents=True, exist_ok=True)
             (root / _TEMPORARY).mkdir(exist_ok=True)
@@ -111,7 +111,7 @@ class LocalBlobStore:
             raise StorageUnavailableError(errno.ENODEV, "the blob store is away")
 
     @contextmanager
-    def told_apart(self) -> Iterator[None]:
+    def translate_errors(self) -> Iterator[None]:
         """Tells a full volume, one that is away or fails, and a blob that is missing apart."""
         try:
             yield
@@ -129,10 +129,10 @@ class LocalBlobStore:
         """What ``do`` returns once the store is there."""
 
         def once() -> _Value:
-            with self.told_apart():
+            with self.translate_errors():
                 return do()
 
-        return until_available(once, self._patience_s)
+        return until_available(once, self._wait_s)
 
     def sweep(self, older_than_s: float = 0.0) -> int:
         return self.tried(lambda: self._sweep(older_than_s))

@@ -11,14 +11,14 @@ from obstore.exceptions import BaseError
 from obstore.store import S3Store
 
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.blobs.retry import LONGEST_WAIT_S
+from regnf_state.blobs.retry import MAX_WAIT_S
 
 _CONNECT_TIMEOUT_S = 5.0
 _ENDPOINTS = ("AWS_ENDPOINT", "AWS_ENDPOINT_URL")
 
 
-def object_client(url: str, patience_s: float, timeout_s: float) -> S3Store:
-    """A client of the bucket and the prefix in ``url``, which repeats for ``patience_s`` what was certainly not done.
+def object_client(url: str, wait_s: float, timeout_s: float) -> S3Store:
+    """A client of the bucket and the prefix in ``url``, which repeats for ``wait_s`` what was certainly not done.
 
     A request may take ``timeout_s`` seconds. Endpoint and credentials are those of the usual AWS_* variables.
     """
@@ -32,10 +32,10 @@ def object_client(url: str, patience_s: float, timeout_s: float) -> S3Store:
         },
         retry_config={
             "max_retries": 1000,
-            "retry_timeout": timedelta(seconds=patience_s),
+            "retry_timeout": timedelta(seconds=wait_s),
             "backoff": {
                 "init_backoff": timedelta(seconds=0.1),
-                "max_backoff": timedelta(seconds=LONGEST_WAIT_S),
+                "max_backoff": timedelta(seconds=MAX_WAIT_S),
                 "base": 2,
             },
         },
@@ -43,7 +43,7 @@ def object_client(url: str, patience_s: float, timeout_s: float) -> S3Store:
 
 
 @contextmanager
-def told_apart() -> Iterator[None]:
+def translate_errors() -> Iterator[None]:
     """Turns the client's errors into OSErrors; FileNotFoundError is one already."""
     try:
         yield

@@ -22,7 +22,7 @@ from obstore.exceptions import AlreadyExistsError, BaseError, PreconditionError
 
 from regnf_state.blobs.base import BlobEntry, check_key
 from regnf_state.blobs.cache import FileCache
-from regnf_state.blobs.object_client import object_client, told_apart
+from regnf_state.blobs.object_client import object_client, translate_errors
 from regnf_state.blobs.retry import until_available
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class ObjectBlobWriter:
         return len(data)
 
     def _send(self) -> None:
-        with told_apart():
+        with translate_errors():
             if self._stream is None:
                 self._temporary = f"{_TEMPORARY}/{uuid4().hex}"
                 self._stream = obstore.open_writer(
@@ -73,7 +73,7 @@ class ObjectBlobWriter:
             self._store.put(key, bytes(self._buffer))
             return
         self._send()
-        with told_apart():
+        with translate_errors():
             self._stream.close()
         self._stream = None
         source = self._temporary
@@ -135,14 +135,14 @@ class ObjectBlobStore:
     """A BlobStore in the bucket and below the prefix of an ``s3://`` address.
 
     The endpoint and the credentials are those of the usual AWS_* variables. A request that fails for the moment is
-    repeated for ``patience_s`` seconds; then StorageUnavailableError is raised. Fields are kept in ``cache``, if given.
+    repeated for ``wait_s`` seconds; then StorageUnavailableError is raised. Fields are kept in ``cache``, if given.
     """
 
-    def __init__(self, url: str, patience_s: float = 10.0, cache: FileCache | None = None) -> None:
-        self._patience_s = patience_s
+    def __init__(self, url: str, wait_s: float = 10.0, cache: FileCache | None = None) -> None:
+        self._wait_s = wait_s
         self._cache = cache
-        self.client = object_client(url, patience_s, _REQUEST_TIMEOUT_S)
-        self.copier = object_client(url, patience_s, _COPY_TIMEOUT_S)
+        self.client = object_client(url, wait_s, _REQUEST_TIMEOUT_S)
+        self.copier = object_client(url, wait_s, _COPY_TIMEOUT_S)
 
     def tried(self, do: Callable[[], _Value]) -> _Value:
         """What a request that may be repeated answers. Raises FileNotFoundError, StorageUnavailableError.
@@ -151,10 +151,10 @@ class ObjectBlobStore:
         """
 
         def once() -> _Value:
-            with told_apart():
+            with translate_errors():
                 return do()
 
-        return until_available(once, self._patience_s)
+        return until_available(once, self._wait_s)
 
     def writer(self) -> ObjectBlobWriter:
         return ObjectBlobWriter(self)
@@ -235,7 +235,7 @@ class ObjectBlobStore:
         return self._head(key)["size"]
 
     def _entries(self, prefix: str) -> Iterator[BlobEntry]:
-        with told_apart():
+        with translate_errors():
             for page in obstore.list(self.client, prefix or None, chunk_size=_PAGE):
                 for meta in page:
                     yield BlobEntry(meta["path"], meta["size"], meta["last_modified"].timestamp())

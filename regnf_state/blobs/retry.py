@@ -8,20 +8,20 @@ from typing import TypeVar
 
 from regnf_state.blobs.base import StorageUnavailableError
 
-LONGEST_WAIT_S = 2.0
+MAX_WAIT_S = 2.0
 _FIRST_WAIT_S = 0.1
 _Value = TypeVar("_Value")
 
 
-def until_available(do: Callable[[], _Value], patience_s: float) -> _Value:
-    """What ``do`` returns, which bears being repeated. Raises StorageUnavailableError after ``patience_s`` seconds."""
-    end = time.monotonic() + patience_s
-    wait_s = _FIRST_WAIT_S
+def until_available(do: Callable[[], _Value], wait_s: float) -> _Value:
+    """What ``do`` returns, which bears being repeated. Raises StorageUnavailableError after ``wait_s`` seconds."""
+    end = time.monotonic() + wait_s
+    pause_s = _FIRST_WAIT_S
     while True:
         try:
             return do()
         except StorageUnavailableError:
-            if time.monotonic() + wait_s > end:
+            if time.monotonic() + pause_s > end:
                 raise
-        time.sleep(wait_s)
-        wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, MAX_WAIT_S)

@@ -15,11 +15,11 @@ from redis import Redis
 from regnf_state.journal.journal import Journal
 from regnf_state.redis.documents import PREFIX, text
 
-_KEY = f"{PREFIX}epoch"
+_KEY = f"{PREFIX}generation"
 _MARK = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2]) return 1 end return 0"
 
 
-class Epoch:
+class Generation:
     """The mark of one blob store in one Redis."""
 
     def __init__(self, redis: Redis, journal: Journal) -> None:
@@ -35,7 +35,7 @@ class Epoch:
         server: Any = self._redis.info("server")
         return f"{self._storage_id}:{server.get('run_id', '')}"
 
-    def stands(self) -> bool:
+    def is_current(self) -> bool:
         """Whether everything in the journal is in Redis."""
         held: Any = self._redis.get(_KEY)
         return held is not None and text(held) == self._name()

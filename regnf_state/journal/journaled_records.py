@@ -14,7 +14,7 @@ from typing import Any
 from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
-from regnf_state.journal.generation import Epoch
+from regnf_state.journal.generation import Generation
 from regnf_state.journal.journal import Journal
 from regnf_state.records import FINISHED, NO_QUOTA, FieldRecord, JobNews, JobRecord, Quota
 from regnf_state.redis.documents import PREFIX
@@ -33,9 +33,9 @@ class JournaledRecordStore(RedisRecordStore):
         self.journal = Journal(blobs)
 
     @cached_property
-    def epoch(self) -> Epoch:
+    def generation(self) -> Generation:
         """Tells whether Redis holds what the journal says."""
-        return Epoch(self._redis, self.journal)
+        return Generation(self._redis, self.journal)
 
     # jobs
 
@@ -50,14 +50,14 @@ class JournaledRecordStore(RedisRecordStore):
 
     def get_job(self, job_id: str) -> JobRecord | None:
         found = super().get_job(job_id)
-        if found is None and not self.epoch.stands():
+        if found is None and not self.generation.is_current():
             self.recall_job(job_id)
             found = super().get_job(job_id)
         return found
 
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
         found = super().news(positions)
-        if all(one.record is not None for one in found) or self.epoch.stands():
+        if all(one.record is not None for one in found) or self.generation.is_current():
             return found
         for job_id, _ in positions:
             self.get_job(job_id)  # recalls the jobs that Redis has lost
@@ -120,7 +120,7 @@ class JournaledRecordStore(RedisRecordStore):
 
     def get_field(self, sha256: str) -> FieldRecord | None:
         found = super().get_field(sha256)
-        if found is None and not self.epoch.stands():
+        if found is None and not self.generation.is_current():
             self.recall_field(sha256)
             found = super().get_field(sha256)
         return found
@@ -128,7 +128,7 @@ class JournaledRecordStore(RedisRecordStore):
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
         found = super().get_fields(references)
         missing = [name for name, field in zip(references, found, strict=True) if field is None]
-        if not missing or self.epoch.stands():
+        if not missing or self.generation.is_current():
             return found
         for name in missing:
             self.recall_field(name)

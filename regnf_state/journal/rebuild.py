@@ -39,11 +39,11 @@ class Rebuilder:
 
     def run_if_needed(self) -> Rebuilt:
         """Read the journal unless Redis holds all of it. Raises RedisError, OSError; then the next call begins anew."""
-        if self._records.epoch.stands():
+        if self._records.generation.is_current():
             return Rebuilt()
-        token = self._records.epoch.begin()
+        token = self._records.generation.begin()
         rebuilt = self._run()
-        if self._records.epoch.end(token) and (rebuilt.jobs or rebuilt.fields):
+        if self._records.generation.end(token) and (rebuilt.jobs or rebuilt.fields):
             logger.warning("from the journal: %d jobs and %d fields", len(rebuilt.jobs), len(rebuilt.fields))
         return rebuilt
 

@@ -55,7 +55,7 @@ class InMemoryRecordStore:
     def ping(self) -> bool:
         return True
 
-    def remember(self, key: str, value: str, ttl_s: int) -> str:
+    def set_if_absent(self, key: str, value: str, ttl_s: int) -> str:
         with self._changed:
             known = self._remembered.get(key)
             if known is None or known[1] <= self.now():
@@ -129,7 +129,7 @@ class InMemoryRecordStore:
 
     def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
         with self._changed:
-            return self._save(transitions.beaten_job(self._require_job(job_id), attempt, self.now()))
+            return self._save(transitions.with_heartbeat(self._require_job(job_id), attempt, self.now()))
 
     def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
         with self._changed:

@@ -1,7 +1,7 @@
-"""Counts of what happens to jobs and fields, kept in Redis: written in the same step as the change that they count.
+"""Counters of what happens to jobs and fields, in Redis. A counter changes in the same step as the record it is about.
 
-So every process counts, each event counts once whoever brings it about, and nothing is lost with a process. A figure is
-a field of one hash: its name and its labels' values, joined by a bar. Seconds are counted by upper bounds of their own.
+So an event counts once, whichever process causes it, and no count is lost when a process ends. A counter is a field of
+one hash: its name and the values of its labels, joined by a bar. Times are counted in buckets with fixed upper bounds.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from redis import Redis
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord
 from regnf_state.redis.documents import PREFIX, Command, text
 
-_KEY = f"{PREFIX}figures"
+_KEY = f"{PREFIX}counters"
 BOUNDS_S = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
 
 
@@ -62,8 +62,8 @@ def of_field(before: FieldRecord | None, after: FieldRecord) -> list[Command]:
     return [counted("imports", after.state, reason), *timed("import_seconds", after.updated - before.updated)]
 
 
-class Figures:
-    """All figures as they were at one moment."""
+class Counters:
+    """All counters as they were at one moment."""
 
     def __init__(self, redis: Redis) -> None:
         held: Any = redis.hgetall(_KEY)

@@ -9,7 +9,7 @@ from typing import Any
 from regnf_state import transitions
 from regnf_state.ownership import owner_of
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError
-from regnf_state.redis import counters as figures
+from regnf_state.redis import counters
 from regnf_state.redis.documents import PREFIX, Cap, Command, RedisDocuments, text
 
 _CREATED = f"{PREFIX}fields:created"
@@ -70,7 +70,7 @@ class RedisFieldRecords(RedisDocuments):
                 raise StaleAttemptError("there is no such field")
             known = FieldRecord(**document)
             changed = change(known, now)
-            if self._save_field(known.version, changed, figures.of_field(known, changed)) == "OK":
+            if self._save_field(known.version, changed, counters.of_field(known, changed)) == "OK":
                 return changed
 
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:

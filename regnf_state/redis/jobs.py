@@ -29,7 +29,7 @@ from regnf_state.records import (
     QuotaError,
     StaleAttemptError,
 )
-from regnf_state.redis import counters as figures
+from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
 from regnf_state.redis.documents import PREFIX, Cap, Command, text
 from regnf_state.redis.fields import RedisFieldRecords
@@ -81,8 +81,8 @@ class RedisRecordStore(RedisFieldRecords):
         self._retention_s = retention_s
         self._expire = redis.register_script(_EXPIRE)
 
-    def remember(self, key: str, value: str, ttl_s: int) -> str:
-        known = self._redis.set(f"{PREFIX}remembered:{key}", value, nx=True, get=True, ex=ttl_s)
+    def set_if_absent(self, key: str, value: str, ttl_s: int) -> str:
+        known = self._redis.set(f"{PREFIX}once:{key}", value, nx=True, get=True, ex=ttl_s)
         return value if known is None else text(known)  # type: ignore[arg-type]
 
     def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
@@ -96,7 +96,7 @@ class RedisRecordStore(RedisFieldRecords):
             commands.append(("ZREM", _WAITING, after.id))
         elif before is None or before.status != "accepted":
             commands.append(("ZADD", _WAITING, repr(after.updated), after.id))
-        commands += figures.of_job(before, after)
+        commands += counters.of_job(before, after)
         event = transitions.event_of(before, after)
         if event is not None:
             name, data = event
@@ -180,7 +180,7 @@ class RedisRecordStore(RedisFieldRecords):
         return self._change_job(job_id, lambda known, now: transitions.changed_job(known, attempt, changes, now))
 
     def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
-        return self._change_job(job_id, lambda known, now: transitions.beaten_job(known, attempt, now))
+        return self._change_job(job_id, lambda known, now: transitions.with_heartbeat(known, attempt, now))
 
     def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
         return self._change_job(job_id, lambda known, now: transitions.requeued_job(known, attempt, now, lost))

@@ -17,7 +17,7 @@ from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 from regnf_state.queue import IMPORT_FUNCTION, IMPORT_QUEUE_NAME, QUEUE_NAME, REGISTER_FUNCTION
 from regnf_state.redis.documents import text
 
-_LONGEST_S = 24 * 3600
+_MAX_S = 24 * 3600
 """What RQ itself would allow a job; workers set the limit that counts from their own settings."""
 _FAILURE_KEPT_S = 60
 
@@ -63,7 +63,7 @@ class RqJobQueue:
                     argument,
                     job_id=rq_id,
                     unique=True,
-                    job_timeout=_LONGEST_S,
+                    job_timeout=_MAX_S,
                     result_ttl=0,
                     failure_ttl=_FAILURE_KEPT_S,
                     description=f"{function} {rq_id}",

@@ -32,7 +32,7 @@ from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 
-_STORAGE_PATIENCE_S = 10.0
+_STORAGE_WAIT_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
 _ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
 # links that people pass on and probes gather parameters that nobody meant
@@ -106,7 +106,7 @@ def _open(
     if needs_redis and settings.redis_url is None:
         raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
     redis = connect(settings.redis_url) if needs_redis and settings.redis_url is not None else None
-    blobs = blobs or open_blobs(settings, _STORAGE_PATIENCE_S)
+    blobs = blobs or open_blobs(settings, _STORAGE_WAIT_S)
     if redis is not None:
         records = records or JournaledRecordStore(redis, settings.retention_s, blobs)
         queue = queue or RqJobQueue(redis)

@@ -12,7 +12,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_service.http.concurrency import pause
-from regnf_service.http.dependencies import Services, off_loop
+from regnf_service.http.dependencies import Services, in_thread
 from regnf_service.metrics import Metrics, served
 from regnf_service.shutdown import stopping_on_signals
 from regnf_service.upkeep.housekeeping import Housekeeper
@@ -61,7 +61,7 @@ async def _reap(services: Services, redis: Redis) -> None:
     reaper = Reaper(records, services.queue, redis, services.settings, services.blobs, rebuilder, housekeeper)
     while not services.stopping.is_set():
         try:
-            await off_loop(reaper.run_once)
+            await in_thread(reaper.run_once)
         except (RedisError, OSError) as error:
             logger.warning("the reaper found a store away: %s", type(error).__name__)
         except Exception:

@@ -17,7 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.http.dependencies import Services
 from regnf_service.http.middleware import route_of
-from regnf_state.redis.counters import Figures
+from regnf_state.redis.counters import Counters
 from regnf_state.redis.webhook_outbox import RedisOutbox
 
 _COUNTS = {
@@ -94,15 +94,15 @@ class _Held(Collector):
         if self._redis is None:
             return
         yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(self._redis).waiting())
-        figures = Figures(self._redis)
+        counters = Counters(self._redis)
         for name, (about, names) in _COUNTS.items():
             counter = CounterMetricFamily(f"regnf_{name}", about, labels=names)
-            for counted, value in figures.counts(name):
+            for counted, value in counters.counts(name):
                 counter.add_metric(counted, value)
             yield counter
         for name, (about, names) in _TIMES.items():
             times = HistogramMetricFamily(f"regnf_{name}", about, labels=names)
-            for group, buckets, total in figures.times(name):
+            for group, buckets, total in counters.times(name):
                 times.add_metric(group, buckets, total)
             yield times
 

@@ -1,4 +1,4 @@
-"""The API, with short patience unless in the whole version: `python -m tests.faults.api FD`, a socket it is handed.
+"""The API, with short waits unless in the whole version: `python -m tests.faults.api FD`, a socket it is handed.
 
 With REGNF_TEST_DIE it kills itself where a job would be queued.
 """
@@ -31,10 +31,10 @@ class DyingQueue(RqJobQueue):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
-def shorten_patience() -> None:
+def shorten_waits() -> None:
     """What no setting shortens."""
     lifespan._REAP_EVERY_S = 0.5
-    app._STORAGE_PATIENCE_S = 0.7
+    app._STORAGE_WAIT_S = 0.7
     reaper._UNHELD_FOR_S = 2.0
     reaper._LEADS_FOR_S = 3
     object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S
@@ -52,5 +52,5 @@ def serve(descriptor: int) -> None:
 if __name__ == "__main__":
     configure_logging("text")
     if not pace().whole:
-        shorten_patience()
+        shorten_waits()
     serve(int(sys.argv[1]))

@@ -14,7 +14,7 @@ from regnf_state.blobs.object_client import object_client
 from tests.object_store import ObjectServer, environment
 
 _TEMPORARY = ".tmp/"
-_PATIENCE_S = 30.0
+_MAX_WAIT_S = 30.0
 
 
 class Store(Protocol):
@@ -67,7 +67,7 @@ class Bucket:
     @cached_property
     def _client(self) -> S3Store:
         with environment(self.server.environment):
-            return object_client(f"s3://{self.name}/service", _PATIENCE_S, _PATIENCE_S)
+            return object_client(f"s3://{self.name}/service", _MAX_WAIT_S, _MAX_WAIT_S)
 
     def listing(self) -> list[str]:
         found = [entry["path"] for page in obstore.list(self._client) for entry in page]

@@ -82,7 +82,7 @@ def test_a_clock_stepped_during_an_import(house: House, clocks: Clocks, steps: d
     house.start_worker(**clocks["worker"].environment)
     house.hold("hold-import")
     name = house.upload(field_bytes("scene"))
-    eventually(lambda: house.redis.keys("regnf:remembered:import:*"), house.log)  # it was claimed
+    eventually(lambda: house.redis.keys("regnf:once:import:*"), house.log)  # it was claimed
     with fault() as one:
         for clock, step in steps.items():
             clocks[clock].step(step)
@@ -90,7 +90,7 @@ def test_a_clock_stepped_during_an_import(house: House, clocks: Clocks, steps: d
         one.over()
         house.let_go("hold-import")
         eventually(lambda: house.field(name)["state"] == "ready", house.log, 120.0)
-    assert len(house.redis.keys("regnf:remembered:import:*")) == 1, "one attempt"
+    assert len(house.redis.keys("regnf:once:import:*")) == 1, "one attempt"
     check_promise(house, [house.submit()])
 
 

@@ -76,13 +76,13 @@ def context(existing: bool = True) -> Context:
 
 
 def run_registration(job_id: str) -> None:
-    shorten_patience()
+    shorten_waits()
     registration.publish = publish
     run_attempt(context(), job_id, *delivery(), HeldEngine)
 
 
 def run_import(sha256: str) -> None:
-    shorten_patience()
+    shorten_waits()
     run_import_attempt(context(), sha256, *delivery(), held_importer)
 
 
@@ -94,7 +94,7 @@ def work() -> None:
         scratch.remove()
 
 
-def shorten_patience() -> None:
+def shorten_waits() -> None:
     """What no setting shortens."""
     if not pace().whole:
         object_blobs._REQUEST_TIMEOUT_S = REQUEST_TIMEOUT_S

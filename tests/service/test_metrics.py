@@ -16,7 +16,7 @@ from regnf_service.metrics import Metrics, served
 from regnf_state.memory import InMemoryBlobStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.counters import BOUNDS_S, Figures
+from regnf_state.redis.counters import BOUNDS_S, Counters
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
@@ -88,7 +88,7 @@ def test_seconds_go_into_the_buckets_of_their_bounds(redis: Redis) -> None:
     for seconds in (0.05, 0.1, 0.2, 2.0, 5000.0, -3.0):
         for command in timed("job_wait_seconds", seconds):
             redis.execute_command(*command)
-    ((labels, buckets, total),) = Figures(redis).times("job_wait_seconds")
+    ((labels, buckets, total),) = Counters(redis).times("job_wait_seconds")
     assert (labels, total) == ((), pytest.approx(5002.35))
     assert dict(buckets)["0.1"] == 3
     assert dict(buckets)["0.3"] == 4

@@ -161,7 +161,7 @@ def test_a_store_that_is_away_is_told_after_some_patience(tmp_path: Path) -> Non
     with environment(
         {"AWS_ENDPOINT_URL": "http://127.0.0.1:1", "AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x"}
     ):
-        store = ObjectBlobStore("s3://bucket", patience_s=0.2)
+        store = ObjectBlobStore("s3://bucket", wait_s=0.2)
     for use in (store.probe, lambda: store.open("a"), lambda: store.put("a", b"."), lambda: list(store.list(""))):
         with pytest.raises(StorageUnavailableError):
             use()
@@ -298,7 +298,7 @@ def test_a_folder_that_is_away_is_no_empty_folder(away: LocalBlobStore, tmp_path
 
 
 def test_a_folder_that_comes_back_in_time_was_never_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    store = LocalBlobStore(tmp_path / "blobs", patience_s=60.0)
+    store = LocalBlobStore(tmp_path / "blobs", wait_s=60.0)
     with store.writer() as writer:
         writer.write(b"half")
         store.root.rename(tmp_path / "elsewhere")

@@ -91,9 +91,9 @@ def test_active_jobs_hold_their_fields(store: RecordStore) -> None:
 
 
 def test_remembering_binds_once(store: RecordStore) -> None:
-    assert store.remember("key", "first", 60) == "first"
-    assert store.remember("key", "second", 60) == "first"
-    assert store.remember("other", "second", 60) == "second"
+    assert store.set_if_absent("key", "first", 60) == "first"
+    assert store.set_if_absent("key", "second", 60) == "first"
+    assert store.set_if_absent("other", "second", 60) == "second"
     assert store.ping()
 
 

@@ -149,7 +149,7 @@ def test_finished_jobs_expire_and_are_remembered_as_gone_in_redis(redis_url: str
             b"regnf:jobs:created",
             b"regnf:jobs:created:anonymous",
             b"regnf:owner:anonymous:active",
-            b"regnf:figures",
+            b"regnf:counters",
             b"regnf:jobs:active",
             b"regnf:jobs:waiting",
         }

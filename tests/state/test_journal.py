@@ -146,7 +146,7 @@ def test_two_machines_read_the_journal_at_once(world: World) -> None:
     assert {world.job(job_id).attempt for job_id in jobs} == {2}
     queued = world.queue.registrations + other.queue.registrations
     assert sorted(queued) == sorted((job_id, 2) for job_id in jobs)
-    assert world.records.epoch.stands()
+    assert world.records.generation.is_current()
 
 
 def test_redis_lost_again_while_the_journal_is_read(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,7 +161,7 @@ def test_redis_lost_again_while_the_journal_is_read(world: World, monkeypatch: p
     monkeypatch.setattr(world.records.journal, "recall", interrupted)
     world.lose_redis()
     world.redis.flushall()
-    assert not world.records.epoch.stands()
+    assert not world.records.generation.is_current()
     assert world.rebuilder.run_if_needed() == Rebuilt(jobs=("j1",))
 
 
@@ -169,11 +169,11 @@ def test_a_restart_of_redis_is_noticed(world: World) -> None:
     """It may have lost its last second: the journal is compared once more, and what is there is left alone."""
     world.accept()
     world.run()
-    world.redis.set("regnf:epoch", f"{world.records.journal.storage_id()}:another-run")
+    world.redis.set("regnf:generation", f"{world.records.journal.storage_id()}:another-run")
     world.redis.delete("regnf:job:j1")
     assert world.rebuilder.run_if_needed() == Rebuilt(jobs=("j1",))
     world.run(attempt=2)
-    world.redis.set("regnf:epoch", "another-store:another-run")
+    world.redis.set("regnf:generation", "another-store:another-run")
     assert world.rebuilder.run_if_needed() == Rebuilt()
     assert world.job().status == "running"
 

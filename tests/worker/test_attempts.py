@@ -10,7 +10,7 @@ from regnf_state.records import FieldRecord
 from regnf_state.settings import Settings
 from regnf_worker.artifacts import publish, read_manifest
 from regnf_worker.context import Context
-from regnf_worker.pulse import Pulse
+from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.registration import run_attempt
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine
@@ -81,11 +81,11 @@ def test_a_field_that_is_never_imported_fails_the_job_at_last(tmp_path: Path) ->
 def test_progress_is_written_a_few_times_a_second_but_every_phase(context: Context) -> None:
     accept(context)
     context.records.update_job("j1", 1, status="running")
-    with Pulse(context.records, "j1", 1, 60) as pulse:
+    with Heartbeat(context.records, "j1", 1, 60) as heartbeat:
         for step in range(1000):
-            pulse.report("optimizing", step / 1000)
+            heartbeat.report("optimizing", step / 1000)
         for phase in ("verifying", "exporting"):
-            pulse.report(phase, 0.999)
+            heartbeat.report(phase, 0.999)
     events = context.records.events("j1", None)
     assert [event.data["phase"] for event in events][-2:] == ["verifying", "exporting"]
     assert len(events) < 50
@@ -95,6 +95,6 @@ def test_a_job_hears_that_another_attempt_has_taken_over(context: Context) -> No
     accept(context)
     context.records.update_job("j1", 1, status="running")
     context.records.requeue_job("j1", 1)
-    with Pulse(context.records, "j1", 1, 60) as pulse, pytest.raises(CancelledError):
-        pulse.report("optimizing", 0.5)
-    assert pulse.superseded
+    with Heartbeat(context.records, "j1", 1, 60) as heartbeat, pytest.raises(CancelledError):
+        heartbeat.report("optimizing", 0.5)
+    assert heartbeat.superseded

@@ -14,15 +14,15 @@ from rq.serializers import JSONSerializer
 from rq.worker.base import BaseWorker
 
 from regnf_state.redis.queue import RqJobQueue
-from regnf_worker.bookkeeping import PatientWorker
+from regnf_worker.bookkeeping import ResilientWorker
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis
 
 # RQ's calls, one by one
 
 
-def offline_worker() -> PatientWorker:
+def offline_worker() -> ResilientWorker:
     """Nothing that a test calls here reaches for Redis."""
-    return PatientWorker(["q"], connection=Redis(), prepare_for_work=False)
+    return ResilientWorker(["q"], connection=Redis(), prepare_for_work=False)
 
 
 class Named:
@@ -120,7 +120,7 @@ def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch)
 # the loop, over a real Redis of which every command in turn is refused
 
 
-class ChildlessWorker(PatientWorker):
+class ChildlessWorker(ResilientWorker):
     """Does what a forking worker's parent does around a job, and notes the job instead of forking for it."""
 
     def execute_job(self, job: Any, queue: Any) -> None:
@@ -210,7 +210,7 @@ def test_a_worker_that_redis_forgot_is_known_again_after_its_next_report(redis: 
         assert 0 < redis.ttl(worker.key) <= 45
 
 
-def redis_pipeline_report(redis: Redis, worker: PatientWorker) -> None:
+def redis_pipeline_report(redis: Redis, worker: ResilientWorker) -> None:
     with redis.pipeline() as pipeline:
         worker.heartbeat(5, pipeline)
         pipeline.execute()

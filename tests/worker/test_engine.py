@@ -28,11 +28,11 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     request = REQUEST | {"initial_transform": start, "ground_truth": None}
     files = Path("scene"), Path("object")
     names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path)
-    ((scene, obj, box, options, seed, _, given, model),) = calls
-    assert (scene, obj, seed, model, names) == ("scene", "object", 3, "the model", ["result.json"])
+    ((scene, obj, box, options, seed, _, warm),) = calls
+    assert (scene, obj, seed, warm.object_model, names) == ("scene", "object", 3, "the model", ["result.json"])
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
-    assert (None if given is None else given.matrix().tolist()) == start
+    assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start
 
 
 def test_requests_recorded_before_there_were_starts_still_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

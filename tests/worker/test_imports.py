@@ -5,16 +5,16 @@ from pathlib import Path
 
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
-from regnf_worker.settle import HorseEnd, settle_import
+from regnf_worker.settle import ChildExit, settle_import
 from tests.worker.doubles import SHA, begin_import, field
 from tests.worker.tiny_engine import tiny_importer
 
 
 def test_of_two_deliveries_of_an_import_one_does_the_work(context: Context) -> None:
     begin_import(context)
-    context.records.remember(f"import:{SHA}:1", "other", 60)
+    context.records.set_if_absent(f"import:{SHA}:1", "other", 60)
     run_import_attempt(context, SHA, 1, "w", tiny_importer)
-    settle_import(context, SHA, 1, "w", HorseEnd(signal=9))
+    settle_import(context, SHA, 1, "w", ChildExit(signal=9))
     assert field(context).state == "validating"
     run_import_attempt(context, SHA, 1, "other", tiny_importer)
     assert field(context).state == "ready"
@@ -50,7 +50,7 @@ def test_an_upload_after_a_deletion_owes_nothing_to_the_import_before_it(context
         return tiny_importer(upload, folder, description)
 
     run_import_attempt(context, SHA, 1, "w", importer)
-    settle_import(context, SHA, 1, "w", HorseEnd())
+    settle_import(context, SHA, 1, "w", ChildExit())
     assert field(context).state == "validating"
     assert list(context.blobs.list("")) == [f"fields/{SHA}/original"]
     run_import_attempt(context, SHA, field(context).attempt, "other", tiny_importer)

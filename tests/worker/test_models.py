@@ -195,7 +195,7 @@ def test_a_search_whose_candidate_is_gone_fails(context: Context) -> None:
 
 
 def test_a_search_stops_between_models_when_it_is_cancelled(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("regnf_worker.pulse._REPORT_EVERY_S", 0.0)  # every report asks the record
+    monkeypatch.setattr("regnf_worker.heartbeat._REPORT_EVERY_S", 0.0)  # every report asks the record
     engine = ModelEngine(while_making=lambda: context.records.request_cancel("j1"))
     assert run(context, engine, "j1", candidates=[CHAIR, TABLE, AIR]).status == "dismissed"
     assert engine.made == [b"chair"]

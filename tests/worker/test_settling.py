@@ -4,22 +4,24 @@ import pytest
 
 from regnf_worker.artifacts import publish
 from regnf_worker.context import Context
-from regnf_worker.settle import HorseEnd, settle_import, settle_registration
+from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from tests.worker.doubles import SHA, accept, begin_import, field, job
 
 
 @pytest.mark.parametrize(
     ("end", "reason"),
     [
-        (HorseEnd(signal=11), "WORKER_LOST"),
-        (HorseEnd(signal=11, out_of_memory=True), "WORKER_LOST"),
-        (HorseEnd(signal=9, out_of_memory=True), "OUT_OF_MEMORY"),
-        (HorseEnd(signal=9, late=True, out_of_memory=True), "JOB_TIMEOUT"),
-        (HorseEnd(late=True), "JOB_TIMEOUT"),
+        (ChildExit(signal=11), "WORKER_LOST"),
+        (ChildExit(signal=11, out_of_memory=True), "WORKER_LOST"),
+        (ChildExit(signal=9, out_of_memory=True), "OUT_OF_MEMORY"),
+        (ChildExit(signal=9, late=True, out_of_memory=True), "JOB_TIMEOUT"),
+        (ChildExit(late=True), "JOB_TIMEOUT"),
     ],
 )
 @pytest.mark.parametrize("claimed", [True, False])
-def test_how_a_process_ended_is_how_its_job_failed(context: Context, end: HorseEnd, reason: str, claimed: bool) -> None:
+def test_how_a_process_ended_is_how_its_job_failed(
+    context: Context, end: ChildExit, reason: str, claimed: bool
+) -> None:
     accept(context)
     if claimed:
         context.records.update_job("j1", 1, status="running", worker="w")
@@ -33,10 +35,10 @@ def test_how_a_process_ended_is_how_its_job_failed(context: Context, end: HorseE
 
 @pytest.mark.parametrize(
     ("end", "reason"),
-    [(HorseEnd(), "INTERNAL"), (HorseEnd(signal=9), "WORKER_LOST"), (HorseEnd(signal=15), "WORKER_LOST")],
+    [(ChildExit(), "INTERNAL"), (ChildExit(signal=9), "WORKER_LOST"), (ChildExit(signal=15), "WORKER_LOST")],
 )
 def test_a_process_that_vanishes_is_given_a_second_chance_and_no_third(
-    context: Context, end: HorseEnd, reason: str
+    context: Context, end: ChildExit, reason: str
 ) -> None:
     accept(context)
     context.blobs.put("jobs/j1/1/half", b".")
@@ -54,7 +56,7 @@ def test_a_process_that_vanishes_is_given_a_second_chance_and_no_third(
 def test_somebody_elses_job_is_left_alone(context: Context) -> None:
     accept(context)
     running = context.records.update_job("j1", 1, status="running", worker="other")
-    settle_registration(context, "j1", 1, "w", HorseEnd(signal=9))
+    settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
     assert job(context) == running
 
 
@@ -62,7 +64,7 @@ def test_a_killed_process_whose_result_stands_has_succeeded(context: Context) ->
     accept(context)
     context.records.update_job("j1", 1, status="running", worker="w")
     publish(context.blobs, "j1", {"attempt": 1, "artifacts": []})
-    settle_registration(context, "j1", 1, "w", HorseEnd(signal=9))
+    settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
     assert job(context).status == "successful"
 
 
@@ -70,14 +72,14 @@ def test_a_killed_process_whose_job_was_cancelled(context: Context) -> None:
     accept(context)
     context.records.update_job("j1", 1, status="running", worker="w")
     context.records.request_cancel("j1")
-    settle_registration(context, "j1", 1, "w", HorseEnd(signal=9))
+    settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
     assert job(context).status == "dismissed"
 
 
 @pytest.mark.parametrize(
-    ("end", "reason"), [(HorseEnd(signal=11), "WORKER_LOST"), (HorseEnd(late=True, signal=9), "IMPORT_TIMEOUT")]
+    ("end", "reason"), [(ChildExit(signal=11), "WORKER_LOST"), (ChildExit(late=True, signal=9), "IMPORT_TIMEOUT")]
 )
-def test_a_killed_import_rejects_its_field(context: Context, end: HorseEnd, reason: str) -> None:
+def test_a_killed_import_rejects_its_field(context: Context, end: ChildExit, reason: str) -> None:
     begin_import(context)
     settle_import(context, SHA, 1, "w", end)
     error = field(context).error
@@ -89,7 +91,7 @@ def test_a_killed_import_rejects_its_field(context: Context, end: HorseEnd, reas
 @pytest.mark.parametrize("given_back", [True, False])
 def test_an_import_given_back_or_killed_starts_anew(context: Context, given_back: bool) -> None:
     begin_import(context)
-    settle_import(context, SHA, 1, "w", HorseEnd(signal=9, given_back=given_back))
+    settle_import(context, SHA, 1, "w", ChildExit(signal=9, given_back=given_back))
     requeues = 0 if given_back else 1
     assert (field(context).state, field(context).attempt, field(context).requeues) == ("validating", 2, requeues)
     assert context.blobs.exists(f"fields/{SHA}/original")

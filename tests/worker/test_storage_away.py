@@ -15,7 +15,7 @@ from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
-from regnf_worker.settle import HorseEnd, settle_import, settle_registration
+from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
 
 SHA = "a" * 64
@@ -56,7 +56,7 @@ def test_a_job_whose_result_cannot_be_stored_is_run_again(context: Context, stor
     assert running is not None
     assert (running.status, running.error) == ("running", None)
     store.away = False
-    settle_registration(context, "j1", 1, "w", HorseEnd())
+    settle_registration(context, "j1", 1, "w", ChildExit())
     run_attempt(context, "j1", 2, "w", TinyEngine)
     done = context.records.get_job("j1")
     assert done is not None
@@ -72,7 +72,7 @@ def test_an_import_whose_field_cannot_be_stored_is_done_again_once(context: Cont
     for attempt in (1, 2):
         with pytest.raises(StorageUnavailableError):
             run_import_attempt(context, SHA, attempt, "w", tiny_importer)
-        settle_import(context, SHA, attempt, "w", HorseEnd())
+        settle_import(context, SHA, attempt, "w", ChildExit())
         record = context.records.get_field(SHA)
         assert record is not None
         states.append((record.state, record.attempt, (record.error or {}).get("reason")))
@@ -106,7 +106,7 @@ def test_a_job_whose_files_are_gone_is_run_again(context: Context, store: AwaySt
     context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
     with pytest.raises(FileNotFoundError):
         run_attempt(context, "j1", 1, "w", FileLosingEngine)
-    settle_registration(context, "j1", 1, "w", HorseEnd())
+    settle_registration(context, "j1", 1, "w", ChildExit())
     again = context.records.get_job("j1")
     assert again is not None
     assert (again.status, again.attempt, again.requeues) == ("accepted", 2, 1)

@@ -17,20 +17,20 @@ from typing import Any, TypeVar
 from redis.exceptions import RedisError
 from rq import Worker, worker_registration
 
-from regnf_worker.patience import LONGEST_WAIT_S, patiently
+from regnf_worker.retry import MAX_WAIT_S, retry_until_available
 
 _LIVE_FOR_S = 45
 """A worker that has not reported for this long is not counted as live."""
 _Value = TypeVar("_Value")
 
 
-class PatientWorker(Worker):
+class ResilientWorker(Worker):
     """An RQ worker that outlives a Redis that is full or away, and hears SIGTERM while it waits for it."""
 
-    max_connection_wait_time = LONGEST_WAIT_S
+    max_connection_wait_time = MAX_WAIT_S
 
-    def _patiently(self, what: str, do: Callable[[], _Value]) -> _Value:
-        return patiently(what, do, stopped=lambda: self._stop_requested)
+    def _until_available(self, what: str, do: Callable[[], _Value]) -> _Value:
+        return retry_until_available(what, do, stopped=lambda: self._stop_requested)
 
     def _if_possible(self, what: str, do: Callable[[], object]) -> None:
         try:
@@ -47,26 +47,26 @@ class PatientWorker(Worker):
             self.connection.delete(self.key)  # a birth whose answer was lost would pass for another worker's
             birth()
 
-        self._patiently("registering the worker", be_born)
+        self._until_available("registering the worker", be_born)
 
     def subscribe(self) -> None:
-        self._patiently("subscribing to commands", super().subscribe)
+        self._until_available("subscribing to commands", super().subscribe)
 
     def check_for_suspension(self, burst: bool) -> None:
         look = super().check_for_suspension
-        self._patiently("looking for a suspension", lambda: look(burst))
+        self._until_available("looking for a suspension", lambda: look(burst))
 
     def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
         take = super().dequeue_job_and_maintain_ttl
-        return self._patiently("taking a job", lambda: take(timeout, max_idle_time))
+        return self._until_available("taking a job", lambda: take(timeout, max_idle_time))
 
     def prepare_execution(self, job: Any) -> Any:
         prepare = super().prepare_execution
-        return self._patiently(f"taking up job {job.id}", lambda: prepare(job))
+        return self._until_available(f"taking up job {job.id}", lambda: prepare(job))
 
     def prepare_job_execution(self, job: Any, remove_from_intermediate_queue: bool = False) -> None:
         prepare = super().prepare_job_execution
-        self._patiently(f"beginning job {job.id}", lambda: prepare(job, remove_from_intermediate_queue))
+        self._until_available(f"beginning job {job.id}", lambda: prepare(job, remove_from_intermediate_queue))
 
     def heartbeat(self, timeout: int | None = None, pipeline: Any = None) -> None:  # noqa: ARG002 - one time for all
         if pipeline is not None:
@@ -74,7 +74,7 @@ class PatientWorker(Worker):
         elif self._horse_pid:
             self._if_possible("a sign of life", self._report_now)
         else:
-            self._patiently("a sign of life", self._report_now)
+            self._until_available("a sign of life", self._report_now)
 
     def _report(self, pipeline: Any) -> None:
         """The whole registration again each time: Redis may have been emptied, or others have swept it as expired."""

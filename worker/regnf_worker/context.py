@@ -15,7 +15,7 @@ from regnf_state.settings import Settings
 
 _RETRIES = 20
 """About eighteen seconds: a job outlives a restart of Redis."""
-_STORAGE_PATIENCE_S = 120.0
+_STORAGE_WAIT_S = 120.0
 
 
 class NoRedisError(RuntimeError):
@@ -42,6 +42,6 @@ class Context:
         if settings.redis_url is None:
             raise NoRedisError("set REGNF_REDIS_URL")
         redis = connect(settings.redis_url, retries=_RETRIES)
-        blobs = open_blobs(settings, _STORAGE_PATIENCE_S, existing)
+        blobs = open_blobs(settings, _STORAGE_WAIT_S, existing)
         records = JournaledRecordStore(redis, settings.retention_s, blobs)
         return cls(settings, records, blobs, RqJobQueue(redis))

@@ -10,7 +10,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_state.ownership import sha256_of
 from regnf_state.records import FieldRecord
 from regnf_worker.context import Context
-from regnf_worker.pulse import Pulse
+from regnf_worker.heartbeat import Heartbeat
 
 _POLL_S = 0.2
 _WAIT_BEFORE_GIVING_BACK_S = 20.0
@@ -23,9 +23,9 @@ class FieldsNotReadyError(Exception):
 class Fields:
     """Fields of one job. Whatever is opened stays open until ``stack`` closes."""
 
-    def __init__(self, context: Context, pulse: Pulse, stack: ExitStack) -> None:
+    def __init__(self, context: Context, heartbeat: Heartbeat, stack: ExitStack) -> None:
         self._context = context
-        self._pulse = pulse
+        self._heartbeat = heartbeat
         self._stack = stack
         self._deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
 
@@ -35,7 +35,7 @@ class Fields:
         Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
         """
         while (field := self._usable(sha256)).state == "validating":
-            self._pulse.check()
+            self._heartbeat.check()
             if time.monotonic() > self._deadline:
                 raise FieldsNotReadyError(sha256)
             time.sleep(_POLL_S)

@@ -17,8 +17,8 @@ from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
-from regnf_worker.patience import patiently
 from regnf_worker.problems import are_files_away, fault, new_incident, problem
+from regnf_worker.retry import retry_until_available
 
 _CLAIM_KEPT_S = 24 * 3600
 logger = logging.getLogger(__name__)
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bool:
     """Whether this attempt at the import is this worker's: of several that ask, the first one's."""
-    return context.records.remember(f"import:{sha256}:{attempt}", worker, _CLAIM_KEPT_S) == worker
+    return context.records.set_if_absent(f"import:{sha256}:{attempt}", worker, _CLAIM_KEPT_S) == worker
 
 
 def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
@@ -41,7 +41,9 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     if field is None or field.attempt != attempt or field.state != "validating":
         logger.info("import %s attempt %d is not run", sha256, attempt)
         return
-    if not patiently(f"the record of import {sha256}", lambda: claim_import(context, sha256, attempt, worker)):
+    if not retry_until_available(
+        f"the record of import {sha256}", lambda: claim_import(context, sha256, attempt, worker)
+    ):
         logger.info("import %s attempt %d is somebody else's", sha256, attempt)
         return
     try:
@@ -62,13 +64,13 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         _refuse(context, sha256, attempt, fault(error, incident))
     else:
         context.blobs.delete(_original(sha256))
-        patiently(
+        retry_until_available(
             f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=report)
         )
 
 
 def _refuse(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
-    patiently(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error))
+    retry_until_available(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error))
 
 
 def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:

@@ -22,10 +22,10 @@ from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import attempt_of
 from regnf_worker import kernel
-from regnf_worker.bookkeeping import PatientWorker
+from regnf_worker.bookkeeping import ResilientWorker
 from regnf_worker.context import Context
 from regnf_worker.scratch import Scratch
-from regnf_worker.settle import HorseEnd, settle_import, settle_registration
+from regnf_worker.settle import ChildExit, settle_import, settle_registration
 
 _IDLE_REPORT_S = 30
 _LATE_GRACE_S = 10.0
@@ -33,7 +33,7 @@ _LATE_GRACE_S = 10.0
 _IMPORT_MARGIN_S = 30
 
 
-class RegnfWorker(PatientWorker):
+class RegnfWorker(ResilientWorker):
     """One worker of the service. ``monitor_s`` is how often it looks after the child it runs."""
 
     def __init__(self, context: Context, scratch: Scratch, monitor_s: int = 1) -> None:
@@ -48,7 +48,7 @@ class RegnfWorker(PatientWorker):
         )
         self._context = context
         self._scratch = scratch
-        self._settlers: dict[str, Callable[[Context, str, int, str, HorseEnd], None]] = {
+        self._settlers: dict[str, Callable[[Context, str, int, str, ChildExit], None]] = {
             IMPORT_QUEUE_NAME: settle_import,
             QUEUE_NAME: settle_registration,
         }
@@ -91,7 +91,7 @@ class RegnfWorker(PatientWorker):
     def _settle(self, job: Any, queue: Any, out_of_memory: bool) -> None:
         status = self._exit_status
         killed = status is not None and os.WIFSIGNALED(status)
-        end = HorseEnd(
+        end = ChildExit(
             signal=os.WTERMSIG(status) if killed and status is not None else None,
             late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
@@ -101,7 +101,7 @@ class RegnfWorker(PatientWorker):
 
         def write_down() -> None:
             try:
-                self._patiently(
+                self._until_available(
                     f"settling job {job.id}",
                     lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
                 )

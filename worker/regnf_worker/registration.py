@@ -28,10 +28,10 @@ from regnf_worker.artifacts import (
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
 from regnf_worker.fields import Fields, FieldsNotReadyError
+from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.models import ObjectModels
-from regnf_worker.patience import patiently
 from regnf_worker.problems import are_files_away, fault, new_incident, problem
-from regnf_worker.pulse import Pulse
+from regnf_worker.retry import retry_until_available
 
 logger = logging.getLogger(__name__)
 
@@ -57,9 +57,9 @@ def run_attempt(
 def _run(context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine]) -> None:
     job_id, attempt = record.id, record.attempt
     logger.info("job %s attempt %d runs", job_id, attempt)
-    with Pulse(context.records, job_id, attempt, context.settings.heartbeat_s) as pulse:
+    with Heartbeat(context.records, job_id, attempt, context.settings.heartbeat_s) as heartbeat:
         try:
-            manifest = read_manifest(context.blobs, job_id) or _work(context, record, make_engine, pulse)
+            manifest = read_manifest(context.blobs, job_id) or _work(context, record, make_engine, heartbeat)
         except (CancelledError, StaleAttemptError):
             discard(context.blobs, job_id, attempt)
             _end(context, job_id, attempt, status="dismissed")
@@ -81,7 +81,9 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
 
 
 def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:
-    return patiently(f"the record of job {job_id}", lambda: context.records.update_job(job_id, attempt, **changes))
+    return retry_until_available(
+        f"the record of job {job_id}", lambda: context.records.update_job(job_id, attempt, **changes)
+    )
 
 
 def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
@@ -100,27 +102,29 @@ def _fail(context: Context, job_id: str, attempt: int, error: dict[str, Any]) ->
 
 def _give_back(context: Context, job_id: str, attempt: int) -> None:
     with suppress(StaleAttemptError):
-        again = patiently(
+        again = retry_until_available(
             f"the record of job {job_id}", lambda: context.records.requeue_job(job_id, attempt, lost=False)
         )
         context.queue.enqueue_registration(job_id, again.attempt)
         logger.info("job %s attempt %d given back: its fields are still being imported", job_id, attempt)
 
 
-def _work(context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine], pulse: Pulse) -> Manifest:
+def _work(
+    context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine], heartbeat: Heartbeat
+) -> Manifest:
     """The job's result, standing. Raises whatever kept it from standing."""
     request = record.request
     with ExitStack() as stack:
-        fields = Fields(context, pulse, stack)
+        fields = Fields(context, heartbeat, stack)
         scene = fields.ready(request["scene"])
         objects = [fields.ready(sha256) for sha256 in request.get("candidates") or [request["object"]]]
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
         engine = make_engine()
         _update(context, record.id, record.attempt, engine=engine.describe())
-        names = _register(context, engine, request, fields, scene, objects, pulse, folder)
-        pulse.confirm()
+        names = _register(context, engine, request, fields, scene, objects, heartbeat, folder)
+        heartbeat.confirm()
         manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)
-    pulse.confirm()
+    heartbeat.confirm()
     if publish(context.blobs, record.id, manifest):
         return manifest
     standing = read_manifest(context.blobs, record.id)
@@ -135,28 +139,28 @@ def _register(
     fields: Fields,
     scene: FieldRecord,
     objects: Sequence[FieldRecord],
-    pulse: Pulse,
+    heartbeat: Heartbeat,
     folder: Path,
 ) -> list[str]:
     """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
     options, scene_file = request["options"], fields.file(scene.sha256)
     if request.get("candidates"):
         models = ObjectModels(context, engine, options, folder)
-        candidates = [_candidate(models, one, fields, pulse) for one in objects]
+        candidates = [_candidate(models, one, fields, heartbeat) for one in objects]
         if all(one.model is None for one in candidates):
             raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
-        return engine.search(scene_file, candidates, request, pulse.report, folder)
+        return engine.search(scene_file, candidates, request, heartbeat.report, folder)
     (one,) = objects
     object_file, model = fields.file(one.sha256), None
     if options.get("preset") == "robust":
         model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
     asked = request | {"object": sha256_of(one.sha256)}
-    return engine.register(scene_file, object_file, model, asked, pulse.report, folder)
+    return engine.register(scene_file, object_file, model, asked, heartbeat.report, folder)
 
 
-def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, pulse: Pulse) -> Candidate:
+def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, heartbeat: Heartbeat) -> Candidate:
     """One candidate with its model; one that is no object is unusable, not the end of the search."""
-    pulse.report("loading", 0.0)
+    heartbeat.report("loading", 0.0)
     sha256 = field.sha256
     try:
         model = models.of(field, lambda: fields.file(sha256))

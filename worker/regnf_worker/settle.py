@@ -23,7 +23,7 @@ _DETAILS = {
 
 
 @dataclass(frozen=True)
-class HorseEnd:
+class ChildExit:
     """How a job's process ended: by which signal, if by one, and what the worker knows about why."""
 
     signal: int | None = None
@@ -45,7 +45,7 @@ class HorseEnd:
         return "WORKER_LOST" if self.signal is not None else "INTERNAL"
 
 
-def settle_registration(context: Context, job_id: str, attempt: int, worker: str, end: HorseEnd) -> None:
+def settle_registration(context: Context, job_id: str, attempt: int, worker: str, end: ChildExit) -> None:
     """See that the record of a job whose process is gone does not go on saying it runs.
 
     A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
@@ -65,7 +65,7 @@ def settle_registration(context: Context, job_id: str, attempt: int, worker: str
         logger.info("job %s attempt %d: somebody else has settled it: %s", job_id, attempt, error)
 
 
-def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
+def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
     job_id, attempt = record.id, record.attempt
     manifest = read_manifest(context.blobs, job_id)
     if manifest is not None:
@@ -87,7 +87,7 @@ def _settle(context: Context, record: JobRecord, end: HorseEnd) -> None:
     logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
 
 
-def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: HorseEnd) -> None:
+def settle_import(context: Context, sha256: str, attempt: int, worker: str, end: ChildExit) -> None:
     """The same for an import: one that was given back, killed, or ended by itself starts anew; others are rejected."""
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
@@ -106,6 +106,6 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
     reject(context, sha256, attempt, problem("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
 
 
-def _problem(end: HorseEnd) -> dict[str, Any]:
+def _problem(end: ChildExit) -> dict[str, Any]:
     reason = end.reason()
     return problem(reason, _DETAILS.get(reason))

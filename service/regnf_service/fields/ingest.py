@@ -8,7 +8,7 @@ from typing import Any
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.fields.uploads import Received, Upload
 from regnf_service.http.body import CLOSE
-from regnf_service.http.dependencies import Services, off_loop
+from regnf_service.http.dependencies import Services, in_thread
 from regnf_service.http.problems import Problem
 from regnf_service.http.schemas.fields import function_of
 from regnf_state.ownership import reference_of
@@ -31,7 +31,7 @@ def check_room(services: Services, caller: str, sha256: str, size: int | None) -
 
 
 @dataclass(frozen=True)
-class Intake:
+class StoredUpload:
     """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried anew."""
 
     record: FieldRecord
@@ -43,22 +43,22 @@ def original_key(reference: str) -> str:
     return f"fields/{reference}/original"
 
 
-async def take_in(
+async def store_upload(
     services: Services, caller: str, upload: Upload, received: Received, description: UploadDescription | None = None
-) -> Intake:
+) -> StoredUpload:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, and QuotaError.
     """
     reference = reference_of(caller, received.sha256)
-    known = await off_loop(services.records.get_field, reference)
+    known = await in_thread(services.records.get_field, reference)
     if known is not None and known.state != "rejected":
-        return await off_loop(_keep, services, known, description)
+        return await in_thread(_keep, services, known, description)
     await upload.commit(original_key(reference))
-    return await off_loop(_record, services, reference, received.bytes, description)
+    return await in_thread(_record, services, reference, received.bytes, description)
 
 
-def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> Intake:
+def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> StoredUpload:
     if description is not None:
         if function_of(description) != known.description:
             raise Problem("FIELD_DESCRIPTION_DIFFERS")
@@ -67,10 +67,10 @@ def _keep(services: Services, known: FieldRecord, description: UploadDescription
     if known.state == "validating":
         # mends an import that was recorded but never queued; queueing twice changes nothing
         services.queue.enqueue_import(known.sha256, known.attempt)
-    return Intake(known, created=False)
+    return StoredUpload(known, created=False)
 
 
-def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> Intake:
+def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> StoredUpload:
     now = services.records.now()
     said: dict[str, Any] = {} if description is None else function_of(description)
     field = FieldRecord(
@@ -93,4 +93,4 @@ def _record(services: Services, reference: str, size: int, description: UploadDe
     if not created:
         return _keep(services, record, description)
     services.queue.enqueue_import(record.sha256, record.attempt)
-    return Intake(record, created=True)
+    return StoredUpload(record, created=True)

@@ -89,7 +89,7 @@ def caller_of_request(request: Request) -> str:
     return caller
 
 
-async def off_loop(work: Callable[..., _Result], *arguments: Any) -> _Result:
+async def in_thread(work: Callable[..., _Result], *arguments: Any) -> _Result:
     """Run blocking work, a call of a store, in a thread."""
     return await to_thread.run_sync(work, *arguments)
 

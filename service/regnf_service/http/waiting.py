@@ -9,10 +9,10 @@ from typing import TypeVar
 from anyio import to_thread
 
 from regnf_service.http.concurrency import pause
-from regnf_service.http.dependencies import Services, off_loop
+from regnf_service.http.dependencies import Services, in_thread
 
 _FIRST_PAUSE_S = 0.02
-_LONGEST_PAUSE_S = 0.25
+_MAX_PAUSE_S = 0.25
 _Value = TypeVar("_Value")
 
 
@@ -23,10 +23,10 @@ async def wait_for(
     deadline = time.monotonic() + seconds
     step = _FIRST_PAUSE_S
     with services.waiters.held():
-        value = await off_loop(fetch)
+        value = await in_thread(fetch)
         while True:
             left = deadline - time.monotonic()
             if enough(value) or left <= 0 or await pause(min(services.waiters.pause_s(step), left), services.stopping):
                 return value
             value = await to_thread.run_sync(fetch, limiter=services.look_limiter)
-            step = min(step * 1.5, _LONGEST_PAUSE_S)
+            step = min(step * 1.5, _MAX_PAUSE_S)

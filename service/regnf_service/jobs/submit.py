@@ -102,7 +102,7 @@ def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_k
 def _earlier_answer(services: Services, key: str, job_id: str) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
     mine = f"{job_id} {services.records.now()!r}"
-    bound = services.records.remember(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
+    bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
     bound_id, _, bound_at = bound.partition(" ")
     if bound_id != job_id:
         raise Problem("IDEMPOTENCY_KEY_REUSED")

@@ -68,7 +68,7 @@ class Housekeeper:
 
     def run(self, term: Term) -> Removed:
         """One round. Raises LeaseLostError, RedisError, OSError."""
-        if not self._records.epoch.stands():
+        if not self._records.generation.is_current():
             return Removed()  # what Redis has lost must not pass for what nobody needs
         temporary = self._blobs.sweep(_ORPHANED_AFTER_S)
         folders = self._folders()

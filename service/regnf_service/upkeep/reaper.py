@@ -16,7 +16,7 @@ from redis import Redis
 
 from regnf_service.upkeep.housekeeping import Housekeeper
 from regnf_service.upkeep.lease import Lease, LeaseLostError, Term
-from regnf_service.upkeep.staleness import Stillness
+from regnf_service.upkeep.staleness import Staleness
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.rebuild import Rebuilder
 from regnf_state.queue import JobQueue
@@ -30,7 +30,7 @@ _LEADS_FOR_S = 30
 """A leader that is killed during a round keeps the others waiting for so long."""
 _UNHELD_FOR_S = 15.0
 """Work that has been in no queue for so long was lost on its way, or with its worker."""
-_LEAST_UNBROKEN_S = 30.0
+_MIN_UNBROKEN_S = 30.0
 """Rounds that are twice as far apart as usual still follow on one another, however early a job is taken for lost."""
 _IMPORT_RETRIES = 2
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Reaped:
-    """What one round did: ids by deed."""
+    """What one round did: ids by action."""
 
     requeued: tuple[str, ...] = ()
     failed: tuple[str, ...] = ()
@@ -70,8 +70,8 @@ class Reaper:
         self._blobs = blobs
         self._rebuilder = rebuilder
         self._housekeeper = housekeeper
-        unbroken = max(settings.lost_after_s / 2, _LEAST_UNBROKEN_S)
-        self._stillness = Stillness(unbroken_s=unbroken, clock=clock)
+        unbroken = max(settings.lost_after_s / 2, _MIN_UNBROKEN_S)
+        self._staleness = Staleness(unbroken_s=unbroken, clock=clock)
         self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
     def run_once(self) -> Reaped:
@@ -80,14 +80,14 @@ class Reaper:
         with self._lease.held() as term:
             if term is None:
                 return Reaped(recalled=recalled)
-            deeds: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}
+            actions: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}
             try:
-                expired = self._lead(term, deeds)
+                expired = self._lead(term, actions)
             except LeaseLostError as error:
                 logger.warning("the round ends early: %s", error)
                 expired = []
             return Reaped(
-                **{deed: tuple(ids) for deed, ids in deeds.items()}, expired=tuple(expired), recalled=recalled
+                **{action: tuple(ids) for action, ids in actions.items()}, expired=tuple(expired), recalled=recalled
             )
 
     def _rebuild(self) -> tuple[str, ...]:
@@ -97,23 +97,23 @@ class Reaper:
         rebuilt = self._rebuilder.run_if_needed()
         return rebuilt.jobs + rebuilt.fields
 
-    def _lead(self, term: Term, deeds: dict[str, list[str]]) -> list[str]:
+    def _lead(self, term: Term, actions: dict[str, list[str]]) -> list[str]:
         """Look after everything; the ids of what has expired. Raises LeaseLostError."""
         now = self._records.now()
-        self._stillness.begin_round()
+        self._staleness.begin_round()
         for job in self._records.active_jobs():
             term.confirm()
-            _note(deeds, job.id, self._look_after_job, job, now)
+            _note(actions, job.id, self._look_after_job, job, now)
         for field in self._records.validating_fields():
             term.confirm()
-            _note(deeds, field.sha256, self._look_after_import, field, now)
+            _note(actions, field.sha256, self._look_after_import, field, now)
         expired = self._expire(term)
         if self._housekeeper is not None:
             self._housekeeper.run_if_due(term)
         return expired
 
     def _look_after_job(self, job: JobRecord, now: float) -> str | None:
-        """Mend one active job; the deed's name, None when nothing was amiss. Raises StaleAttemptError."""
+        """Mend one active job; the action's name, None when nothing was amiss. Raises StaleAttemptError."""
         if job.status == "accepted":
             if self._queue.holds_registration(job.id, job.attempt) or not self._is_unheld(job.id, job.attempt):
                 return None
@@ -133,7 +133,7 @@ class Reaper:
 
     def _is_unheld(self, name: str, attempt: int) -> bool:
         """Whether work that no queue holds now has been seen in none for a while: somebody may be about to queue it."""
-        return self._stillness.of(f"{name}:unheld", attempt) >= _UNHELD_FOR_S
+        return self._staleness.of(f"{name}:unheld", attempt) >= _UNHELD_FOR_S
 
     def _is_lost(self, job: JobRecord, now: float) -> bool:
         """Whether the job's heartbeat is so old, and has been seen to stand still for so long, that its worker is gone.
@@ -141,7 +141,7 @@ class Reaper:
         How old it is Redis' clock tells, which may be stepped; and nobody could beat while Redis was away.
         """
         beaten = job.heartbeat or job.updated
-        still = self._stillness.of(job.id, (job.attempt, beaten))
+        still = self._staleness.of(job.id, (job.attempt, beaten))
         silent = now - beaten >= self._lost_after_s
         return still >= self._lost_after_s or (silent and still >= self._lost_after_s / 6)
 
@@ -168,15 +168,15 @@ class Reaper:
 
 
 def _note(
-    deeds: dict[str, list[str]], name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float
+    actions: dict[str, list[str]], name: str, look: Callable[[_Record, float], str | None], record: _Record, now: float
 ) -> None:
     try:
-        deed = look(record, now)
+        action = look(record, now)
     except StaleAttemptError:
         return  # it moved on by itself meanwhile
-    if deed is not None:
-        deeds[deed].append(name)
-        logger.warning("%s: %s", name, deed)
+    if action is not None:
+        actions[action].append(name)
+        logger.warning("%s: %s", name, action)
 
 
 def _worker_lost() -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-class Stillness:
+class Staleness:
     """Told of every record in every round. When rounds were more than ``unbroken_s`` apart, everything begins anew.
 
     Whoever could not look, because Redis was away or the machine slept, does not know who was silent meanwhile.

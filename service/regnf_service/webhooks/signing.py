@@ -13,7 +13,7 @@ from regnf_service.http.tokens import TokensError, read_lines
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 
 _PREFIX = "whsec_"
-_SHORTEST, _LONGEST = 24, 64
+_MIN_KEY_BYTES, _MAX_KEY_BYTES = 24, 64
 
 Secrets = Mapping[str, Sequence[bytes]]
 """Each caller's keys. Several: each message bears a signature with every one, while one replaces another."""
@@ -35,7 +35,7 @@ def _key(caller: str, text: str) -> bytes:
         key = base64.b64decode(text.removeprefix(_PREFIX), validate=True) if text.startswith(_PREFIX) else b""
     except binascii.Error:
         key = b""
-    if not _SHORTEST <= len(key) <= _LONGEST:
+    if not _MIN_KEY_BYTES <= len(key) <= _MAX_KEY_BYTES:
         raise TokensError(f"the webhook secret of {caller} is not whsec_ and the base64 of 24 to 64 bytes")
     return key
 

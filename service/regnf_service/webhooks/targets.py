@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from regnf_service.http.tokens import TokensError
 
 _PORTS = {"http": 80, "https": 443}
-_LONGEST_URL = 2000
+_MAX_URL_CHARS = 2000
 _TRANSLATED = ipaddress.ip_network("64:ff9b::/96")
 
 
@@ -57,7 +57,7 @@ def _entry(entry: str) -> Target:
 
 def target_of(url: str) -> Target | None:
     """Scheme, host and port of a URL that a message can be sent to; None for any other."""
-    if len(url) > _LONGEST_URL or not url.isascii() or not url.isprintable() or " " in url or "\\" in url:
+    if len(url) > _MAX_URL_CHARS or not url.isascii() or not url.isprintable() or " " in url or "\\" in url:
         return None
     try:
         parts = urlsplit(url)

@@ -16,7 +16,7 @@ from regnf_service.http.dependencies import (
     Services,
     ServicesDep,
     WaitQuery,
-    off_loop,
+    in_thread,
 )
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
@@ -115,7 +115,7 @@ async def list_fields(
 ) -> dict[str, Any]:
     before = decode_token(page_token)
     # one more than asked for tells whether there is a next page
-    found = await off_loop(services.records.list_fields, label, limit + 1, before, caller)
+    found = await in_thread(services.records.list_fields, label, limit + 1, before, caller)
     page = found[:limit]
     more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
     return {"fields": [field_document(record, prefix) for record in page], "next_page_token": more}

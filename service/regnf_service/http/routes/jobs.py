@@ -17,7 +17,7 @@ from regnf_service.http.dependencies import (
     Services,
     ServicesDep,
     WaitQuery,
-    off_loop,
+    in_thread,
 )
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
@@ -47,7 +47,7 @@ _EVENT = {
 
 async def job_answer(services: Services, record: JobRecord, prefix: str, status: int = 200) -> JSONResponse:
     """The job's document, with the headers that tell a poller when to come back."""
-    return _answer(services, await off_loop(_seen, services, record), prefix, status)
+    return _answer(services, await in_thread(_seen, services, record), prefix, status)
 
 
 class _Seen(NamedTuple):
@@ -134,7 +134,7 @@ async def get_job(
 
     seen = await wait_for(look, is_news, wait, services)
     if wait and not held.given:
-        seen = await off_loop(_seen, services, seen.record)
+        seen = await in_thread(_seen, services, seen.record)
     return held.apply(_answer(services, seen, prefix, 200))
 
 
@@ -161,9 +161,9 @@ async def job_events(
     ] = None,
 ) -> Response:
     """From the beginning, or after `Last-Event-ID`."""
-    record = await off_loop(find_job, services, id, caller)
+    record = await in_thread(find_job, services, id, caller)
     try:
-        waiting = await off_loop(services.records.events, id, last_event_id)
+        waiting = await in_thread(services.records.events, id, last_event_id)
     except ValueError as error:
         raise Problem("INVALID_EVENT_ID") from error
     if last_event_id is not None and record.status not in ACTIVE and not waiting:
@@ -189,15 +189,15 @@ async def cancel_job(
     prefix: PrefixDep,
 ) -> JSONResponse:
     """Cancelling twice is no error."""
-    before = await off_loop(find_job, services, id, caller)
+    before = await in_thread(find_job, services, id, caller)
     if before.status == "dismissed":
         return await job_answer(services, before, prefix)
-    after = await off_loop(services.records.request_cancel, id)
+    after = await in_thread(services.records.request_cancel, id)
     if after is None:
         raise Problem("JOB_NOT_FOUND")
     if after.status in ("successful", "failed"):
         raise Problem("JOB_FINISHED")
-    await off_loop(services.queue.stop, id, after.attempt)
+    await in_thread(services.queue.stop, id, after.attempt)
     return await job_answer(services, after, prefix, 202)
 
 

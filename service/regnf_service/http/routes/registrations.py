@@ -10,9 +10,9 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
-from regnf_service.fields.ingest import take_in
+from regnf_service.fields.ingest import store_upload
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.problems import Problem
 from regnf_service.http.routes.documentation import (
@@ -38,7 +38,7 @@ from regnf_state.records import ACTIVE, FINISHED
 
 router = APIRouter(tags=["registrations"])
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
-_LONGEST_WAIT_S = 30
+_MAX_WAIT_S = 30
 _ONE_SHOT = {
     "schema": {
         "type": "object",
@@ -54,7 +54,7 @@ def preferred_wait(prefer: str | None) -> int | None:
     for preference in (prefer or "").split(","):
         match = _PREFERENCE.fullmatch(preference)
         if match:
-            return min(int(match.group(1)), _LONGEST_WAIT_S)
+            return min(int(match.group(1)), _MAX_WAIT_S)
     return None
 
 
@@ -132,7 +132,7 @@ async def register(
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
     if dry_run:
         return JSONResponse({"valid": True, "id": job_id_of(owned_request(asked, caller)), "request": asked})
-    record = await off_loop(submit, services, caller, asked, idempotency_key)
+    record = await in_thread(submit, services, caller, asked, idempotency_key)
     wait = preferred_wait(prefer)
     if wait and record.status in ACTIVE:
         record = await wait_for(
@@ -157,7 +157,7 @@ async def _by_reference(request: Request, services: Services, caller: str) -> di
     if question.object is not None:
         named["/object"] = question.object
     named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(question.candidates or ())}
-    await off_loop(check_fields, services, caller, asked, named)
+    await in_thread(check_fields, services, caller, asked, named)
     return asked
 
 
@@ -176,8 +176,8 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         question = read_model(Question, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
         asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
-        await off_loop(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
+        await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():
-                await take_in(services, caller, upload, received[name])
+                await store_upload(services, caller, upload, received[name])
     return asked

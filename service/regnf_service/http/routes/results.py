@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.problems import Problem
 from regnf_service.http.ranges import ByteRange, parse_range
@@ -119,7 +119,7 @@ async def get_artifact(
     if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
 ) -> Response:
     """The names are those of the result's `artifacts` list."""
-    manifest = await off_loop(_manifest, services, id, caller)
+    manifest = await in_thread(_manifest, services, id, caller)
     if name not in manifest.artifacts:
         raise Problem("ARTIFACT_NOT_FOUND")
     size, etag = manifest.artifacts[name].bytes, f'"{manifest.artifacts[name].sha256[:32]}"'
@@ -134,7 +134,7 @@ async def get_artifact(
     status = 200 if part is None else 206
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=ARTIFACTS[name])
-    file = await off_loop(_open, services, manifest, name)
+    file = await in_thread(_open, services, manifest, name)
     return StreamingResponse(_blocks(file, chosen), status_code=status, headers=headers, media_type=ARTIFACTS[name])
 
 
@@ -149,9 +149,9 @@ async def _blocks(file: BinaryIO, part: ByteRange) -> AsyncIterator[bytes]:
     """The part's bytes, a block at a time, each read in a thread."""
     left = part.length
     try:
-        await off_loop(file.seek, part.start)
+        await in_thread(file.seek, part.start)
         while left:
-            block = await off_loop(file.read, min(left, _BLOCK_BYTES))
+            block = await in_thread(file.read, min(left, _BLOCK_BYTES))
             if not block:
                 return
             left -= len(block)

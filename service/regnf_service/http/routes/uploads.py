@@ -11,10 +11,10 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_service.fields.ingest import Intake, check_room, take_in
+from regnf_service.fields.ingest import StoredUpload, check_room, store_upload
 from regnf_service.fields.uploads import Received, Upload
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, off_loop
+from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.problems import Problem
@@ -81,12 +81,12 @@ async def put_field(
     if body.media_type(request).startswith("multipart/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=body.CLOSE)
     digest = announced_digest(content_digest)
-    await off_loop(check_room, services, caller, sha256, body.declared_length(request))
+    await in_thread(check_room, services, caller, sha256, body.declared_length(request))
     async with services.open_upload(caller) as upload:
         received = await _receive_raw(request, services, upload)
         if received.sha256 != sha256 or digest not in (None, received.sha256):
             raise Problem("DIGEST_MISMATCH")
-        taken = await take_in(services, caller, upload, received)
+        taken = await store_upload(services, caller, upload, received)
     return _answer(taken, prefix)
 
 
@@ -126,7 +126,7 @@ async def post_field(
             received, description = await _receive_raw(request, services, upload), None
             if digest not in (None, received.sha256):
                 raise Problem("DIGEST_MISMATCH")
-        taken = await take_in(services, caller, upload, received, description)
+        taken = await store_upload(services, caller, upload, received, description)
     return _answer(taken, prefix)
 
 
@@ -165,7 +165,7 @@ async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[by
         raise Problem("DIGEST_MISMATCH")
 
 
-def _answer(taken: Intake, prefix: str) -> JSONResponse:
+def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:
     document = field_document(taken.record, prefix)
     headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)

@@ -23,7 +23,7 @@ from regnf_service.http.schemas.transforms import Similarity
 
 START_UNSUPPORTED = "initial_transform_unsupported"
 SEARCH_UNSUPPORTED = "library_search_unsupported"
-_MOST_CANDIDATES = 512
+_MAX_CANDIDATES = 512
 
 
 class FieldReference(Incoming):
@@ -52,7 +52,7 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 Candidates = Annotated[
-    list[Reference], Field(min_length=1, max_length=_MOST_CANDIDATES, json_schema_extra={"uniqueItems": True})
+    list[Reference], Field(min_length=1, max_length=_MAX_CANDIDATES, json_schema_extra={"uniqueItems": True})
 ]
 
 

@@ -13,7 +13,7 @@ from redis.exceptions import TimeoutError as RedisTimeoutError
 from rq.exceptions import StopRequested
 
 _FIRST_WAIT_S = 0.1
-LONGEST_WAIT_S = 2.0
+MAX_WAIT_S = 2.0
 _PASSING = (RedisConnectionError, RedisTimeoutError, OutOfMemoryError, ReadOnlyError)
 _PASSING_WORDS = ("MISCONF ", "OOM ")
 """No class of their own: a disk that Redis cannot write to, and what older servers say of a script without memory."""
@@ -26,7 +26,7 @@ def passes(error: RedisError) -> bool:
     return isinstance(error, _PASSING) or any(word in str(error) for word in _PASSING_WORDS)
 
 
-def patiently(what: str, do: Callable[[], _Value], stopped: Callable[[], bool] = lambda: False) -> _Value:
+def retry_until_available(what: str, do: Callable[[], _Value], stopped: Callable[[], bool] = lambda: False) -> _Value:
     """What ``do`` returns once Redis lets it, however long that takes; ``do`` must bear being repeated.
 
     Raises StopRequested when ``stopped`` by then, and any error that does not pass.
@@ -45,7 +45,7 @@ def patiently(what: str, do: Callable[[], _Value], stopped: Callable[[], bool] =
                 logger.warning("%s: Redis refuses, trying until it does not: %s", what, error)
             refusals += 1
             time.sleep(wait_s)
-            wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+            wait_s = min(2 * wait_s, MAX_WAIT_S)
         else:
             if refusals:
                 logger.warning("%s: done after %d refusals", what, refusals)

@@ -13,9 +13,9 @@ from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
-from regnf_worker.patience import LONGEST_WAIT_S, passes, patiently
 from regnf_worker.process import RegnfWorker
 from regnf_worker.registration import run_attempt
+from regnf_worker.retry import MAX_WAIT_S, passes, retry_until_available
 from regnf_worker.scratch import Scratch
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
@@ -36,36 +36,38 @@ def accept(context: Context, do: str = "succeed") -> None:
 
 def test_waits_grow_and_are_bounded(waits: list[float]) -> None:
     do = Refusals(8, answer="done")
-    assert patiently("it", do) == "done"
+    assert retry_until_available("it", do) == "done"
     assert len(do.calls) == 9
     assert waits == [0.1, 0.2, 0.4, 0.8, 1.6, 2.0, 2.0, 2.0]
-    assert max(waits) == LONGEST_WAIT_S
+    assert max(waits) == MAX_WAIT_S
 
 
 @pytest.mark.parametrize("error", PASSING, ids=str)
 def test_what_passes_is_waited_for(waits: list[float], error: RedisError) -> None:
     assert passes(error)
-    assert patiently("it", Refusals(2, error, answer=3)) == 3
+    assert retry_until_available("it", Refusals(2, error, answer=3)) == 3
 
 
 @pytest.mark.parametrize("error", [LASTING, StopRequested(), ValueError()], ids=repr)
 def test_what_does_not_pass_is_raised_at_once(waits: list[float], error: Exception) -> None:
     do = Refusals(1, error)
     with pytest.raises(type(error)):
-        patiently("it", do)
+        retry_until_available("it", do)
     assert (len(do.calls), waits) == (1, [])
 
 
 def test_who_is_told_to_stop_waits_no_longer(waits: list[float]) -> None:
     do = Refusals(9)
     with pytest.raises(StopRequested):
-        patiently("it", do, stopped=lambda: len(do.calls) == 3)
+        retry_until_available("it", do, stopped=lambda: len(do.calls) == 3)
     assert len(do.calls) == 3
-    assert patiently("it", Refusals(0, answer=1), stopped=lambda: True) == 1, "what succeeds is not given up"
+    assert retry_until_available("it", Refusals(0, answer=1), stopped=lambda: True) == 1, (
+        "what succeeds is not given up"
+    )
 
 
 def test_a_refusal_and_its_end_are_logged_once(waits: list[float], caplog: pytest.LogCaptureFixture) -> None:
-    patiently("the claim", Refusals(5))
+    retry_until_available("the claim", Refusals(5))
     assert [record.message for record in caplog.records] == [
         f"the claim: Redis refuses, trying until it does not: {FULL}",
         "the claim: done after 5 refusals",
@@ -151,7 +153,7 @@ def test_a_job_waits_for_redis_and_loses_nothing(
         assert waits
 
 
-@pytest.mark.parametrize("name", ["remember", "update_field"])
+@pytest.mark.parametrize("name", ["set_if_absent", "update_field"])
 @pytest.mark.parametrize(("data", "state"), [(b"f", "ready"), (b"raise", "rejected")])
 def test_an_import_waits_for_redis_and_rejects_nothing_for_it(
     context: Context, monkeypatch: pytest.MonkeyPatch, waits: list[float], name: str, data: bytes, state: str

@@ -14,14 +14,14 @@ from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError
 from regnf_state.records import JobRecord, RecordStore, StaleAttemptError
-from regnf_worker.patience import patiently
+from regnf_worker.retry import retry_until_available
 
 STOP_WITHIN_S = 5.0
 _REPORT_EVERY_S = 0.25
 logger = logging.getLogger(__name__)
 
 
-class Pulse:
+class Heartbeat:
     """Beats in a thread of its own while the job runs, and writes the job's progress to its record.
 
     Use as a context manager. ``report`` is the registration's progress callback: it raises CancelledError once the job
@@ -38,10 +38,10 @@ class Pulse:
         self._stop = threading.Event()
         self._phase: str | None = None
         self._reported = 0.0
-        self._thread = threading.Thread(target=self._beat, name="pulse", daemon=True)
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         self.superseded = False
 
-    def __enter__(self) -> Pulse:
+    def __enter__(self) -> Heartbeat:
         self._thread.start()
         return self
 
@@ -67,7 +67,7 @@ class Pulse:
 
     def confirm(self) -> None:
         """Ask the record, as soon as it answers, whether this attempt counts. Raises CancelledError, RedisError."""
-        patiently(
+        retry_until_available(
             f"the record of job {self._job_id}",
             lambda: self._note(self._records.heartbeat, self._job_id, self._attempt),
         )
