@@ -22,36 +22,37 @@ _START_S = 20.0
 
 
 def installed_servers() -> dict[str, str]:
-    """The servers of this machine by name."""
-    found = {"valkey": server_binary(), "redis": shutil.which("redis-server")}
-    return {name: binary for name, binary in found.items() if binary}
+    """The programs of this machine's servers by name.
+
+    Debian's redis-tools, which starts no service of its own, has the server under the name of its checker.
+    """
+    found = {"valkey": server_binary(), "redis": shutil.which("redis-server") or shutil.which("redis-check-rdb")}
+    return {name: program for name, program in found.items() if program}
 
 
-def command_of(socket: Path, data: Path, server: str | None = None) -> list[str]:
-    """What starts a server: the one named, or the one that the environment names."""
-    binary = installed_servers()[server or os.environ.get("REGNF_TEST_REDIS", "valkey")]
-    return [binary, *server_command(socket, data)[1:]]
+def start_server(
+    socket: Path, data: Path, server: str | None = None, environment: dict[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start the server that is named, or that the environment names; it takes commands once this returns."""
+    program = installed_servers()[server or os.environ.get("REGNF_TEST_REDIS", "valkey")]
+    command = ["redis-server", *server_command(socket, data)[1:]]
+    process = subprocess.Popen(command, executable=program, stdout=subprocess.DEVNULL, env=environment)
+    deadline = time.monotonic() + _START_S
+    while not answers(f"unix://{socket}"):
+        assert process.poll() is None, "the Redis server has ended"
+        assert time.monotonic() < deadline, "the Redis server does not answer"
+        time.sleep(0.01)
+    return process
 
 
 @contextmanager
 def private_redis(server: str | None = None) -> Iterator[str]:
-    """Start a server without TCP; yields its address. Socket paths must be short, hence a folder of its own."""
+    """A server without TCP; yields its address. Socket paths must be short, hence a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="rg-") as folder:
         socket = Path(folder) / "s"
-        command = command_of(socket, Path(folder) / "data", server)
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        process = start_server(socket, Path(folder) / "data", server)
         try:
-            wait_for(f"unix://{socket}", process)
             yield f"unix://{socket}"
         finally:
             process.kill()
             process.wait()
-
-
-def wait_for(url: str, process: subprocess.Popen[bytes]) -> None:
-    """Returns once the server takes commands."""
-    deadline = time.monotonic() + _START_S
-    while not answers(url):
-        assert process.poll() is None, "the Redis server has ended"
-        assert time.monotonic() < deadline, "the Redis server does not answer"
-        time.sleep(0.01)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.redis_server import command_of, wait_for
+from tests.redis_server import start_server
 
 
 @dataclass
@@ -25,10 +25,8 @@ class RestartableRedis:
     def url(self) -> str:
         return f"unix://{self.folder}/s"
 
-    def start(self) -> None:
-        command = command_of(self.folder / "s", self.data)
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=self.environment)
-        wait_for(self.url, self.process)
+    def start(self, server: str | None = None) -> None:
+        self.process = start_server(self.folder / "s", self.data, server, self.environment)
 
     def kill(self) -> None:
         assert self.process is not None
@@ -38,12 +36,12 @@ class RestartableRedis:
 
 @contextmanager
 def restartable_redis(
-    data: Path | None = None, environment: dict[str, str] | None = None
+    data: Path | None = None, environment: dict[str, str] | None = None, server: str | None = None
 ) -> Iterator[RestartableRedis]:
     """A started server. Socket paths must be short, hence a folder of its own."""
     with tempfile.TemporaryDirectory(prefix="rg-") as folder:
         made = RestartableRedis(Path(folder), data or Path(folder) / "data", environment)
-        made.start()
+        made.start(server)
         try:
             yield made
         finally:
