@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, sync_playwright
 
 from tests.ui.fixture_server import FixtureServer
 
@@ -74,14 +74,73 @@ def context_options() -> dict[str, Any]:
     return {"viewport": {"width": 1100, "height": 700}, "reduced_motion": "reduce"}
 
 
+Open = Callable[[dict[str, Any]], Page]
+
+
+@pytest.fixture(scope="session")
+def open_window(browser: Browser) -> Open:
+    """``open_window(options)``: a page in a window of its own, which takes the browser longer than a test."""
+
+    def open_it(options: dict[str, Any]) -> Page:
+        context = browser.new_context(**options)
+        context.set_default_timeout(60_000)
+        return context.new_page()
+
+    return open_it
+
+
+@pytest.fixture(scope="session")
+def kept_windows() -> dict[str, Page]:
+    """The windows that tests share, by their options."""
+    return {}
+
+
+def forget(page: Page) -> None:
+    """Leave the window as it was opened."""
+    page.unroute_all()
+    page.context.set_offline(False)
+    page.context.clear_permissions()
+    page.emulate_media(color_scheme="light", reduced_motion="reduce")
+    if page.url.startswith("http"):
+        page.evaluate("() => { sessionStorage.clear(); localStorage.clear(); }")
+    page.goto("about:blank")
+
+
 @pytest.fixture
-def visit(browser: Browser, server: FixtureServer, context_options: dict[str, Any]) -> Iterator[Visit]:
-    context = browser.new_context(**context_options)
-    context.set_default_timeout(60_000)
-    page = context.new_page()
+def shared_page(open_window: Open, kept_windows: dict[str, Page], context_options: dict[str, Any]) -> Iterator[Page]:
+    key = repr(context_options)
+    page = kept_windows[key] if key in kept_windows else kept_windows.setdefault(key, open_window(context_options))
+    yield page
+    forget(page)
+
+
+@pytest.fixture
+def own_page(open_window: Open, context_options: dict[str, Any]) -> Iterator[Page]:
+    """For a test that leaves traces in its window: a script that runs in every page, say."""
+    page = open_window(context_options)
+    yield page
+    page.context.close()
+
+
+@pytest.fixture
+def visit(request: pytest.FixtureRequest, server: FixtureServer) -> Iterator[Visit]:
+    name = "own_page" if "own_page" in request.fixturenames else "shared_page"
+    page: Page = request.getfixturevalue(name)
     visit = Visit(page, server)
-    page.on("request", lambda request: visit.requests.append(request.url))
-    page.on("pageerror", lambda error: visit.complaints.append(str(error)))
-    page.on("console", lambda message: visit.complaints.append(message.text) if message.type != "info" else None)
+
+    def asked(message: Request) -> None:
+        visit.requests.append(message.url)
+
+    def failed(error: Error) -> None:
+        visit.complaints.append(str(error))
+
+    def said(message: ConsoleMessage) -> None:
+        if message.type != "info":
+            visit.complaints.append(message.text)
+
+    listeners = {"request": asked, "pageerror": failed, "console": said}
+    for event, listener in listeners.items():
+        page.on(event, listener)
     yield visit
-    context.close()
+    for event, listener in listeners.items():
+        page.remove_listener(event, listener)

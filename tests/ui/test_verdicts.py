@@ -134,6 +134,7 @@ def test_results_that_know_nothing_of_all_this_are_shown_without(visit: Visit) -
     assert "Surfaces agree" in page.locator("#verdict-reason").inner_text()
 
 
+@pytest.mark.usefixtures("own_page")
 def test_without_a_view_the_alternatives_still_have_their_numbers(visit: Visit) -> None:
     visit.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page = visit.open("ambiguous")

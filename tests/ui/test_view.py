@@ -250,6 +250,7 @@ def test_damaged_cloud_leaves_the_numbers(visit: Visit) -> None:
     assert page.locator("#verdict-word").inner_text() == "Registered"
 
 
+@pytest.mark.usefixtures("own_page")
 def test_no_webgl_leaves_the_numbers(visit: Visit) -> None:
     visit.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page = visit.open("done")
