@@ -22,12 +22,13 @@ from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
 from regnf_fit.images.held_out import judge
-from regnf_fit.images.network import DEGREE, RadianceField
+from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
-from regnf_fit.images.options import ReconstructionOptions, ReconstructionProgress, ReconstructionReport
+from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
 from regnf_fit.images.preparation import prepare
 from regnf_fit.images.sdfstudio_export import write_sdfstudio
 from regnf_fit.images.trainer import Trainer
+from regnf_fit.options import FitProgress
 
 _REPORT_EVERY = 25
 _CHECKPOINTS = 10
@@ -54,7 +55,7 @@ def reconstruct(
     options: ReconstructionOptions | None = None,
     seed: int = 0,
     device: str = "auto",
-    progress: ReconstructionProgress | None = None,
+    progress: FitProgress | None = None,
     label: str | None = None,
     source: dict[str, Any] | None = None,
 ) -> ReconstructionReport:
@@ -69,7 +70,7 @@ def reconstruct(
     rng = np.random.default_rng(seed)
     prepared = prepare(images, options.start, rng)
     trainer = Trainer(prepared, options, seed, torch_device, rng)
-    write = _Writer(options, prepared.bounds, label, source or {}, observe(images, options.observation_voxels))
+    write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels))
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
@@ -103,7 +104,7 @@ def _train(
     files: FitFiles,
     key: str,
     write: _Writer,
-    progress: ReconstructionProgress | None,
+    progress: FitProgress | None,
 ) -> float:
     """Run the iterations that are left; the mean loss of the last ones."""
     total = trainer.options.iterations
@@ -148,24 +149,13 @@ def _draw(field: RadianceField, bounds: torch.Tensor, path: Path) -> None:
 class _Writer:
     """Writes fields of one fit."""
 
-    options: ReconstructionOptions
     bounds: torch.Tensor
     label: str | None
     source: dict[str, Any]
     observation: Observation | None
 
     def __call__(self, field: RadianceField, path: Path) -> None:
-        description: dict[str, Any] = {
-            "kind": "neus_facto",
-            "hash": asdict(self.options.grid),
-            "positional_encoding": {"degree": DEGREE, "two_pi": False},
-            "use_grid": True,
-            "contraction": "none",
-            "level_mask": None,
-            "bounds": self.bounds.tolist(),
-            "label": self.label,
-            "source": self.source,
-        }
+        description = field.description(self.bounds, self.label, self.source)
         tensors = field.tensors()
         if self.observation is not None:
             grid, tensors[OBSERVATION] = self.observation.stored()

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
 from regnf_core.schema.hash_grid_config import HashGridConfig
-
-ReconstructionProgress = Callable[[int, float, float], None]
-"""Called now and then with the iteration, its loss and an estimate of the seconds left. May raise to stop the fit."""
+from regnf_fit.options import NetworkOptions, grid_of_levels
 
 Start = Literal["auto", "object", "room"]
 """The shape a field starts from: a ball in free space, a hollow ball in matter, or what the cameras' places suggest."""
-
-
-def _default_grid() -> HashGridConfig:
-    return HashGridConfig.from_top_resolution(
-        512, levels=8, features_per_level=2, log2_table_size=15, base_resolution=16
-    )
 
 
 @dataclass(frozen=True)
@@ -41,16 +32,13 @@ class LossWeights:
 
 
 @dataclass(frozen=True)
-class ReconstructionOptions:
+class ReconstructionOptions(NetworkOptions):
     """How a field is fitted to images. Lengths are shares of the bounds' diagonal."""
 
-    grid: HashGridConfig = field(default_factory=_default_grid)
-    """The hash grid over [-2, 2]^3: more entries and a finer top level keep thinner parts, in a larger file."""
-    hidden_layers: int = 2
+    grid: HashGridConfig = field(default_factory=lambda: grid_of_levels(8))
     hidden_width: int = 64
     feature_width: int = 16
     """What the geometry's network hands to the color's."""
-    iterations: int = 3000
     surface_rays: int = 512
     """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
     band_samples: int = 3
@@ -77,15 +65,9 @@ class ReconstructionOptions:
     """The share of the iterations from one level to the next."""
     averaging: float = 0.99
     """Decay of the moving average of the parameters, which is what is written; 0 for none."""
-    table_rate: float = 1e-2
-    network_rate: float = 2e-3
-    final_rate: float = 0.01
-    """The learning rates' share that is left at the end of their cosine decay."""
     start: Start = "auto"
     observation_voxels: int = 160
     """Voxels along the longest side of the grid that tells what was seen, where there are depths; 0: none is kept."""
-    half_table: bool = True
-    """Store the hash table in half precision: half the file, and distances change by less than 1e-4."""
 
     def learning_levels(self, iteration: int) -> int:
         """How many of the grid's levels learn at ``iteration``, coarsest first."""
@@ -95,11 +77,6 @@ class ReconstructionOptions:
     def decay(self, iteration: int) -> float:
         """Of the moving average at ``iteration``: less at first, so that the start is soon forgotten."""
         return min(self.averaging, (1.0 + iteration) / (10.0 + iteration))
-
-    def rate_share(self, iteration: int) -> float:
-        """What is left of the learning rates at ``iteration``: a cosine from 1 down to ``final_rate``."""
-        cosine = 0.5 * (1.0 + math.cos(math.pi * min(iteration / self.iterations, 1.0)))
-        return self.final_rate + (1.0 - self.final_rate) * cosine
 
 
 @dataclass(frozen=True)

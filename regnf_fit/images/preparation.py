@@ -11,9 +11,9 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_images, check_seen
 from regnf_fit.images.depth_normals import local_planes
-from regnf_fit.images.network import StartShape
 from regnf_fit.images.options import Start
 from regnf_fit.images.rays import PixelRays, rays_of_pixels
+from regnf_fit.network import StartShape
 
 _MAX_PIXELS = 3_000_000
 _HELD_OUT_SHARE = 0.02

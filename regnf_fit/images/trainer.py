@@ -19,6 +19,7 @@ from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import least_sharpness
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
+from regnf_fit.network import make_optimizer
 
 _SHARPEST = 50.0
 """How far above the least sharpness the learned one may rise."""
@@ -56,15 +57,8 @@ class Trainer:
         field = self.field
         networks = [*field.weights, *field.biases, *field.color_weights, *field.color_biases]
         networks += [field.feature_weight, field.feature_bias, field.background]
-        self.optimizer = torch.optim.Adam(
-            [
-                {"params": [field.table], "lr": options.table_rate, "eps": 1e-15},
-                {"params": networks, "lr": options.network_rate},
-                {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate},
-            ],
-            betas=(0.9, 0.99),
-            fused=True,
-        )
+        sharpness = {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate}
+        self.optimizer = make_optimizer(field.table, networks, options, sharpness)
         self._rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def mean_loss(self) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,13 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
 from regnf_core.schema.safe_format import write_safe_field
-from regnf_fit.mesh.network import DEGREE, TrainableField
-from regnf_fit.mesh.options import FitOptions, FitProgress, FitReport
+from regnf_fit.mesh.options import FitOptions, FitReport
 from regnf_fit.mesh.samples import ExactSamples, diagonal, near_samples, padded_bounds, volume_samples
+from regnf_fit.network import GRID_RADIUS, StartShape, TrainableField, make_optimizer
+from regnf_fit.options import FitProgress
 
 _CHECK_POINTS = 20_000
 _REPORT_EVERY = 50
-_GRID_RADIUS = 2.0
 
 
 def fit_field(
@@ -39,7 +38,7 @@ def fit_field(
     ``seed`` on one machine. Raises InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET).
     """
     options = options or FitOptions()
-    if padded_bounds(target, options.padding).abs().max() > _GRID_RADIUS:
+    if padded_bounds(target, options.padding).abs().max() > GRID_RADIUS:
         raise InvalidInputError(
             "the target with its padding reaches beyond [-2, 2]: scale it down", reason="TARGET_OUTSIDE_GRID"
         )
@@ -48,9 +47,8 @@ def fit_field(
     near = near_samples(target, options.near_points, options.noise, rng)
     volume = volume_samples(target, options.volume_points, options.padding, rng)
     trained = _train(target, near, volume, options, seed, progress)
-    write_safe_field(
-        path, _description(options, padded_bounds(target, options.margin), label, source or {}), trained.tensors()
-    )
+    description = trained.description(padded_bounds(target, options.margin), label, source or {})
+    write_safe_field(path, description, trained.tensors())
     return measure_fit(open_field(path), target, options, seed + 1, time.monotonic() - started)
 
 
@@ -88,15 +86,8 @@ def _train(
 ) -> TrainableField:
     generator = torch.Generator().manual_seed(seed)
     size = diagonal(target)
-    network = TrainableField(options, radius=size / 4.0, generator=generator)
-    optimizer = torch.optim.Adam(
-        [
-            {"params": [network.table], "lr": options.table_rate, "eps": 1e-15},
-            {"params": [*network.weights, *network.biases], "lr": options.network_rate},
-        ],
-        betas=(0.9, 0.99),
-        fused=True,
-    )
+    network = TrainableField(options, StartShape(torch.zeros(3), radius=size / 4.0), generator)
+    optimizer = make_optimizer(network.table, [*network.weights, *network.biases], options)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, options.rate_share)
     started = time.monotonic()
     for iteration in range(1, options.iterations + 1):
@@ -136,17 +127,3 @@ def _loss(
 
 def _draw(samples: ExactSamples, count: int, generator: torch.Generator) -> ExactSamples:
     return samples.take(torch.randint(len(samples), (count,), generator=generator))
-
-
-def _description(options: FitOptions, bounds: Tensor, label: str | None, source: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "kind": "neus_facto",
-        "hash": asdict(options.grid),
-        "positional_encoding": {"degree": DEGREE, "two_pi": False},
-        "use_grid": True,
-        "contraction": "none",
-        "level_mask": None,
-        "bounds": bounds.tolist(),
-        "label": label,
-        "source": source,
-    }

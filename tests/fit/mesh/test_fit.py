@@ -16,8 +16,8 @@ from regnf_core.fields.mesh import MeshField
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.mesh.fit import fit_field
-from regnf_fit.mesh.network import TrainableField
 from regnf_fit.mesh.options import FitOptions
+from regnf_fit.network import StartShape, TrainableField
 from tests.core.analytic import AnalyticField, sphere
 
 OPTIONS = FitOptions(
@@ -64,7 +64,7 @@ def test_same_seed_same_field(tmp_path: Path) -> None:
 def test_starts_as_a_signed_distance() -> None:
     # Geometric initialization nears |x| - radius as the layers widen.
     wide = FitOptions(**(vars(OPTIONS) | {"hidden_width": 1024}))
-    network = TrainableField(wide, radius=0.5, generator=torch.Generator().manual_seed(0))
+    network = TrainableField(wide, StartShape(torch.zeros(3), 0.5), torch.Generator().manual_seed(0))
     directions = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(1)))
     with torch.no_grad():
         outside = network.function().value(1.5 * directions)
