@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FORMAT_VERSION = "2"
-_VERSION_WITH_FAMILY = "1"
-"""The version before: the same but for the entry ``kind``, which was called ``family``."""
+_OLD_VERSION = "1"
+_OLD_NAMES = {"family": "kind", "neighbours": "neighbors", "normalised": "normalized"}
+"""Entries that were called otherwise in version 1. Nothing else has changed since."""
 _TYPE_NAMES = {"float32": "F32", "float16": "F16", "int32": "I32"}
 _ALIGNMENT = 64
 _MAX_DESCRIPTION = 1 << 20
@@ -82,7 +83,7 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
     version, text = metadata.get("regnf"), metadata.get("field")
     if version is None or text is None:
         raise FieldFormatError("a safetensors file, but no regnf field", reason="SAFE_FORMAT_INVALID")
-    if version not in (FORMAT_VERSION, _VERSION_WITH_FAMILY):
+    if version not in (FORMAT_VERSION, _OLD_VERSION):
         raise FieldFormatError(f"field format version {version[:20]!r} is not known", reason="SAFE_FORMAT_VERSION")
     if len(text) > _MAX_DESCRIPTION:
         raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
@@ -90,8 +91,8 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FieldFormatError("the field's description is not JSON", reason="SAFE_FORMAT_INVALID") from error
-    if version == _VERSION_WITH_FAMILY and isinstance(values, dict) and "family" in values:
-        values = {"kind": values.pop("family"), **values}
+    if version == _OLD_VERSION and isinstance(values, dict):
+        values = {_OLD_NAMES.get(name, name): value for name, value in values.items()}
     return parse_description(values)
 
 

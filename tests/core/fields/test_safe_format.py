@@ -143,6 +143,16 @@ def test_a_file_of_version_1_is_still_read(tmp_path: Path) -> None:
     torch.testing.assert_close(open_field(path).signed_distance(torch.zeros(1, 3)), new)
 
 
+def test_other_names_of_version_1(tmp_path: Path) -> None:
+    path = tmp_path / "field.safetensors"
+    network = {"layers.0.weight": np.ones((4, 3)), "layers.1.weight": np.ones((1, 4)), "norms.0.weight": np.ones(4)}
+    network |= {"layers.0.bias": np.zeros(4), "layers.1.bias": np.zeros(1), "norms.0.bias": np.zeros(4)}
+    values = {"family": "mlp", "bounds": description()["bounds"], "activation": "sine", "normalised": [0]}
+    arrays = {name: array.astype(np.float32) for name, array in network.items()}
+    save_file(arrays, path, {"regnf": "1", "field": json.dumps(values)})
+    assert read_description(path)["normalized"] == [0]
+
+
 def test_the_old_name_of_an_entry_is_told(tmp_path: Path) -> None:
     with pytest.raises(FieldFormatError, match="did you mean `kind`"):
         write_safe_field(tmp_path / "field.safetensors", with_family(), tensors())
