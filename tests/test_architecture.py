@@ -25,6 +25,22 @@ FORBIDDEN = {
 }
 
 
+MAX_PARAMETERS = 8
+KNOWN_CYCLES = {
+    "regnf_core.importing: containers, pickle",
+    "regnf_core.robust: pipeline, verdict",
+    "regnf_core.robust: refine, search",
+    "regnf_service: fields, http, jobs, webhooks",
+    "regnf_service.http: contract, problems, schemas, strict_json",
+}
+KNOWN_LONG_SIGNATURES = {
+    "regnf_core.batch.register_batch",
+    "regnf_core.robust.refine.levenberg_marquardt.minimize",
+    "regnf_core.robust.refine.pose_candidates.run_stage",
+}
+"""What is still to be changed; both lists shrink to nothing."""
+
+
 def imports_of(path: Path) -> Iterator[str]:
     """Every module a file imports, at whatever depth of the code; ``from a import b`` names both a and a.b."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -50,16 +66,125 @@ def test_no_package_imports_what_it_must_not_know(package: str) -> None:
 
 def modules_of(package: str) -> dict[str, Path]:
     """Every module of a package by its dotted name."""
-    files = (ROOT / FOLDERS.get(package, package)).rglob("*.py")
-    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+    folder = ROOT / FOLDERS.get(package, package)
+    named = {path: (package, *path.relative_to(folder).with_suffix("").parts) for path in sorted(folder.rglob("*.py"))}
+    return {".".join(parts).removesuffix(".__init__"): path for path, parts in named.items()}
 
 
-@pytest.mark.parametrize("package", ["regnf_core", "regnf_fit", "regnf_data"])
-def test_no_two_modules_import_each_other(package: str) -> None:
-    modules = modules_of(package)
-    imported = {name: set(imports_of(path)) - {name} for name, path in modules.items()}
-    pairs = {(a, b) for a in modules for b in imported[a] & modules.keys() if a < b and a in imported[b]}
-    assert not pairs
+MODULES = {name: path for package in sorted(OURS) for name, path in modules_of(package).items()}
+
+
+def children_of(package: str) -> dict[str, set[str]]:
+    """Which of a package's direct children, modules and subpackages, import which others, at whatever depth.
+
+    Imports of all kinds count: at the top of a file, under TYPE_CHECKING, within functions.
+    """
+    edges: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        if not module.startswith(f"{package}."):
+            continue
+        own = child_of(package, module)
+        edges.setdefault(own, set())
+        for name in imports_of(path):
+            if name in MODULES and name.startswith(f"{package}.") and child_of(package, name) != own:
+                edges[own].add(child_of(package, name))
+    return edges
+
+
+def child_of(package: str, module: str) -> str:
+    return module.removeprefix(f"{package}.").split(".")[0]
+
+
+def cycles_among(edges: dict[str, set[str]]) -> set[frozenset[str]]:
+    """The groups of names that all reach each other."""
+    reached = {name: reachable(edges, name) for name in edges}
+    groups = {frozenset(other for other in reached[name] if name in reached[other]) for name in edges}
+    return {group for group in groups if group}
+
+
+def reachable(edges: dict[str, set[str]], start: str) -> set[str]:
+    found: set[str] = set()
+    ahead = set(edges[start])
+    while ahead:
+        name = ahead.pop()
+        found.add(name)
+        ahead |= edges.get(name, set()) - found
+    return found
+
+
+def test_cycles_are_found() -> None:
+    edges = {"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"d"}}
+    assert cycles_among(edges) == {frozenset("abc")}
+    assert cycles_among({"a": {"b"}, "b": set()}) == set()
+
+
+def test_no_import_cycle_of_any_kind() -> None:
+    """Neither modules nor the folders that hold them import each other, directly or in a circle, in any package."""
+    modules = {module: (set(imports_of(path)) & MODULES.keys()) - {module} for module, path in MODULES.items()}
+    assert not cycles_among(modules)
+    packages = {module.rpartition(".")[0] for module in MODULES if "." in module}
+    found = {
+        f"{package}: {', '.join(sorted(cycle))}" for package in packages for cycle in cycles_among(children_of(package))
+    }
+    assert not found - KNOWN_CYCLES
+
+
+def outside(module: str, package: str) -> bool:
+    return not f"{module}.".startswith(f"{package}.")
+
+
+def test_the_presets_know_nothing_of_each_other() -> None:
+    paper, robust = "regnf_core.paper", "regnf_core.robust"
+    broken = {
+        f"{module} imports {name}"
+        for module, path in MODULES.items()
+        for name in imports_of(path)
+        if (not outside(module, paper) and not outside(name, robust))
+        or (not outside(module, robust) and not outside(name, paper))
+    }
+    assert not broken
+
+
+def test_the_published_method_has_one_entrance() -> None:
+    """Outside of ``regnf_core.paper`` only its pipeline is imported, and only where a preset is chosen."""
+    users = {
+        (module, name)
+        for module, path in MODULES.items()
+        if outside(module, "regnf_core.paper")
+        for name in imports_of(path)
+        if not outside(name, "regnf_core.paper")
+    }
+    assert users == {
+        ("regnf_core.registration", "regnf_core.paper"),
+        ("regnf_core.registration", "regnf_core.paper.pipeline"),
+    }
+
+
+def too_many_parameters(module: str, path: Path) -> Iterator[str]:
+    """The functions of a module with more than MAX_PARAMETERS parameters, self and cls left out."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        given = node.args
+        every = [*given.posonlyargs, *given.args, *given.kwonlyargs]
+        names = [arg.arg for arg in (*every, given.vararg, given.kwarg) if arg is not None]
+        count = len([name for name in names if name not in ("self", "cls")])
+        name = "lambda" if isinstance(node, ast.Lambda) else node.name
+        if count > MAX_PARAMETERS:
+            yield f"{module}.{name}"
+
+
+def commands() -> set[str]:
+    """The functions that typer makes commands of: their parameters are the options that a user reads in --help."""
+    from regnf_cli.main import app
+
+    callbacks = [command.callback for command in app.registered_commands]
+    return {f"{callback.__module__}.{callback.__name__}" for callback in callbacks if callback is not None}
+
+
+def test_no_function_has_more_parameters_than_a_reader_keeps_in_mind() -> None:
+    found = {name for module, path in MODULES.items() for name in too_many_parameters(module, path)}
+    assert not found - commands() - KNOWN_LONG_SIGNATURES
 
 
 def test_descriptions_know_nothing_of_what_evaluates_them() -> None:

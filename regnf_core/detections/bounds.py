@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterator, Sequence
 
 from regnf_core.detections.detection import Detection
-from regnf_core.detections.rotations import Vector, cross, dot, normal_quaternion, rotation_columns
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.rotations import Vector, cross, dot, normal_quaternion, rotation_columns
 
 Bounds = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner."""

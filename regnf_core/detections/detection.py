@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.detections.rotations import IDENTITY, Quaternion, Vector, normal_quaternion
+from regnf_core.rotations import IDENTITY, Quaternion, Vector, normal_quaternion
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from regnf_core.detections.rotations import Vector
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.rotations import Vector
 
 Place = tuple[str | int, ...]
 MAX_COORDINATE = 1e6

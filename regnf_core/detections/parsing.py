@@ -34,10 +34,10 @@ from regnf_core.detections.names import (
 )
 from regnf_core.detections.numbers import Place, edges, fault, number, point, shown
 from regnf_core.detections.rotation_forms import read_quaternion, read_rotation
-from regnf_core.detections.rotations import IDENTITY, Quaternion
 from regnf_core.detections.several import chosen
 from regnf_core.hints import suggestion
-from regnf_core.importing.upload_description import LABEL_PATTERN
+from regnf_core.labels import LABEL_PATTERN
+from regnf_core.rotations import IDENTITY, Quaternion
 
 _MAX_LABEL = 200
 _LABEL = re.compile(LABEL_PATTERN)

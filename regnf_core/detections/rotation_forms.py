@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from regnf_core.detections.numbers import Place, fault, number, numbers, shown
-from regnf_core.detections.rotations import (
+from regnf_core.rotations import (
     IDENTITY,
     Quaternion,
     determinant,

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from regnf_core.detections import Detection, parse_detection
-from regnf_core.detections.rotations import quaternion_of
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.geometry.quaternions import matrix_from_quaternion
+from regnf_core.rotations import quaternion_of
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.quaternion_formula import rotation_rows
+from regnf_core.rotations import rotation_rows
 
 
 def matrix_from_quaternion(q: Tensor) -> Tensor:

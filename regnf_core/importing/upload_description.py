@@ -10,10 +10,9 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.labels import LABEL_PATTERN
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
-LABEL_PATTERN = r"^[^\x00-\x1f\x7f\u202a-\u202e\u2066-\u2069]*$"
-"""Labels are shown as they are: no control characters, and none that turn the text around them."""
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
 
 

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-import regnf_core
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.result import Alternative, IterationRecord, RegistrationResult
 from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.version import __version__
 from regnf_core.viewing.uncertainty import COVARIANCE_ORDERING, uncertainty
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def result_document(
         "options": result.options,
         "engine": {
             "name": "regnf",
-            "version": regnf_core.__version__,
+            "version": __version__,
             "device": str(device),
             "torch": torch.__version__,
         },

@@ -137,7 +137,7 @@ def _require_text(description: dict[str, Any]) -> None:
 
     Raises FieldFormatError (SAFE_FORMAT_INVALID).
     """
-    from regnf_core.importing.upload_description import LABEL_PATTERN
+    from regnf_core.labels import LABEL_PATTERN
 
     if not re.fullmatch(LABEL_PATTERN, description.get("label") or ""):
         raise FieldFormatError("the field's label has control characters", reason="SAFE_FORMAT_INVALID")

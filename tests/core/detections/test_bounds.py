@@ -10,8 +10,8 @@ import pytest
 
 from regnf_core.detections import Detection, require_in_scene
 from regnf_core.detections.bounds import distance
-from regnf_core.detections.rotations import Vector, normal_quaternion, rotation_columns
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.rotations import Vector, normal_quaternion, rotation_columns
 
 HALF = math.sqrt(0.5)
 CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

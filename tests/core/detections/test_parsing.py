@@ -11,8 +11,8 @@ import torch
 
 from regnf_core import OrientedBox
 from regnf_core.detections import parse_detection
-from regnf_core.detections.rotations import normal_quaternion
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.rotations import normal_quaternion
 
 HALF = math.sqrt(0.5)
 QUARTER = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]

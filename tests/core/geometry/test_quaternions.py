@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from regnf_core.geometry.quaternion_formula import rotation_rows
 from regnf_core.geometry.quaternions import matrix_from_quaternion, quaternion_from_matrix
+from regnf_core.rotations import rotation_rows
 
 
 def unit_quaternions(count: int) -> torch.Tensor:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
-from regnf_core.detections.rotations import normal_quaternion, rotation_columns
 from regnf_core.geometry.similarity_check import similarity_fault
+from regnf_core.rotations import normal_quaternion, rotation_columns
 from regnf_service.http.schemas.common import Coordinate, Incoming
 
 Rows = list[list[float]]

@@ -1,16 +1,32 @@
-"""Rotations as plain numbers: quaternions (x, y, z, w) and 3x3 matrices."""
+"""Rotations as plain numbers: quaternions (x, y, z, w) and 3x3 matrices. Torch-free."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeVar
 
-from regnf_core.geometry.quaternion_formula import rotation_rows
+if TYPE_CHECKING:
+    from torch import Tensor
 
+Number = TypeVar("Number", float, "Tensor")
+Row = tuple[Number, Number, Number]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 _DIGITS = 12
+
+
+def rotation_rows(x: Number, y: Number, z: Number, w: Number) -> tuple[Row[Number], Row[Number], Row[Number]]:
+    """The three rows of the rotation matrix of the unit quaternion x, y, z (vector part), w (real part).
+
+    The numbers may be tensors of one shape; each entry then is such a tensor.
+    """
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
 
 
 def normal_quaternion(xyzw: Sequence[float]) -> Quaternion:
