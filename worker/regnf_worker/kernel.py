@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import os
+import select
 import signal
 import sys
+import time
 from collections.abc import Callable, MutableMapping
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 _PR_SET_PDEATHSIG = 1
 _FIRST_TO_GO = "500"
+_EXIT_POLL_S = 0.005
 _COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
@@ -26,6 +30,31 @@ def die_with_parent(parent_pid: int) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent_pid:  # it died before the kernel was told
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Exit(NamedTuple):
+    """The end of a child. ``status`` as waitpid has it; None when somebody else has waited for the child."""
+
+    status: int | None
+
+
+def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | None:
+    """Wait for a child to end, for so many seconds at most; None when it still runs.
+
+    ``ended`` is the reading end of a pipe whose writing end only the child holds open.
+    """
+    deadline = time.monotonic() + seconds
+    select.select([ended], [], [], seconds)
+    while True:
+        try:
+            pid, status = os.waitpid(child, os.WNOHANG)
+        except ChildProcessError:
+            return Exit(None)
+        if pid:
+            return Exit(status)
+        if time.monotonic() >= deadline:
+            return None
+        time.sleep(_EXIT_POLL_S)  # the kernel closes a process' files a moment before it can be waited for
 
 
 def in_child(work: Callable[[], None]) -> bool:

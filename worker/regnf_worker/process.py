@@ -17,13 +17,14 @@ from typing import Any
 from redis.exceptions import RedisError
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
+from rq.utils import now
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import attempt_of
 from regnf_worker import kernel
-from regnf_worker.bookkeeping import ResilientWorker
 from regnf_worker.context import Context
+from regnf_worker.resilient_worker import ResilientWorker
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
 
@@ -58,8 +59,6 @@ class RegnfWorker(ResilientWorker):
         }
         self._started = 0.0
         self._limit_s = 0.0
-        self._begun = False
-        self._exit_status: int | None = None
         self._late = False
         self._give_back_at: float | None = None
         self._given_back = False
@@ -76,23 +75,61 @@ class RegnfWorker(ResilientWorker):
     # one job
 
     def execute_job(self, job: Any, queue: Any) -> None:
+        """Run one job in a child, limit it, and settle its record. A job that is taken and not begun is in no queue
+        any more: the reaper puts it back.
+        """
         job.timeout = self._limit_s = self._limits[queue.name]
-        self._started, self._exit_status = time.monotonic(), None
-        self._begun = self._late = self._given_back = False
+        self._started = time.monotonic()
+        self._late = self._given_back = False
         oom_kills = kernel.oom_kills()
+        self.begin_job(job)
         try:
-            super().execute_job(job, queue)
+            status = self._run_child(job, queue)
         finally:
             self._scratch.empty()
-            if self._begun and self._horse_pid == 0:
-                self._settle(job, queue, kernel.oom_kills() > oom_kills)
-            # one that was taken and not begun is in no queue any more: the reaper puts it back
+        try:
+            self.finish_job(job, queue, status)
+        finally:
+            self._settle(job, queue, status, kernel.oom_kills() > oom_kills)
 
-    def _settle(self, job: Any, queue: Any, out_of_memory: bool) -> None:
-        status = self._exit_status
-        killed = status is not None and os.WIFSIGNALED(status)
+    def _run_child(self, job: Any, queue: Any) -> int | None:
+        """Fork a child for the job and wait for its end. Its status, as waitpid has it; None when it is unknown."""
+        ended, held_by_child = os.pipe()
+        parent = os.getpid()
+        child = os.fork()
+        if child == 0:
+            os.setpgrp()
+            kernel.die_with_parent(parent)
+            kernel.offer_to_the_oom_killer()
+            self._scratch.use()
+            self.main_work_horse(job, queue)
+            os._exit(0)
+        os.close(held_by_child)
+        self._horse_pid = child
+        job.started_at = now()
+        job.timeout = -1  # the limit is kept here, by a clock that nobody sets: RQ counts by the wall clock
+        try:
+            while (exit_ := kernel.wait_for_exit(child, ended, self.job_monitoring_interval)) is None:
+                self._limit_child()
+                self.report_running(job)
+        finally:
+            os.close(ended)
+        self._horse_pid = 0
+        return exit_.status
+
+    def _limit_child(self) -> None:
+        """Kill a child that is past its time limit, or past the time that a worker which stops grants it."""
+        now_s = time.monotonic()
+        if now_s - self._started > self._limit_s + _LATE_GRACE_S:
+            self._late = True
+            self.kill_horse()
+        elif self._give_back_at is not None and now_s >= self._give_back_at:
+            self._given_back = True
+            self.kill_horse()
+
+    def _settle(self, job: Any, queue: Any, status: int | None, out_of_memory: bool) -> None:
         end = ChildExit(
-            signal=os.WTERMSIG(status) if killed and status is not None else None,
+            signal=os.WTERMSIG(status) if status is not None and os.WIFSIGNALED(status) else None,
             late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
             given_back=self._given_back,
@@ -112,40 +149,6 @@ class RegnfWorker(ResilientWorker):
             write_down()
         elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
             self.log.error("job %s could not be settled: the process that should have has died", job.id)
-
-    def fork_work_horse(self, job: Any, queue: Any) -> None:
-        parent = os.getpid()
-        child = os.fork()
-        if child == 0:
-            os.setpgrp()
-            kernel.die_with_parent(parent)
-            kernel.offer_to_the_oom_killer()
-            self._scratch.use()
-            self.main_work_horse(job, queue)
-            os._exit(0)
-        self._horse_pid, self._begun = child, True
-
-    def monitor_work_horse(self, job: Any, queue: Any) -> None:
-        """The limit is kept here, by a clock that nobody steps: RQ would count by the wall clock, and kill by it."""
-        job.timeout = -1
-        super().monitor_work_horse(job, queue)
-
-    def wait_for_horse(self) -> tuple[int | None, int | None, Any]:
-        pid, status, usage = super().wait_for_horse()
-        if pid:
-            self._exit_status = status
-        return pid, status, usage
-
-    def maintain_heartbeats(self, job: Any) -> None:
-        """Called every ``monitor_s`` while the child runs."""
-        now = time.monotonic()
-        if now - self._started > self._limit_s + _LATE_GRACE_S:
-            self._late = True
-            self.kill_horse()
-        elif self._give_back_at is not None and now >= self._give_back_at:
-            self._given_back = True
-            self.kill_horse()
-        super().maintain_heartbeats(job)
 
     # the worker itself
 

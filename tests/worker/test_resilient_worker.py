@@ -14,7 +14,7 @@ from rq.serializers import JSONSerializer
 from rq.worker.base import BaseWorker
 
 from regnf_state.redis.queue import RqJobQueue
-from regnf_worker.bookkeeping import ResilientWorker
+from regnf_worker.resilient_worker import ResilientWorker
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis
 
 # RQ's calls, one by one
@@ -33,15 +33,12 @@ TRIED: list[tuple[str, tuple[Any, ...]]] = [
     ("subscribe", ()),
     ("check_for_suspension", (False,)),
     ("dequeue_job_and_maintain_ttl", (5, None)),
-    ("prepare_execution", (Named,)),
     ("prepare_job_execution", (Named, False)),
 ]
 LEFT_UNDONE: list[tuple[str, tuple[Any, ...]]] = [
     ("set_state", ("idle", None)),
     ("run_maintenance_tasks", ()),
     ("teardown", ()),
-    ("maintain_heartbeats", (Named,)),
-    ("set_current_job_working_time", (1.5, None)),
 ]
 
 
@@ -97,18 +94,23 @@ def test_a_sign_of_life_waits_unless_a_child_runs(
     assert len(refusals.calls) == tries
 
 
-@pytest.mark.parametrize("horse", [0, 123])
-def test_books_refused_after_a_child_has_ended_do_not_end_the_worker(
-    monkeypatch: pytest.MonkeyPatch, horse: int
+def test_a_job_is_taken_up_before_its_child_starts(monkeypatch: pytest.MonkeyPatch, waits: list[float]) -> None:
+    refusals = Refusals(3)
+    fake(monkeypatch, "prepare_execution", refusals)
+    offline_worker().begin_job(Named)
+    assert [call[1:] for call in refusals.calls] == [(Named,)] * 4
+    assert len(waits) == 3
+
+
+@pytest.mark.parametrize("error", [FULL, LASTING], ids=["full", "wrong"])
+def test_no_refusal_keeps_the_worker_from_looking_after_its_child(
+    monkeypatch: pytest.MonkeyPatch, waits: list[float], error: Exception
 ) -> None:
-    monkeypatch.setattr("rq.Worker.monitor_work_horse", lambda *_: Refusals(1)())
-    worker = offline_worker()
-    worker._horse_pid = horse
-    if horse:
-        with pytest.raises(OutOfMemoryError):
-            worker.monitor_work_horse(Named, None)  # a child that still runs is not abandoned
-    else:
-        worker.monitor_work_horse(Named, None)
+    refusals = Refusals(1, error)
+    fake(monkeypatch, "maintain_heartbeats", refusals)
+    offline_worker().report_running(Named)
+    assert [call[1:] for call in refusals.calls] == [(Named,)]
+    assert waits == []
 
 
 def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,12 +126,11 @@ class ChildlessWorker(ResilientWorker):
     """Does what a forking worker's parent does around a job, and notes the job instead of forking for it."""
 
     def execute_job(self, job: Any, queue: Any) -> None:
-        self.prepare_execution(job)
+        self.begin_job(job)
         self.prepare_job_execution(job)
         done.append(job.id)
-        self.set_current_job_working_time(0)
-        self.maintain_heartbeats(job)
-        self.set_state("idle")
+        self.report_running(job)
+        self.finish_job(job, queue, signal.SIGKILL)
 
 
 done: list[str] = []
