@@ -10,15 +10,19 @@ EXIT_NOT_REGISTERED = 1
 EXIT_BAD_INPUT = 2
 EXIT_UNAVAILABLE = 3
 EXIT_AMBIGUOUS = 4
+EXIT_INTERRUPTED = 130
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
 
 
-def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT) -> int:
-    """Say on stderr what went wrong; returns the exit code."""
+def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None = None) -> int:
+    """Say on stderr what went wrong, and what to do next; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
     err.print(message, markup=False, soft_wrap=True)
+    if hint:
+        err.print("[bold]hint:[/] ", end="")
+        err.print(hint, markup=False, soft_wrap=True)
     return code
 
 

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
+from regnf_cli.paths import FIELD, JSON_FILE, folder
 from regnf_cli.request_files import read_object
 from regnf_core.errors import InvalidOptionsError
 
@@ -20,24 +21,21 @@ _GRID_MOST = 1024
 
 
 def convert(
-    field: Annotated[
-        Path, typer.Argument(help="A checkpoint, mesh, grid, ONNX model or safe field.", exists=True, dir_okay=False)
-    ],
+    field: Annotated[Path, typer.Argument(help="A checkpoint, mesh, grid, ONNX model or safe field.", **FIELD)],
     output: Annotated[
         Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
     ],
     resolution: Annotated[
         int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
     ] = 128,
-    description: Annotated[
-        Path | None, typer.Option(help="JSON: what the file does not carry.", exists=True, dir_okay=False)
-    ] = None,
+    description: Annotated[Path | None, typer.Option(help="JSON: what the file does not carry.", **JSON_FILE)] = None,
     images: Annotated[
         Path | None,
         typer.Option(
-            help="The posed depth images that the field was fitted to: keep what they have seen with the safe field.",
-            exists=True,
-            file_okay=False,
+            help="The posed depth images that the field was fitted to: the safe field then records which parts the "
+            "cameras observed.",
+            parser=folder,
+            metavar="FOLDER",
         ),
     ] = None,
 ) -> None:
@@ -47,9 +45,10 @@ def convert(
     """
     require("engine")
     if output.suffix.lower() not in _SUFFIXES:
-        raise InvalidOptionsError(f"the output must end in one of {', '.join(_SUFFIXES)}")
+        message = f"{output}: expected a name that ends in one of {', '.join(_SUFFIXES)}"
+        raise InvalidOptionsError(message, hint="The ending chooses the format.")
     if not output.parent.is_dir():
-        raise InvalidOptionsError(f"no such folder: {output.parent}")
+        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
     given = read_object(description, "description") if description else None
     if images is not None and output.suffix.lower() != ".safetensors":
         raise InvalidOptionsError("--images goes with a safe field (.safetensors)")
@@ -61,14 +60,15 @@ def convert(
 
 def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None, images: Path | None) -> None:
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+    from regnf_core.loading import naming
 
-    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as folder:
-        with err.status("importing"):
-            report = import_field(field, Path(folder), given, ImportLimits())
+    with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
+        with err.status("importing"), naming(field):
+            report = import_field(field, Path(scratch), given, ImportLimits())
         if images is not None:
-            with err.status("looking at what was seen"):
-                _keep_what_was_seen(Path(folder) / FIELD_NAME, images)
-        os.replace(Path(folder) / FIELD_NAME, output)
+            with err.status("recording which parts the cameras observed"):
+                _keep_what_was_seen(Path(scratch) / FIELD_NAME, images)
+        os.replace(Path(scratch) / FIELD_NAME, output)
     _say(output, f"{report.family}, {report.parameters:,} parameters")
     for warning in report.warnings:
         err.print(f"warning: {warning}", markup=False, soft_wrap=True)

@@ -127,9 +127,9 @@ def _fit_mesh(
 def _check(output: Path, extent: float | None, label: str | None) -> None:
     """Refuse before the work what would fail after it."""
     if output.suffix != ".safetensors":
-        raise InvalidOptionsError("the output must end in .safetensors")
+        raise InvalidOptionsError(f"{output}: expected a name that ends in .safetensors")
     if not output.parent.is_dir():
-        raise InvalidOptionsError(f"no such folder: {output.parent}")
+        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
     if extent is not None and not 0.0 < extent < math.inf:
         raise InvalidOptionsError("the extent must be positive")
     if label is not None and len(label) > _LONGEST_LABEL:

@@ -11,21 +11,22 @@ import typer
 
 from regnf_cli.console import out
 from regnf_cli.extras import require
+from regnf_cli.paths import FIELD, JSON_FILE
 from regnf_cli.request_files import read_object
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 
 
 def inspect(
-    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", exists=True, dir_okay=False)],
+    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", **FIELD)],
     description: Annotated[
-        Path | None, typer.Option(help="JSON: what the checkpoint does not carry.", exists=True, dir_okay=False)
+        Path | None, typer.Option(help="JSON: what the checkpoint does not carry.", **JSON_FILE)
     ] = None,
     picture: Annotated[
         Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
-    """Say what a field file is: family, why, bounds, parameters, plausibility.
+    """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
 
     Example: **regnf inspect step-000030000.ckpt --picture chair.png**
     """
@@ -34,12 +35,15 @@ def inspect(
 
     from regnf_core.importing.gate.gate import ImportLimits, import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
+    from regnf_core.loading import naming
 
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
-        raise InvalidOptionsError(f"a picture ends in .png and needs a folder that exists: {picture}")
+        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
+        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
     given = read_object(description, "description") if description else None
     with tempfile.TemporaryDirectory() as folder:
-        report = import_field(field, Path(folder), given, ImportLimits(), picture is not None).to_dict()
+        with naming(field):
+            report = import_field(field, Path(folder), given, ImportLimits(), picture is not None).to_dict()
         if picture is not None:
             _keep(Path(folder) / PICTURE_NAME, picture)
     if as_json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import socket
 
@@ -52,8 +53,16 @@ def open_socket(settings: Settings) -> socket.socket:
             raise
     except OSError as error:
         detail = f"cannot listen on {settings.host}, port {settings.port}: {error.strerror or error}"
-        raise StartError(detail, reason="ADDRESS_UNAVAILABLE") from error
+        raise StartError(detail, reason="ADDRESS_UNAVAILABLE", hint=_address_hint(error, settings)) from error
     return listener
+
+
+def _address_hint(error: OSError, settings: Settings) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return f"Another program uses port {settings.port}: stop it, or give --port 0 for a free one."
+    if error.errno == errno.EACCES:
+        return "Ports below 1024 need privileges: give --port 8080."
+    return "Give an address of this machine with --host: 127.0.0.1 for this machine alone, 0.0.0.0 for all networks."
 
 
 def address_of(listener: socket.socket) -> str:

@@ -17,7 +17,7 @@ def object_model(path: Path, options: RobustOptions) -> ObjectModel:
 
     Raises NoSurfaceError, and FieldFormatError naming the file.
     """
-    field = _safe_field(path)
+    field = safe_field_path(path)
     kept = _place(field) if options.object_samples == RobustOptions().object_samples else None
     if kept is not None:
         try:
@@ -30,13 +30,6 @@ def object_model(path: Path, options: RobustOptions) -> ObjectModel:
         write_object_model(kept, model)
         return read_object_model(kept)  # the first search finds what all others will
     return model
-
-
-def _safe_field(path: Path) -> Path:
-    try:
-        return safe_field_path(path)
-    except FieldFormatError as error:
-        raise FieldFormatError(f"{path}: {error}", reason=error.reason) from error
 
 
 def _place(safe_field: Path) -> Path:

@@ -11,52 +11,64 @@ import typer
 from regnf_cli.console import out, phase_progress
 from regnf_cli.extras import require
 from regnf_cli.output import prepare, write_into
+from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT
 from regnf_cli.report import exit_code, show_result
-from regnf_cli.request_files import parse_detection, read_object, read_options, read_transform
+from regnf_cli.request_files import read_detection, read_options, read_transform
+from regnf_cli.scene_file import check_box_by_header, open_scene
+from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError
 from regnf_core.options import Preset, RegistrationOptions
 
-_FILE: dict[str, Any] = {"exists": True, "dir_okay": False}
-
 
 def register(
-    scene: Annotated[Path, typer.Argument(help="The scene's field: safe field, checkpoint or mesh.", **_FILE)],
-    object_: Annotated[Path, typer.Argument(metavar="OBJECT", help="The library object's field.", **_FILE)],
-    detection: Annotated[Path, typer.Option(help="JSON: the box in the scene's frame.", **_FILE)],
+    scene: Annotated[
+        Path, typer.Argument(help="The scene's field: safe field, checkpoint or mesh.", **FIELD | {"metavar": "SCENE"})
+    ],
+    object_: Annotated[Path, typer.Argument(help="The library object's field.", **FIELD | {"metavar": "OBJECT"})],
+    detection: Annotated[
+        Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **JSON_FILE)
+    ],
+    detection_index: Annotated[
+        int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
+    ] = None,
     preset: Annotated[
-        Preset | None, typer.Option(help="robust (the default) needs no starting guess; paper is the published method.")
+        Preset | None, typer.Option(help="robust (the default) needs no initial guess; paper is the published method.")
     ] = None,
     options: Annotated[
-        Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **_FILE)
+        Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **JSON_FILE)
     ] = None,
     initial_transform: Annotated[
         Path | None,
-        typer.Option(help="JSON: a T_object_scene to look at first, as a 4x4 or in a result document.", **_FILE),
+        typer.Option(help="JSON: a T_object_scene to try first, as a 4x4 or in a result document.", **JSON_FILE),
     ] = None,
     truth: Annotated[
-        Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **_FILE)
+        Path | None, typer.Option(help="JSON with the true T_object_scene: errors are shown.", **JSON_FILE)
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1)] = 0,
     output: Annotated[
-        Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", file_okay=False)
+        Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", **OUTPUT)
     ] = None,
     server: Annotated[
         str | None, typer.Option(help="Address of a regnf service; without it the work is done here.")
     ] = None,
     worker_timeout: Annotated[
-        int, typer.Option(min=0, help="With --server: give up once it has had no live worker for so many seconds.")
+        int, typer.Option(min=0, help="With --server: seconds to wait for a worker before giving up.")
     ] = 60,
+    cancel_on_interrupt: Annotated[
+        bool, typer.Option("--cancel-on-interrupt", help="With --server: Ctrl+C cancels the job; it goes on otherwise.")
+    ] = False,
     token: Annotated[str | None, typer.Option(envvar="REGNF_API_TOKEN", help="The service's bearer token.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the whole result document.")] = False,
 ) -> None:
-    """Find the similarity transform that lays the scene's object onto the library's.
+    """Find where a known object stands in a scanned scene: rotation, position and scale.
 
     Example: **regnf register room.ckpt chair.ckpt --detection box.json --output out/**
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.
     """
+    box = read_detection(detection, detection_index)
     request: dict[str, Any] = {
-        "detection": read_object(detection, "detection"),
+        "detection": box.canonical(),
         "options": read_options(options, preset),
         "seed": seed,
         "initial_transform": read_transform(initial_transform, "initial transform") if initial_transform else None,
@@ -64,16 +76,20 @@ def register(
     }
     if request["initial_transform"] and RegistrationOptions.from_dict(request["options"]).preset != "robust":
         raise InvalidInputError(
-            "only the preset robust starts from a given transform", reason="INITIAL_TRANSFORM_UNSUPPORTED"
+            "only the preset robust starts from a given transform",
+            reason="INITIAL_TRANSFORM_UNSUPPORTED",
+            hint="Leave --initial-transform out, or use --preset robust.",
         )
+    check_box_by_header(scene, box, object_)
     if server is not None:
-        from regnf_cli.remote import RemoteService, register_remotely
+        from regnf_cli.remote import RemoteService
+        from regnf_cli.remote_exchange import Delivery, register_remotely
 
         service = RemoteService(server, token, worker_timeout)
-        document = register_remotely(service, scene, object_, request, output)
+        document = register_remotely(service, scene, object_, request, Delivery(output, cancel_on_interrupt))
     else:
         require("engine")
-        document = _register_here(scene, object_, request, output)
+        document = _register_here(scene, object_, box, request, output)
     if as_json:
         out.print_json(json.dumps(document))
     else:
@@ -81,7 +97,10 @@ def register(
     raise typer.Exit(exit_code(document))
 
 
-def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: Path | None) -> dict[str, Any]:
+def _register_here(
+    scene: Path, object_: Path, detection: Detection, request: dict[str, Any], output: Path | None
+) -> dict[str, Any]:
+    from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.loading import load_field
     from regnf_core.registration import WarmStart
@@ -89,13 +108,13 @@ def _register_here(scene: Path, object_: Path, request: dict[str, Any], output: 
     from regnf_core.viewing import result_document
 
     options = RegistrationOptions.from_dict(request["options"])
-    box = parse_detection(request["detection"])
+    box = OrientedBox.from_detection(detection)
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
     prepare(output)
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
-        fields = load_field(scene), load_field(object_)
+        fields = open_scene(scene, detection), load_field(object_)
         result = run(
             *fields,
             box,

@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
 from regnf_core.geometry.similarity_check import similarity_fault
+from regnf_core.json_faults import json_fault
 from regnf_core.options import Preset, RegistrationOptions
 
-if TYPE_CHECKING:
-    from regnf_core.geometry.box import OrientedBox
-
 Rows = list[list[float]]
+_TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates.'
+
+
+def read_detection(path: Path, index: int | None = None) -> Detection:
+    """The detection in a file, in any form. Raises InvalidInputError (MALFORMED_JSON) and InvalidDetectionError."""
+    try:
+        return parse_detection(_read_json(path, "detection"), index)
+    except InvalidDetectionError as error:
+        message = f"{path}: {error}"
+        raise InvalidDetectionError(message, reason=error.reason, hint=error.hint, place=error.place) from error
 
 
 def read_object(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
     value = _read_json(path, what)
     if not isinstance(value, dict):
-        raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON")
+        hint = "Write an object: {...}."
+        raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
     return value
 
 
@@ -34,7 +44,12 @@ def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
     if preset is not None and named != preset:
         raise InvalidOptionsError(f"options.preset: {path} says {named!r}, --preset {preset}: leave one of them out")
     options = values | {"preset": named} if named is not None else values
-    RegistrationOptions.from_dict(options)
+    try:
+        RegistrationOptions.from_dict(options)
+    except InvalidOptionsError as error:
+        source = f"{path}: " if path else ""
+        hint = error.hint or "docs/api.md lists every option with its range."
+        raise InvalidOptionsError(f"{source}{error}", reason=error.reason, hint=hint) from error
     return options
 
 
@@ -46,37 +61,22 @@ def read_transform(path: Path, what: str) -> Rows:
     value = _read_json(path, what)
     if isinstance(value, dict):
         value = value.get("T_object_scene", value)
-    rows = value.get("matrix") if isinstance(value, dict) else value
-    if rows is None:
-        raise InvalidInputError(f"{what} {path}: no T_object_scene with a matrix", reason="INVALID_TRANSFORM")
-    if fault := similarity_fault(rows):
-        raise InvalidInputError(f"{what} {path}: {fault}", reason="INVALID_TRANSFORM")
+    rows: Any = value.get("matrix") if isinstance(value, dict) else value
+    fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
+    if fault:
+        raise InvalidInputError(f"{what} {path}: {fault}", reason="INVALID_TRANSFORM", hint=_TRANSFORM)
     return [[float(number) for number in row] for row in rows]
-
-
-def parse_detection(values: dict[str, Any]) -> OrientedBox:
-    """A detection's JSON as a box. Raises InvalidDetectionError for what is missing, unknown or malformed."""
-    from regnf_core.geometry.box import OrientedBox
-
-    known = {"min", "max", "center", "size", "rotation_quaternion_xyzw", "label", "score"}
-    if unknown := sorted(set(values) - known):
-        raise InvalidDetectionError(f"detection holds unknown members: {', '.join(unknown)}")
-    shared = {name: values[name] for name in ("label", "score") if values.get(name) is not None}
-    try:
-        if values.keys() & {"min", "max"}:
-            if extra := sorted(values.keys() & {"center", "size", "rotation_quaternion_xyzw"}):
-                raise InvalidDetectionError(f"detection holds corners and {', '.join(extra)}: either, not both")
-            return OrientedBox.from_corners(values["min"], values["max"], **shared)
-        quaternion = values.get("rotation_quaternion_xyzw") or (0.0, 0.0, 0.0, 1.0)
-        return OrientedBox.from_quaternion(values["center"], values["size"], quaternion, **shared)
-    except KeyError as error:
-        raise InvalidDetectionError(f"detection lacks {error}") from error
-    except (OverflowError, RuntimeError, TypeError, ValueError) as error:
-        raise InvalidDetectionError("detection must hold lists of three numbers") from error
 
 
 def _read_json(path: Path, what: str) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"{what} {path}: {error}", reason="MALFORMED_JSON") from error
+    except json.JSONDecodeError as error:
+        message, hint = json_fault(error)
+    except UnicodeDecodeError:
+        message, hint = "no text in UTF-8", "Is it a field or a picture? A JSON file is expected here."
+    except RecursionError:
+        message, hint = "its lists nest too deeply", "A box has two levels of lists at most."
+    except ValueError:
+        message, hint = "a number of too many digits", "Write fewer digits."
+    raise InvalidInputError(f"{what} {path}: {message}", reason="MALFORMED_JSON", hint=hint)

@@ -32,13 +32,15 @@ class StateLock:
             self._file = (self._state_dir / _NAME).open("a+")
         except OSError as error:
             detail = f"cannot keep state in {self._state_dir}: {error.strerror}"
-            raise StartError(detail, reason="STATE_DIR_UNUSABLE") from error
+            hint = "Give a folder that can be written with --state-dir."
+            raise StartError(detail, reason="STATE_DIR_UNUSABLE", hint=hint) from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             self._file.close()
-            detail = f"another service uses {self._state_dir}; give this one its own with --state-dir"
-            raise StartError(detail, reason="STATE_DIR_IN_USE") from error
+            detail = f"another `regnf serve` uses {self._state_dir}"
+            hint = "Use that one, or stop it, or give this one its own folder with --state-dir."
+            raise StartError(detail, reason="STATE_DIR_IN_USE", hint=hint) from error
         self._remove_leftover()
         return self
 

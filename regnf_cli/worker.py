@@ -26,17 +26,22 @@ def worker(
 
     from redis.exceptions import ConnectionError as RedisConnectionError
 
-    from regnf_cli.settings import read_settings
+    from regnf_cli.settings import check_redis_url, read_settings
     from regnf_cli.start_errors import StartError
     from regnf_worker.context import NoRedisError
     from regnf_worker.main import run_worker
     from regnf_worker.preload import PreloadError
 
     if redis_url is not None:
+        check_redis_url(redis_url, "--redis-url")
         os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too
     try:
         run_worker(read_settings())
     except (NoRedisError, PreloadError) as error:
-        raise StartError(str(error), reason=error.reason) from error
+        hint = "Give --redis-url redis://HOST:6379/0, or start `regnf serve`, which brings its own Redis and worker."
+        raise StartError(
+            str(error), reason=error.reason, hint=hint if isinstance(error, NoRedisError) else None
+        ) from error
     except RedisConnectionError as error:
-        raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE") from error
+        hint = "Start Redis, or check the address in --redis-url or REGNF_REDIS_URL."
+        raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE", hint=hint) from error

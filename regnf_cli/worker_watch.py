@@ -40,7 +40,8 @@ class WorkerWatch:
             self._missing_since = now
         if now - self._missing_since >= self._limit_s:
             raise NoWorkerError(
-                f"the service has had no live worker for {self._limit_s:g} s; what was sent stays in its queue, "
-                "and the same command finds it again"
+                f"the service has had no live worker for {self._limit_s:g} s",
+                hint="Start one: `regnf worker`, or `regnf serve` with --workers 1. The job stays in the queue; the "
+                "same command finds it again.",
             )
         self._next_look = min(self._next_look, self._missing_since + self._limit_s)

@@ -19,6 +19,19 @@ _ONNX_VERSIONS, _ONNX_NEXT = (
     (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
 )
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
+_OTHER_FILES = (
+    (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
+    (b"<!doctype html", "an HTML page, not a field; the download failed, or it needs a login"),
+    (b"<html", "an HTML page, not a field; the download failed, or it needs a login"),
+    (b"<?xml", "an XML document, not a field; the download failed, or it is another file"),
+    (b"\x89PNG", "a PNG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
+    (b"\xff\xd8\xff", "a JPEG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
+    (b"\x1f\x8b", "a gzip archive; unpack it, and give the file inside"),
+    (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
+    (b"%PDF", "a PDF document, not a field"),
+    (b"\x89HDF", "an HDF5 file; only the formats of docs/families.md are taken"),
+)
+"""Files that people give by mistake: their first bytes, and what they are."""
 
 
 def sniff_format(head: bytes) -> str | None:
@@ -55,6 +68,9 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
+    for magic, what in _OTHER_FILES:
+        if head.lstrip()[: len(magic)].lower() == magic.lower():
+            return "FORMAT_NOT_RECOGNIZED", what
     return (
         "FORMAT_NOT_RECOGNIZED",
         "none of the formats that are taken: torch.save archives, safetensors, npz, SQLite, ONNX, meshes",

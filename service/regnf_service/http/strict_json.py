@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+from regnf_core.json_faults import json_fault
 from regnf_service.http.problems import Problem
 
 _MAX_DEPTH = 32
@@ -24,7 +25,8 @@ def parse_json(body: bytes) -> Any:
     except UnicodeDecodeError as error:
         raise Problem("MALFORMED_JSON", "The body is not UTF-8.") from error
     except json.JSONDecodeError as error:
-        raise Problem("MALFORMED_JSON", f"Not JSON from byte {error.pos} on.") from error
+        message, hint = json_fault(error)
+        raise Problem("MALFORMED_JSON", f"The body is {message}.", hint=hint) from error
     except (RecursionError, ValueError) as error:
         raise Problem("MALFORMED_JSON", "Too deep, or a number of too many digits.") from error
     _check_depth(value)

@@ -1,0 +1,61 @@
+"""Files named at the command line: a name that cannot be used is refused with the one that was meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.field_files import require_field_file, require_file
+
+
+def field_file(text: str) -> Path:
+    """The path of a field. Raises what ``require_field_file`` does."""
+    path = Path(text)
+    require_field_file(path)
+    return path
+
+
+def file(text: str) -> Path:
+    """The path of a file that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER)."""
+    path = Path(text)
+    require_file(path)
+    return path
+
+
+def folder(text: str) -> Path:
+    """The path of a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND, FILE_IS_NO_FOLDER)."""
+    path = Path(text)
+    if path.is_dir():
+        return path
+    if path.exists():
+        hint = f"Give the folder that holds it: {path.parent}"
+        raise InvalidInputError(f"{path}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
+    require_file(path)
+    return path
+
+
+def library_path(text: str) -> Path:
+    """A folder of fields, or a field. Raises what ``require_field_file`` does."""
+    path = Path(text)
+    if not path.is_dir():
+        require_field_file(path)
+    return path
+
+
+def output_folder(text: str) -> Path:
+    """The path of a folder to write into, which may not be there yet. Raises InvalidInputError (FILE_IS_NO_FOLDER)."""
+    path = Path(text)
+    for place in (path, *path.parents):
+        if place.is_dir():
+            break
+        if place.exists():
+            message = f"{place}: a file, expected a folder to write into"
+            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder with --output.")
+    return path
+
+
+FIELD: dict[str, Any] = {"parser": field_file, "metavar": "FILE"}
+JSON_FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
+OUTPUT: dict[str, Any] = {"parser": output_folder, "metavar": "FOLDER"}
+"""How options and arguments of these kinds are declared."""

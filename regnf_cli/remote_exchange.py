@@ -1,0 +1,134 @@
+"""One registration or search through a service, from the upload to the files, for the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+from rich.progress import Progress
+
+from regnf_cli.console import err, phase_progress
+from regnf_cli.remote import RemoteService, Report
+from regnf_cli.remote_errors import ServiceError, unreachable
+
+_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", ServiceError.reason})
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """output: where to write the job's files, if anywhere · cancel: whether Ctrl+C cancels the job too."""
+
+    output: Path | None = None
+    cancel: bool = False
+
+
+def register_remotely(
+    service: RemoteService, scene: Path, object_: Path, request: dict[str, Any], delivery: Delivery
+) -> dict[str, Any]:
+    """The whole exchange for one registration, with progress on stderr; returns the result document.
+
+    Raises ServiceError, UnreachableError, NoWorkerError; KeyboardInterrupt once the user has been told of the job.
+    """
+
+    def upload(report: Report) -> dict[str, Any]:
+        return {"scene": _sent(service, scene, report), "object": _sent(service, object_, report)}
+
+    return _exchange(service, upload, request, delivery)
+
+
+def search_remotely(
+    service: RemoteService, scene: Path, objects: Sequence[Path], request: dict[str, Any], delivery: Delivery
+) -> dict[str, Any]:
+    """The same for a search among ``objects``, which the document then names by their files."""
+    files: dict[str, Path] = {}
+
+    def upload(report: Report) -> dict[str, Any]:
+        sent = {"scene": _sent(service, scene, report)}
+        for path in objects:
+            with _named(path):
+                files.setdefault(service.send(path, report), path)
+        for sha256, path in files.items():
+            with _named(path):
+                service.wait_until_ready(sha256)
+        return {**sent, "candidates": list(files)}
+
+    document = _exchange(service, upload, request, delivery)
+    for place in (document, *document["candidates"]):
+        place["object"] = str(files[place["object"]])
+    return document
+
+
+def _sent(service: RemoteService, path: Path, report: Report) -> str:
+    with _named(path):
+        return service.upload_field(path, report)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Refusals of a field name its file."""
+    try:
+        yield
+    except ServiceError as error:
+        if error.unavailable or error.reason in _NOT_OF_A_FILE:
+            raise
+        raise ServiceError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
+
+
+def _exchange(
+    service: RemoteService, upload: Callable[[Report], dict[str, Any]], request: dict[str, Any], delivery: Delivery
+) -> dict[str, Any]:
+    """Upload, post, follow, fetch."""
+    try:
+        with service, phase_progress() as bar:
+            task = bar.add_task("uploading", total=1.0)
+
+            def report(phase: str, share: float) -> None:
+                bar.update(task, description=phase, completed=share)
+
+            named = upload(report)
+            body = {name: value for name, value in request.items() if value is not None}
+            job_id = service.submit({**named, **body})["id"]
+            _announce(bar, service, job_id)
+            try:
+                service.follow(job_id, report)
+            except KeyboardInterrupt:
+                bar.stop()
+                _leave(service, job_id, delivery.cancel)
+                raise
+            document = service.result(job_id)
+            _fetch(service, job_id, document, delivery.output)
+            return document
+    except httpx.RequestError as error:
+        raise unreachable(service.address, error) from error
+
+
+def _announce(bar: Progress, service: RemoteService, job_id: str) -> None:
+    bar.console.print(f"job          {job_id}", markup=False, soft_wrap=True)
+    bar.console.print(f"page         {service.page(job_id)}", markup=False, soft_wrap=True)
+
+
+def _leave(service: RemoteService, job_id: str, cancel: bool) -> None:
+    """Say what becomes of the job after Ctrl+C."""
+    if cancel:
+        service.cancel(job_id)
+        said = f"cancelled the job {job_id}"
+    else:
+        said = (
+            f"the job {job_id} goes on: the same command follows it again, {service.page(job_id)} shows it\n"
+            f"To cancel it: curl -X POST {service.address}/jobs/{job_id}/cancel, "
+            "or give --cancel-on-interrupt next time."
+        )
+    err.print(said, markup=False, soft_wrap=True)
+
+
+def _fetch(service: RemoteService, job_id: str, document: dict[str, Any], output: Path | None) -> None:
+    if output is None:
+        return
+    output.mkdir(parents=True, exist_ok=True)
+    for artifact in document["artifacts"]:
+        name = artifact["name"]
+        service.fetch_artifact(job_id, name, output / Path(name).name)  # never outside the folder

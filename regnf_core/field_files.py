@@ -1,0 +1,81 @@
+"""Whether a path can be a field at all, and which file was meant when it cannot. Torch-free; opens nothing large."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from regnf_core.errors import FieldFormatError, InvalidInputError
+
+CHECKPOINT_SUFFIXES = frozenset({".ckpt", ".pt", ".pth", ".tar"})
+_TEXT_SUFFIXES = frozenset({".yml", ".yaml", ".json", ".toml", ".txt", ".log"})
+_MAX_DEPTH = 4
+_MAX_ENTRIES = 5000
+_MAX_NAME = 200
+
+
+def require_field_file(path: Path) -> None:
+    """Raises InvalidInputError FILE_NOT_FOUND or FILE_IS_FOLDER, FieldFormatError FILE_EMPTY or FORMAT_NOT_RECOGNIZED.
+
+    Each names the path; for the folder of a training run and its config.yml, the hint names the checkpoint inside.
+    """
+    require_file(path)
+    if path.suffix.lower() in _TEXT_SUFFIXES:
+        found = checkpoint_below(path.parent)
+        hint = f"Did you mean {found}?" if found else "Give the checkpoint that it belongs to."
+        message = f"{path}: a text file ({path.suffix}), expected a field: safe field, checkpoint or mesh"
+        raise FieldFormatError(message, reason="FORMAT_NOT_RECOGNIZED", hint=hint)
+    if path.stat().st_size == 0:
+        raise FieldFormatError(f"{path}: the file is empty", reason="FILE_EMPTY", hint="Copy or download it again.")
+
+
+def require_file(path: Path) -> None:
+    """Raises InvalidInputError, FILE_NOT_FOUND or FILE_IS_FOLDER, which names the path and the file that was meant."""
+    if path.is_dir():
+        found = checkpoint_below(path)
+        hint = f"Did you mean {found}?" if found else "Give a file inside it."
+        raise InvalidInputError(f"{path}: a folder, expected a file", reason="FILE_IS_FOLDER", hint=hint)
+    if not path.exists():
+        shown = str(path) if len(str(path)) <= _MAX_NAME else f"{str(path)[:_MAX_NAME]}..."
+        raise InvalidInputError(f"{shown}: no such file", reason="FILE_NOT_FOUND", hint=_near(path))
+
+
+def checkpoint_below(folder: Path) -> Path | None:
+    """The checkpoint of the latest step in a training run's folder; None where there is none."""
+    found = [path for path in _files(folder) if path.suffix.lower() in CHECKPOINT_SUFFIXES]
+    return max(found, key=lambda path: (_step(path), path.stat().st_mtime, path.name), default=None)
+
+
+def _step(path: Path) -> int:
+    numbers = re.findall(r"\d{1,12}", path.stem)
+    return int(numbers[-1]) if numbers else -1
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """The files below a folder, a few levels deep and a few thousand at most."""
+    seen = 0
+    base = len(folder.parts)
+    for place, folders, names in os.walk(folder):
+        if len(Path(place).parts) - base >= _MAX_DEPTH:
+            folders.clear()
+        for name in names:
+            seen += 1
+            if seen > _MAX_ENTRIES:
+                return
+            yield Path(place) / name
+
+
+def _near(path: Path) -> str:
+    """What to do about a file that is not there: the name that is almost the same, or where to look."""
+    if str(path).lstrip()[:1] in ("{", "["):
+        return "A file is expected: write the JSON into a file, and give its name."
+    folder = path.parent
+    if not folder.is_dir():
+        return f"There is no folder {str(folder)[:_MAX_NAME]} either. Check the path."
+    names = [entry.name for entry in folder.iterdir()]
+    same_stem = [name for name in names if Path(name).stem == path.stem]
+    near = same_stem or difflib.get_close_matches(path.name, names, n=1)
+    return f"Did you mean {folder / near[0]}?" if near else f"Check the path, and what is in {folder.resolve()}."
