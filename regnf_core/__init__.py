@@ -33,7 +33,7 @@ _HOMES = {
     "RegnfError": "regnf_core.errors",
     "SdfField": "regnf_core.fields.base",
     "Sim3": "regnf_core.geometry.sim3",
-    "WarmStart": "regnf_core.robust.register",
+    "WarmStart": "regnf_core.robust.pipeline",
     "open_field": "regnf_core.fields.build",
     "register": "regnf_core.registration",
 }

@@ -1,4 +1,4 @@
-"""Several detections of one scene and several objects in one go: what they share is made once.
+"""Several detections of one scene and several objects in one call: what they share is made once.
 
 outcomes = register_batch(scene, [box_1, box_2], [chair, table], pairs=[(0, 0), (1, 1)])
 """
@@ -16,7 +16,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Phase, ProgressCallback, RegistrationResult
 from regnf_core.robust.model.object_model import ObjectModel, model_object
-from regnf_core.robust.register import WarmStart, cloud_region, register_robust
+from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.run import Run
 from regnf_core.surface.result_clouds import with_clouds
@@ -24,9 +24,17 @@ from regnf_core.surface.result_clouds import with_clouds
 _T = TypeVar("_T")
 
 
+@dataclass(frozen=True, eq=False)
+class ModeledObject:
+    """An object's field with its model, made earlier by ``model_object``: saves making it again."""
+
+    field: SdfField
+    model: ObjectModel
+
+
 @dataclass(frozen=True)
 class BatchOutcome:
-    """One pair's end: a result, or the error that it alone would have raised."""
+    """A result, or the error that the registration of this pair raised."""
 
     detection: int
     object: int
@@ -37,21 +45,20 @@ class BatchOutcome:
 def register_batch(
     scene: SdfField,
     detections: Sequence[OrientedBox],
-    objects: Sequence[SdfField],
+    objects: Sequence[SdfField | ModeledObject],
     pairs: Sequence[tuple[int, int]] | None = None,
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
-    models: Sequence[ObjectModel] | None = None,
     clouds: bool = True,
 ) -> list[BatchOutcome]:
     """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
 
-    Every pair ends as :func:`regnf_core.register` alone would end with the same seed: a faulty pair spoils no other.
-    ``models`` are the objects' models, made earlier. Without ``clouds`` the point clouds for viewers are left out,
-    about half of the time. ``progress`` sees the phases of one pair after the other; its share is of all of them.
-    Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the
-    lists, and CancelledError from ``progress``.
+    Each result is that of :func:`regnf_core.register` for this pair and seed; a pair that fails does not stop the
+    others. Without ``clouds`` the point clouds for viewers are left out, which take about half of the time.
+    ``progress`` gets the phases of one pair after the other, and the share done of all pairs. Raises
+    InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the lists,
+    and CancelledError from ``progress``.
     """
     options = options or RegistrationOptions()
     options.require_robust("registers a batch")
@@ -59,7 +66,7 @@ def register_batch(
     for d, o in wanted:
         if not (0 <= d < len(detections) and 0 <= o < len(objects)):
             raise InvalidInputError(f"no pair ({d}, {o}) among the detections and objects", reason="PAIR_UNKNOWN")
-    batch = _Batch(scene, detections, objects, options, seed, dict(enumerate(models or ())))
+    batch = _Batch(scene, detections, objects, options, seed)
     outcomes = []
     for number, (d, o) in enumerate(wanted):
         run = Run(_share_of(progress, number, len(wanted)))
@@ -73,19 +80,19 @@ def register_batch(
 
 
 class _Batch:
-    """Views and models, made when first needed; what failed once fails again without being tried."""
+    """Views and models, made when first needed. What failed once fails again without another attempt."""
 
     def __init__(
         self,
         scene: SdfField,
         detections: Sequence[OrientedBox],
-        objects: Sequence[SdfField],
+        objects: Sequence[SdfField | ModeledObject],
         options: RegistrationOptions,
         seed: int,
-        models: dict[int, ObjectModel],
     ) -> None:
-        self.scene, self.detections, self.objects = scene, detections, objects
-        self.options, self.seed = options, seed
+        self.scene, self.detections, self.options, self.seed = scene, detections, options, seed
+        self.objects = [one.field if isinstance(one, ModeledObject) else one for one in objects]
+        models = {number: one.model for number, one in enumerate(objects) if isinstance(one, ModeledObject)}
         self._views: dict[int, SceneView | RegnfError] = {}
         self._models: dict[int, ObjectModel | RegnfError] = dict(models)
 

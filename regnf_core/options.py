@@ -134,7 +134,7 @@ class RobustOptions:
     max_free_space_violations: _Ratio = 0.2
     """Largest share (0..1) of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED. Less is
     allowed of accurate fields. More where the scene's field lacks parts of the object."""
-    max_hidden_share: _Ratio = 0.75
+    max_occluded_share: _Ratio = 0.75
     """Largest share (0..1) of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE.
     More for things of which hardly one side was seen."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
@@ -218,6 +218,7 @@ def _names() -> dict[tuple[str, ...], list[str]]:
 UNKNOWN_OPTION = "unexpected_keyword_argument"
 """The type of pydantic's error about an unknown option."""
 _FORMER_NAMES = {
+    ("robust", "max_hidden_share"): "robust.max_occluded_share",
     ("sampling", "up_axis"): "up_axis",
     ("robust", "up_axis"): "up_axis",
     ("initialisation",): "initialization",

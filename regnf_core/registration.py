@@ -7,7 +7,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.paper import pipeline as paper
 from regnf_core.result import ProgressCallback, RegistrationResult
-from regnf_core.robust.register import WarmStart, cloud_region, register_robust
+from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
 from regnf_core.run import Run
 from regnf_core.surface.result_clouds import with_clouds
 

@@ -17,7 +17,7 @@ from benchmarks.robust.runs import ROBUST, Context, Run
 from regnf_core import WarmStart, register
 from regnf_core import open_field as open_safe_field
 from regnf_core.library import LibraryObject, LibrarySearch, read_object_model, search_library
-from regnf_core.robust.library_search import by_signature
+from regnf_core.robust.library_search import rank_by_signature
 from regnf_core.robust.scene.scene_view import view_scene
 
 NAME = "library"
@@ -124,7 +124,7 @@ def _missed(found: LibrarySearch) -> Run:
 
 def _signature_place(case: Case, pair: Pair, some: Sequence[LibraryObject], seed: int) -> int:
     view = view_scene(case.scene, case.detection, ROBUST.robust, seed)
-    order = by_signature(view, [one.model for one in some])
+    order = rank_by_signature(view, [one.model for one in some])
     return 1 + [some[number].name for number, _ in order].index(pair.instance)
 
 

@@ -1,5 +1,6 @@
-"""The preset `robust`: registration without a starting guess, at any scale and in any orientation, with a verdict.
+"""The preset `robust`: registration without an initial guess, at any scale and in any orientation, with a verdict.
 
-Samples of both surfaces, hypotheses over all of Sim(3) scored on those samples alone, Levenberg-Marquardt on the fields
-for the few that can win, and a judgment on samples that the refinement has not seen.
+It samples both surfaces, searches all of Sim(3) on those samples alone, refines the few best poses on the fields by
+Levenberg-Marquardt, and evaluates them on held-out samples. ``pipeline`` is the whole of it; every tuned number stands
+in ``constants``.
 """

@@ -1,170 +1,182 @@
-"""Registration without a starting guess, top to bottom: sample, search, refine, judge."""
+"""The preset `robust` as one call: sample both surfaces, search, refine on the fields, evaluate.
+
+What each step does stands in docs/robust.md.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
 
 import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.counting import CountingField
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.pose_distance import displacement
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RegistrationOptions, RobustOptions
-from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.options import RegistrationOptions
+from regnf_core.result import RegistrationResult
+from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
+from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
-from regnf_core.robust.refine.pose_candidates import LAST, STAGES, Finalists, Trail, run_stage
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.samples import split
-from regnf_core.robust.scene.scene_view import SceneView
-from regnf_core.robust.search.hypotheses import seeds, seeds_about
-from regnf_core.robust.search.rotations import super_fibonacci, turns_about
-from regnf_core.robust.search.search import ROUNDS, Round, search
-from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
-from regnf_core.robust.working_frame import WorkingField
-from regnf_core.surface.cameras import axis_vector
+from regnf_core.robust.problem import RegistrationProblem, make_problem
+from regnf_core.robust.refine.coarse_to_fine import RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
+from regnf_core.robust.report import result_of
+from regnf_core.robust.residuals import SurfacePair
+from regnf_core.robust.scene.scene_view import SceneView, view_scene
+from regnf_core.robust.search.features import feature_seeds
+from regnf_core.robust.search.rotations import start_rotations
+from regnf_core.robust.search.seeds import seed_poses, seed_poses_around
+from regnf_core.robust.stage import Stage
+from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
+from regnf_core.run import STARTS, Run
 
-SCALE_FACTORS = (0.85, 1.0, 1.18)
-ITERATIONS = sum(len(stage.widths) for stage in (*STAGES, LAST))
-_YAW_SHARE = 10  # rotations of the full search for each turn about a given axis
-_WARM_SEEDS = 63
-_SAME_POSE = 0.06  # object diameters
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A detection and an object: what is refined on (A, B), what is judged on (A_held, B_held), in working frames."""
-
-    view: SceneView
-    model: ObjectModel
-    scene_field: WorkingField
-    object_field: WorkingField
-    A: Samples
-    B: Samples
-    A_held: Samples
-    B_held: Samples
-
-    def in_field_frames(self, T_work: Sim3) -> Sim3:
-        """A single pose between the working frames as T_object_scene."""
-        return self.model.frame.to_field() @ T_work @ self.view.frame.to_field().inverse()
-
-    def in_working_frames(self, T_object_scene: Sim3) -> Sim3:
-        """A single T_object_scene as a pose between the working frames."""
-        return self.model.frame.to_field().inverse() @ T_object_scene @ self.view.frame.to_field()
+ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, REFINEMENT.last_stage))
+"""Of the refinement on the fields."""
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    """Finalists, best first, the evidence on them, and where each one started."""
+class WarmStart:
+    """What is known before a registration with the preset `robust`.
 
-    finalists: Finalists
-    evidence: Evidence
-    T_initial: Sim3
-
-
-def pose_problem(
-    view: SceneView,
-    model: ObjectModel,
-    scene: SdfField,
-    obj: SdfField,
-    options: RobustOptions,
-    generator: torch.Generator,
-) -> Problem:
-    """Split the samples of both surfaces into those to refine on and those to judge on."""
-    A, A_held = split(view.foreground, options.held_out_share, generator)
-    B, B_held = split(model.samples, options.held_out_share, generator)
-    return Problem(view, model, view.field(scene), model.field(obj), A, B, A_held, B_held)
-
-
-def find_candidates(
-    view: SceneView,
-    model: ObjectModel,
-    rotations: Tensor,
-    generator: torch.Generator,
-    T_start: Sim3 | None = None,
-    rounds: tuple[Round, ...] = ROUNDS,
-    more_seeds: Sim3 | None = None,
-) -> tuple[Sim3, Tensor]:
-    """Candidate poses (H,) and their scores (H,), best first, from the samples alone: no field is evaluated.
-
-    rotations: (K, 3, 3) that the search starts from.
-    With ``T_start``, a single pose in working frames, only its neighborhood is searched; ``more_seeds`` (H,) are
-    searched beside those of the geometry.
+    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection ·
+    object_model: what ``model_object`` made of the object's field earlier; saves making it again.
     """
-    if T_start is not None:
-        T = seeds_about(T_start, _WARM_SEEDS, generator)
-    else:
-        T = seeds(
-            view.foreground.on_surface(),
-            model.samples.on_surface(),
-            view.detection.rotation,
-            view.detection.size / view.detection.diagonal,
-            rotations,
-            torch.tensor(SCALE_FACTORS),
-        )
-    if more_seeds is not None:
-        T = Sim3.cat([T, more_seeds])
-    return search(view.proxy, model.proxy, view.foreground, model.samples, T, model.extremes, generator, rounds)
+
+    T_object_scene: Sim3 | None = None
+    object_model: ObjectModel | None = None
 
 
-def refine_candidates(
-    problem: Problem,
-    candidates: Sim3,
-    options: RobustOptions,
+def register_robust(
+    scene_field: SdfField,
+    object_field: SdfField,
+    detection: OrientedBox,
+    options: RegistrationOptions,
+    seed: int,
+    run: Run,
+    warm_start: WarmStart | None = None,
+    scene_view: SceneView | None = None,
+) -> RegistrationResult:
+    """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
+
+    ``scene_view`` saves making one; it must be of this scene, box, options and seed.
+    Deterministic for a seed, on one machine and with the same number of threads.
+    Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
+    """
+    known = warm_start or WarmStart()
+    scene, obj = CountingField(scene_field), CountingField(object_field)
+    generator = torch.Generator().manual_seed(seed)
+    with run.phase("sampling"):
+        view = scene_view or view_scene(scene_field, detection, options.robust, seed)
+        model = known.object_model or model_object(obj, options.robust)
+        problem = make_problem(view, model, scene, obj, options.robust, generator)
+    best = _best_attempt(problem, options, seed, run, generator, known.T_object_scene)
+    evaluations = view.evaluations + scene.evaluations + obj.evaluations
+    return result_of(problem, best, options, seed, evaluations)
+
+
+def cloud_region(detection: OrientedBox) -> Callable[[Tensor], Tensor]:
+    """What says which points (N, 3) of the scene may belong to a result's clouds, (N,) bool.
+
+    Those in the detection box, grown a little. No ground is removed: which way is up need not be known.
+    """
+    return lambda points: detection.contains(points, SAMPLING.cloud_margin)
+
+
+def search_poses(
+    view: SceneView,
+    model: ObjectModel,
+    seeds: Sim3,
     generator: torch.Generator,
-    on_step: Callable[[], None] = lambda: None,
-) -> Outcome:
-    """Refine on the fields, add the winner's twins under the object's symmetries, refine all that is left, judge.
+    stages: Sequence[Stage] = SEARCH.stages,
+) -> PoseCandidates:
+    """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated."""
+    grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
+    context = RefinementContext(model.extremal_points, generator)
+    return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
+
+
+def refine_poses(
+    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
+) -> PoseCandidates:
+    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them in the last stage. Best first.
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
-    scene, obj, ex = problem.scene_field, problem.object_field, problem.model.extremes
-    found = None
-    most = problem.view.most_offset
-    T, offsets = candidates, torch.zeros_like(candidates.scale)
-    for stage in STAGES:
-        trail = found.trail if found else Trail()
-        found = run_stage(scene, obj, problem.A, problem.B, T, stage, ex, generator, trail, on_step, offsets, most)
-        T, offsets = found.T, found.offsets
-    assert found is not None
-    twins = _missing_twins(T, problem.model.symmetry, ex)
-    descent = torch.cat([torch.arange(T.scale.numel()), torch.zeros(twins.scale.numel(), dtype=torch.long)])
-    trail = found.trail.keep(descent)
-    last = run_stage(
-        scene,
-        obj,
-        problem.A,
-        problem.B,
-        Sim3.cat([T, twins]),
-        LAST,
-        ex,
-        generator,
-        trail,
-        on_step,
-        offsets[descent],
-        most,
-    )
-    evidence = gather_evidence(scene, obj, problem.A_held, problem.B_held, last.T, options, last.offsets)
-    T_initial = last.trail.steps[0].T
-    return Outcome(last, evidence, T_initial)
+    points = problem.model.extremal_points
+    context = RefinementContext(points, generator, max_offset=problem.view.max_offset, on_step=on_step)
+    found = coarse_to_fine(problem.fit, PoseCandidates.start(T, with_offsets=True), REFINEMENT.stages, context)
+    equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
+    origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
+    joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
+    return coarse_to_fine(problem.fit, joined, [REFINEMENT.last_stage], context)
 
 
-def _missing_twins(T: Sim3, symmetry: SelfSymmetry, extremes: Tensor) -> Sim3:
-    """The best pose (the first of T) turned by each of the object's symmetries, without those that T holds already."""
-    if symmetry.T.scale.numel() == 0:
+def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
+    """The best pose (the first of T) under each of the object's symmetries, without those that T holds already."""
+    if len(symmetry.T) == 0:
         return T[:0]
-    twins = symmetry.T @ T[:1]
-    nearest = torch.stack([displacement(twins, T[i], extremes) for i in range(T.scale.numel())]).amin(0)
-    return twins[nearest > _SAME_POSE]
+    equivalents = symmetry.T @ T[:1]
+    nearest = torch.stack([displacement(equivalents, one, points) for one in T]).amin(0)
+    return equivalents[nearest > REFINEMENT.same_pose]
 
 
-def start_rotations(options: RegistrationOptions, divisor: float = 1.0) -> Tensor:
-    """(K, 3, 3) rotations that the search starts from: the option ``rotations`` over ``divisor``, 24 at least.
+def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor) -> Sim3:
+    """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
+    box = view.detection
+    return seed_poses(
+        view.foreground.on_surface(),
+        model.samples.on_surface(),
+        box.rotation,
+        box.size / box.diagonal,
+        rotations,
+        torch.tensor(SEARCH.scale_factors),
+    )
 
-    All orientations, or turns about the option ``up_axis``.
-    """
-    count = max(24, int(options.robust.rotations / divisor))
-    if options.up_axis is None:
-        return super_fibonacci(count)
-    return turns_about(axis_vector(options.up_axis), max(24, count // _YAW_SHARE))
+
+def _best_attempt(
+    problem: RegistrationProblem,
+    options: RegistrationOptions,
+    seed: int,
+    run: Run,
+    generator: torch.Generator,
+    T_start: Sim3 | None,
+) -> Evaluation:
+    """Around a given start, else from the shapes, else from feature matches too: slower ways where others fail."""
+    view, model = problem.view, problem.model
+    if T_start is not None:
+        seeds = seed_poses_around(problem.in_working_frames(T_start), generator)
+        found = _attempt(problem, seeds, options, run, generator)
+        if found.verdict != "rejected":
+            return found
+    seeds = geometric_seeds(view, model, start_rotations(options))
+    found = _attempt(problem, seeds, options, run, generator)
+    if found.verdict != "rejected" or options.robust.feature_draws == 0:
+        return found
+    matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
+    if len(matched) == 0:
+        return found
+    again = _attempt(problem, Sim3.cat([seeds, matched]), options, run, generator)
+    return min(found, again, key=lambda one: one.rank)
+
+
+def _attempt(
+    problem: RegistrationProblem, seeds: Sim3, options: RegistrationOptions, run: Run, generator: torch.Generator
+) -> Evaluation:
+    with run.phase("initializing"):
+        candidates = search_poses(problem.view, problem.model, seeds, generator)
+    with run.phase("optimizing"):
+        refined = refine_poses(problem, candidates.T, generator, _progress_of_steps(run))
+    with run.phase("verifying"):
+        return evaluate_candidates(problem, refined, options)
+
+
+def _progress_of_steps(run: Run) -> Callable[[], None]:
+    """What to call after each iteration: reports the share done, and lets the caller cancel."""
+    taken = count(1)
+    span = STARTS["verifying"] - STARTS["optimizing"]
+    return lambda: run.report("optimizing", STARTS["optimizing"] + span * next(taken) / ITERATIONS)

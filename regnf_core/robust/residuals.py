@@ -7,8 +7,8 @@ With y = T x for scene points x, w = T^-1 z for object points z, g the fields' g
 
 Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them.
 
-Fields learned from images are too thick or too thin by much the same everywhere: the two surfaces are then an offset d
-apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
+Fields learned from images are too thick or too thin by about the same amount everywhere. The two surfaces are then an
+offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 """
 
 from __future__ import annotations
@@ -20,50 +20,38 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.samples import Samples, UnobservedTest, subsample
 
 
 class DistanceModel(Protocol):
-    """Anything that tells a signed distance (M,) and its gradient (M, 3) at points (M, 3)."""
+    """Anything that gives a signed distance (M,) and its gradient (M, 3) at points (M, 3)."""
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
-class Unseen(Protocol):
-    """Tells where nobody looked: (M,) bool for points (M, 3) of the samples' frame, signed distances (M,) there."""
-
-    def __call__(self, points: Tensor, values: Tensor, /) -> Tensor: ...
-
-
 @dataclass(frozen=True, eq=False)
-class Samples:
-    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
+class SurfacePair:
+    """The scene's and the object's surface: a distance model and samples of each, in their working frames."""
 
-    unseen: where the field rests on nothing; None: all was seen.
-    """
+    scene: DistanceModel
+    obj: DistanceModel
+    scene_samples: Samples
+    object_samples: Samples
 
-    points: Tensor
-    values: Tensor
-    normals: Tensor
-    unseen: Unseen | None = None
-
-    def __len__(self) -> int:
-        return int(self.points.shape[0])
-
-    def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.points[index], self.values[index], self.normals[index], self.unseen)
-
-    def on_surface(self) -> Tensor:
-        """The points (N, 3) carried onto the surface along their normals."""
-        return self.points - self.values.unsqueeze(-1) * self.normals
+    def subsample(self, limit: int, generator: torch.Generator) -> SurfacePair:
+        """The pair with at most ``limit`` samples of each surface, at random."""
+        few_scene = subsample(self.scene_samples, limit, generator)
+        few_object = subsample(self.object_samples, limit, generator)
+        return SurfacePair(self.scene, self.obj, few_scene, few_object)
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals (H, N + M) of H poses, scene samples first; Jacobian (H, N + M, 7); agreement of the normals.
+    """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7).
 
-    ``cosines`` (H, N + M): cosine between a sample's normal and the other field's gradient where the pose carries it.
-    unseen: (H, N + M) bool, object samples that come to lie where nobody looked into the scene; None: all was seen ·
-    offset: (H,) how much farther out the scene's surface lies than the object's, object units; already taken out of
+    cosines: (H, N + M), between a sample's normal and the other field's gradient where the pose carries the sample ·
+    unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed; None: all of it was ·
+    offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
     the values.
     """
 
@@ -71,44 +59,65 @@ class Residuals:
     jacobian: Tensor
     cosines: Tensor
     scene_count: int
-    unseen: Tensor | None = None
+    unobserved: Tensor | None = None
     offset: Tensor | None = None
 
-    def of(self, poses: Tensor) -> Residuals:
-        """Those of some poses."""
-        unseen = None if self.unseen is None else self.unseen[poses]
-        offset = None if self.offset is None else self.offset[poses]
-        return Residuals(
-            self.values[poses], self.jacobian[poses], self.cosines[poses], self.scene_count, unseen, offset
+    @property
+    def scene_to_object(self) -> Tensor:
+        """(H, N) r1, of the scene samples."""
+        return self.values[:, : self.scene_count]
+
+    @property
+    def object_to_scene(self) -> Tensor:
+        """(H, M) r2, of the object samples."""
+        return self.values[:, self.scene_count :]
+
+    def jacobian_with_offset(self) -> Tensor:
+        """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: its column is the last one."""
+        if self.offset is None:
+            return self.jacobian
+        column = torch.ones_like(self.jacobian[..., :1])
+        column[:, : self.scene_count] = -1.0
+        return torch.cat([self.jacobian, column], -1)
+
+    @classmethod
+    def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
+        """Those of ``first`` for the poses where ``mask`` (H,) is set, those of ``second`` for the others."""
+        return cls(
+            torch.where(mask[:, None], first.values, second.values),
+            torch.where(mask[:, None, None], first.jacobian, second.jacobian),
+            torch.where(mask[:, None], first.cosines, second.cosines),
+            first.scene_count,
+            _where(mask[:, None], first.unobserved, second.unobserved),
+            _where(mask, first.offset, second.offset),
         )
 
 
-def residuals(
-    scene: DistanceModel, obj: DistanceModel, A: Samples, B: Samples, T: Sim3, offset: Tensor | None = None
-) -> Residuals:
-    """Both residuals of the batch of poses T (H,) at scene samples A (N) and object samples B (M), object units.
+def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> Residuals:
+    """Both residuals of the batch of poses T (H,) at the samples of both surfaces, object units.
 
     offset: (H,), see :class:`Residuals`; None: the surfaces coincide.
     """
+    A, B = surfaces.scene_samples, surfaces.object_samples
     T = T.to(A.points)
-    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
-    forth, J_forth, cos_forth = _scene_to_object(obj, A, s, R, t)
-    back, J_back, cos_back, unseen = _object_to_scene(scene, B, s, R, t, A.unseen)
+    r1, J1, cosines1 = _scene_to_object(surfaces.obj, A, T)
+    r2, J2, cosines2, unobserved = _object_to_scene(surfaces.scene, B, T, A.unobserved)
     if offset is not None:
-        forth, back = forth - offset[:, None].to(forth), back + offset[:, None].to(back)
+        r1, r2 = r1 - offset[:, None].to(r1), r2 + offset[:, None].to(r2)
     return Residuals(
-        torch.cat([forth, back], 1),
-        torch.cat([J_forth, J_back], 1),
-        torch.cat([cos_forth, cos_back], 1),
+        torch.cat([r1, r2], 1),
+        torch.cat([J1, J2], 1),
+        torch.cat([cosines1, cosines2], 1),
         len(A),
-        None if unseen is None else torch.cat([torch.zeros_like(forth, dtype=torch.bool), unseen], 1),
+        None if unobserved is None else torch.cat([torch.zeros_like(r1, dtype=torch.bool), unobserved], 1),
         offset,
     )
 
 
-def _scene_to_object(obj: DistanceModel, A: Samples, s: Tensor, R: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, Tensor, Tensor]:
+    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
     arm = s[..., None] * (A.points @ R.mT)  # y - t, (H, N, 3)
-    value, g = _ask(obj, arm + t)
+    value, g = _query(obj, arm + t)
     own = s * A.values
     lever = (g * arm).sum(-1) - own
     J = torch.cat([torch.linalg.cross(arm, g), g, lever[..., None]], dim=-1)
@@ -116,21 +125,23 @@ def _scene_to_object(obj: DistanceModel, A: Samples, s: Tensor, R: Tensor, t: Te
 
 
 def _object_to_scene(
-    scene: DistanceModel, B: Samples, s: Tensor, R: Tensor, t: Tensor, unseen: Unseen | None
+    scene: DistanceModel, B: Samples, T: Sim3, unobserved: UnobservedTest | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
     arm = B.points - t  # z - t, (H, M, 3)
     w = (arm @ R) / s[..., None]
-    value, g = _ask(scene, w)
+    value, g = _query(scene, w)
     turned = g @ R.mT  # R g_a
-    seen = s * value
-    lever = seen - (turned * arm).sum(-1)
+    scaled = s * value
+    lever = scaled - (turned * arm).sum(-1)
     J = torch.cat([-torch.linalg.cross(arm, turned), -turned, lever[..., None]], dim=-1)
-    residual = seen - B.values
-    hidden = None if unseen is None else unseen(w.reshape(-1, 3), residual.reshape(-1)).reshape(residual.shape)
-    return residual, J, _cosine(turned, B.normals.expand_as(turned)), hidden
+    r2 = scaled - B.values
+    where = None if unobserved is None else unobserved(w.reshape(-1, 3), r2.reshape(-1)).reshape(r2.shape)
+    return r2, J, _cosine(turned, B.normals.expand_as(turned)), where
 
 
-def _ask(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
+def _query(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Value (H, N) and gradient (H, N, 3) of the model at points (H, N, 3)."""
     value, gradient = model.value_and_gradient(points.reshape(-1, 3))
     return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
 
@@ -138,3 +149,7 @@ def _ask(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
 def _cosine(gradient: Tensor, normals: Tensor) -> Tensor:
     cosine: Tensor = (gradient * normals).sum(-1) / gradient.norm(dim=-1).clamp_min(1e-6)
     return cosine
+
+
+def _where(mask: Tensor, first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    return None if first is None or second is None else torch.where(mask, first, second)

@@ -1,123 +1,53 @@
-"""Samples of both surfaces, evenly spread over what lies in the region, with normals and exact field values.
-
-No length is absolute: everything follows from the detection box and from the object's own extent. A sample is a point
-close to the surface together with the field's value there, which the residuals take into account; so two gradient
-evaluations a point are enough.
-"""
+"""Samples of a surface, and what tells where a scene was not observed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
-from regnf_core.geometry.box import OrientedBox
-from regnf_core.geometry.points import diameter
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.working_frame import WorkingField, WorkingFrame
-from regnf_core.surface.projection import project_to_surface
-from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
-from regnf_core.surface.surface_cells import Cells, surface_cells, tighten
 
-REGION_GROWTH = 1.2
-"""The scene is sampled in the box grown by this: boxes are often too small or off center."""
-_OBJECT_BASE, _SCENE_BASE, _LEVELS = 8, 9, 2
-_THICKNESS = 0.6  # edges: leaf cells beyond it duplicate what their neighbors find
-_CLOSE = 0.35  # edges: a sample farther from the surface after its step is dropped
-_LEAST_SLOPE = 0.2  # a gradient shorter than this leads nowhere
+class UnobservedTest(Protocol):
+    """Tells which places were not observed: (M,) bool for points (M, 3) of the samples' frame and the signed distances
+    (M,) there."""
+
+    def __call__(self, points: Tensor, values: Tensor, /) -> Tensor: ...
 
 
 @dataclass(frozen=True, eq=False)
-class SampledField:
-    """A field, the frame it is worked on in, and its samples there. spacing: working units between samples."""
+class Samples:
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
 
-    field: WorkingField
-    frame: WorkingFrame
-    samples: Samples
-    spacing: float
-
-
-def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
-    """At most ``limit`` samples of the object; the working frame has the surface's centroid at 0 and diameter 1.
-
-    Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
+    unobserved: where the field shows something that was not observed; None: everything was observed.
     """
-    low, high = obj.bounds
-    rough = _box_frame(low, high)
-    field = WorkingField(obj, rough)
-    low, high = rough.into(low).double(), rough.into(high).double()
-    inner = tighten(field.value, low, high, _OBJECT_BASE)
-    cells, space = surface_cells(field.value, *inner, _OBJECT_BASE, _LEVELS)
-    found = _settle(field, cells, limit, generator)
-    found = found[space.sees(found.points, found.normals)]
-    inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
-    found = found[inside]
-    require_object_surface(len(found))
-    surface = found.on_surface()
-    size = diameter(surface)
-    center = surface.double().mean(0)
-    frame = WorkingFrame(rough.out_of(center[None])[0], rough.length * size)
-    samples = Samples((found.points - center.float()) / size, found.values / size, found.normals)
-    return SampledField(WorkingField(obj, frame), frame, samples, cells.edge / size)
+
+    points: Tensor
+    values: Tensor
+    normals: Tensor
+    unobserved: UnobservedTest | None = None
+
+    def __len__(self) -> int:
+        return int(self.points.shape[0])
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved)
+
+    def on_surface(self) -> Tensor:
+        """The points (N, 3) moved onto the surface along their normals."""
+        return self.points - self.values.unsqueeze(-1) * self.normals
 
 
-def sample_scene_surface(
-    scene: SdfField, detection: OrientedBox, limit: int, generator: torch.Generator
-) -> SampledField:
-    """At most ``limit`` samples of the scene within the grown box; working frame: the box's center, its diagonal 1.
-
-    Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION),
-    InvalidInputError (FIELD_NOT_FINITE).
-    """
-    require_box_in_scene(scene, detection)
-    frame = WorkingFrame(detection.center.double(), detection.diagonal)
-    field = WorkingField(scene, frame)
-    half = detection.size.double() / detection.diagonal * (REGION_GROWTH / 2)
-    rotation = detection.rotation.double()
-
-    def value(local: Tensor) -> Tensor:
-        return field.value(local.to(rotation) @ rotation.T)
-
-    cells, space = surface_cells(value, -half, half, _SCENE_BASE, _LEVELS)
-    cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
-    found = _settle(field, cells, limit, generator)
-    axes = rotation.to(found.points)
-    found = found[space.sees(found.points @ axes, found.normals @ axes)]
-    bounds = frame.into(scene.bounds)
-    found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
-    require_scene_surface(len(found))
-    return SampledField(field, frame, found, cells.edge)
-
-
-def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
-    """Two disjoint random parts: the second, a share ``held_out``, for the judgment alone."""
-    order = torch.randperm(len(samples), generator=generator)
-    cut = len(samples) - int(held_out * len(samples))
-    return samples[order[:cut]], samples[order[cut:]]
-
-
-def some(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
+def subsample(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
     """At most ``limit`` of the samples, at random."""
     if len(samples) <= limit:
         return samples
     return samples[torch.randperm(len(samples), generator=generator)[:limit]]
 
 
-def _box_frame(low: Tensor, high: Tensor) -> WorkingFrame:
-    return WorkingFrame(((low + high) / 2).double(), float((high - low).norm()))
-
-
-def _settle(field: WorkingField, cells: Cells, limit: int, generator: torch.Generator) -> Samples:
-    """One Newton step from the leaf cells' centers towards the surface; value and normal where it ends."""
-    close = (cells.values.abs() <= _THICKNESS * cells.edge).nonzero().squeeze(-1)
-    if close.numel() > limit:
-        close = close[torch.randperm(close.numel(), generator=generator)[:limit]]
-    start = cells.centers[close].float()
-    if start.shape[0] == 0:
-        return Samples(start, start[:, 0], start)
-    found = project_to_surface(field.value_and_gradient, start, 1, _LEAST_SLOPE)
-    length = found.gradient.norm(dim=-1)
-    kept = (found.distance.abs() <= _CLOSE * cells.edge) & (length >= _LEAST_SLOPE)
-    return Samples(found.points[kept], found.distance[kept], found.gradient[kept] / length[kept, None])
+def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
+    """Two disjoint random parts; the second, a share ``held_out`` (0..1), is for the verdict alone."""
+    order = torch.randperm(len(samples), generator=generator)
+    cut = len(samples) - int(held_out * len(samples))
+    return samples[order[:cut]], samples[order[cut:]]

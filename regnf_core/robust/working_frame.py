@@ -1,4 +1,5 @@
-"""Working frames: both fields are seen centered and of size one, so that no number below depends on anybody's units."""
+"""Working frames: both fields are centered and of size one, so that no number in this package depends on their
+units."""
 
 from __future__ import annotations
 
@@ -58,7 +59,7 @@ class WorkingField:
 
 
 class WorkingObservation:
-    """What was seen of a field, in its working frame: at (M, 3) float32 points on the CPU."""
+    """What was observed of a field, in its working frame: at (M, 3) float32 points on the CPU."""
 
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
         self._observation = observation.seen_in(frame.to_field())
@@ -67,8 +68,8 @@ class WorkingObservation:
         """(M,) bool: a surface was measured there."""
         return self._observation.at(points) == SURFACE
 
-    def nobody_looked(self, points: Tensor, _values: Tensor) -> Tensor:
-        """(M,) bool: neither a surface was measured there, nor anything seen through it."""
+    def unobserved(self, points: Tensor, _values: Tensor) -> Tensor:
+        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
         return self._observation.at(points) == UNSEEN
 
 

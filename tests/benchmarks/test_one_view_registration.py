@@ -32,5 +32,5 @@ def test_it_is_found(position: tuple[float, float, float]) -> None:
     result = register(scene, chair(), detection(), ROBUST)
     assert result.verdict == "registered"
     assert placement_error(result, chair_pose()) < 0.02
-    assert result.metrics["shadow_share_scene"] > 0.2
-    assert result.metrics["hidden_share_object"] > 0.15
+    assert result.metrics["occlusion_boundary_share_scene"] > 0.2
+    assert result.metrics["occluded_share_object"] > 0.15

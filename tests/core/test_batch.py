@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from regnf_core.batch import register_batch
+from regnf_core.batch import ModeledObject, register_batch
 from regnf_core.errors import CancelledError, InvalidInputError, InvalidOptionsError
 from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.library import model_object
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.result import Phase
@@ -50,6 +51,18 @@ def test_what_pairs_share_is_made_once() -> None:
     register_batch(scene, [detection()], [obj, obj], pairs=[(0, 0), (0, 0), (0, 0)], options=ROBUST, clouds=False)
     assert scene.evaluations - of_scene < 2.8 * of_scene
     assert obj.evaluations - of_object < 2.8 * of_object
+
+
+def test_a_model_that_was_made_earlier_saves_making_it() -> None:
+    scene, obj = room(chair_pose()), CountingField(chair())
+    model = model_object(chair())
+    (plain,) = register_batch(scene, [detection()], [obj], options=ROBUST, clouds=False)
+    without = obj.evaluations
+    (known,) = register_batch(scene, [detection()], [ModeledObject(obj, model)], options=ROBUST, clouds=False)
+    assert obj.evaluations - without < 0.7 * without
+    assert plain.result is not None
+    assert known.result is not None
+    assert torch.equal(plain.result.T_object_scene.matrix(), known.result.T_object_scene.matrix())
 
 
 def test_an_unknown_pair_is_refused_before_any_work() -> None:

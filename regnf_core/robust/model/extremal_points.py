@@ -1,4 +1,4 @@
-"""A handful of outermost points by which two placements of an object can be told apart."""
+"""A few outermost points of an object, by which two placements of it are compared."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def extreme_points(points: Tensor, count: int) -> Tensor:
+def extremal_points(points: Tensor, count: int) -> Tensor:
     """``count`` of the points (N, 3), far apart from each other: farthest-point sampling from the outermost one."""
     chosen = [int((points - points.mean(0)).norm(dim=-1).argmax())]
     nearest = torch.full((points.shape[0],), torch.inf, dtype=points.dtype)

@@ -1,4 +1,4 @@
-"""An object's model as a safetensors file: a few dozen kilobytes that save sampling the object again."""
+"""An object's model as a safetensors file of about 50 kB, which saves sampling the object again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.model.signature import SIGNATURE_LENGTH
-from regnf_core.robust.residuals import Samples
+from regnf_core.robust.samples import Samples
 from regnf_core.robust.working_frame import WorkingFrame
 
 MODEL_VERSION = "1"
@@ -38,7 +38,7 @@ _SHAPES: dict[str, tuple[int | str, ...]] = {
 
 
 def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None:
-    """Write the model, whole or not at all."""
+    """Write the model atomically."""
     axis = model.symmetry.axis
     tensors = {
         "center": model.frame.center,
@@ -46,7 +46,7 @@ def write_object_model(path: str | os.PathLike[str], model: ObjectModel) -> None
         "points": model.samples.points,
         "values": model.samples.values,
         "normals": model.samples.normals,
-        "extremes": model.extremes,
+        "extremes": model.extremal_points,
         "symmetry.scale": model.symmetry.T.scale,
         "symmetry.rotation": model.symmetry.T.rotation,
         "symmetry.translation": model.symmetry.T.translation,

@@ -1,4 +1,4 @@
-"""All that a registration needs to know of a library object beforehand: made once a field, independent of any scene."""
+"""What a registration needs to know of a library object beforehand: made once for a field, independent of any scene."""
 
 from __future__ import annotations
 
@@ -10,39 +10,38 @@ from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
-from regnf_core.robust.model.extremal_points import extreme_points
-from regnf_core.robust.model.self_symmetry import SelfSymmetry, confirmed, self_symmetry
+from regnf_core.robust.constants import MODEL
+from regnf_core.robust.model.extremal_points import extremal_points
+from regnf_core.robust.model.self_symmetry import SelfSymmetry, confirm_symmetries, propose_symmetries
 from regnf_core.robust.model.signature import signature
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.samples import sample_object_surface
-from regnf_core.robust.search.distance_grid import ProxyField, proxy_of
+from regnf_core.robust.samples import Samples
+from regnf_core.robust.sampling import sample_object_surface
+from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
 from regnf_core.robust.search.rotations import super_fibonacci
 from regnf_core.robust.working_frame import WorkingField, WorkingFrame
 
-_EXTREMES = 16
 _SEED = 0  # an object's model is the same for every registration
-_ROTATIONS = 600  # tried for symmetries
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
     """An object's surface and symmetries. Points in the working frame: the surface's centroid at 0, its diameter 1.
 
-    spacing: between samples · extremes: (E, 3) outermost points, by which two placements are told apart · signature:
-    (310,), see :mod:`regnf_core.robust.model.signature`.
+    spacing: between samples · extremal_points: (E, 3) outermost points, by which two placements are compared ·
+    signature: (310,), see :mod:`regnf_core.robust.model.signature`.
     """
 
     frame: WorkingFrame
     samples: Samples
     spacing: float
-    extremes: Tensor
+    extremal_points: Tensor
     symmetry: SelfSymmetry
     signature: Tensor
 
     @cached_property
-    def proxy(self) -> ProxyField:
-        """The distance table made from the samples."""
-        return proxy_of(self.samples, self.spacing)
+    def distance_grid(self) -> DistanceGrid:
+        """Distances to the samples, on a grid."""
+        return distance_grid(self.samples, self.spacing)
 
     def field(self, obj: SdfField) -> WorkingField:
         """The object's field, the one that this model was made from, in the working frame."""
@@ -58,11 +57,11 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     options = options or RobustOptions()
     generator = torch.Generator().manual_seed(_SEED)
     sampled = sample_object_surface(obj, options.object_samples, generator)
-    extremes = extreme_points(sampled.samples.on_surface(), _EXTREMES)
-    proxy = proxy_of(sampled.samples, sampled.spacing)
-    proposed = self_symmetry(proxy, sampled.samples, extremes, super_fibonacci(_ROTATIONS), generator)
-    symmetry = confirmed(proposed, sampled.field, sampled.samples, extremes, generator)
     samples = sampled.samples
-    model = ObjectModel(sampled.frame, samples, sampled.spacing, extremes, symmetry, signature(samples))
-    model.__dict__["proxy"] = proxy  # what the property would make again
+    outermost = extremal_points(samples.on_surface(), MODEL.extremal_points)
+    grid = distance_grid(samples, sampled.spacing)
+    proposed = propose_symmetries(grid, samples, outermost, super_fibonacci(MODEL.rotations), generator)
+    symmetry = confirm_symmetries(proposed, sampled.field, samples, outermost, generator)
+    model = ObjectModel(sampled.frame, samples, sampled.spacing, outermost, symmetry, signature(samples))
+    model.__dict__["distance_grid"] = grid  # what the property would make again
     return model

@@ -1,4 +1,4 @@
-"""An object's own symmetries, found by registering it with itself: proposed by its samples, confirmed by its field."""
+"""An object's own symmetries, found by registering it with itself: proposed on its samples, confirmed by its field."""
 
 from __future__ import annotations
 
@@ -10,34 +10,24 @@ from torch import Tensor
 from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.result import ObjectSymmetry
-from regnf_core.robust.refine.levenberg_marquardt import minimize
-from regnf_core.robust.residuals import DistanceModel, Samples, residuals
-from regnf_core.robust.samples import some
+from regnf_core.robust.constants import MODEL
+from regnf_core.robust.refine.coarse_to_fine import RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
+from regnf_core.robust.refine.loss import disagreement
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
+from regnf_core.robust.residuals import DistanceModel, SurfacePair, residuals
+from regnf_core.robust.samples import Samples, subsample
 from regnf_core.robust.search.rotations import turns_about
-from regnf_core.robust.search.search import disagreement
 
-_POINTS = 200
-_WIDTH = 0.02  # object diameters
-_ALIKE = 0.35
-"""Largest score, above that of the identity, of a turn that may be a symmetry: the fields decide afterwards."""
-_MOST = 12
-_APART = 0.08  # object diameters between two different symmetries
-_AXIS_TURNS = 36
-_CONFIRMING_POINTS = 300
-_CONFIRMING_WIDTHS = [0.03, 0.02, 0.015, 0.01, 0.01, 0.01]
-_OFF = 0.01  # object diameters
-_EXACT = 0.03
-"""Largest share of samples off by more than ``_OFF`` of a turn that is called a symmetry. Normals do not count: on the
-rims of thin boards a fitted field has them anyhow."""
-_PARALLEL = 0.99  # least cosine between the axes of turns about one axis
+_SCORE_WIDTH = MODEL.stages[-1].score_width
 
 
 @dataclass(frozen=True, eq=False)
 class SelfSymmetry:
     """Rigid transforms (K,) that carry the object, or most of it, onto itself; the identity is left out.
 
-    axis: (3,) when every turn about it is one · deviation: (K,) the share of the surface that each does not carry onto
-    the surface: near 0 for a symmetry, more for what merely resembles one.
+    axis: (3,) when every turn about it is a symmetry · deviation: (K,) the share of the surface that each transform
+    does not carry onto the surface: near 0 for a symmetry, more for a transform that only resembles one.
     """
 
     T: Sim3
@@ -45,90 +35,94 @@ class SelfSymmetry:
     deviation: Tensor
 
     def group(self) -> ObjectSymmetry:
-        """What the object's field calls its symmetries: exact turns alone."""
-        exact = self.T[self.deviation <= _EXACT]
+        """The symmetries that the object's field confirms."""
+        exact = self.T[self.deviation <= MODEL.max_deviating_share]
         omega = exact.log()[:, :3]
         if self.axis is not None:
             across = int((~_about(exact, self.axis)).sum())
             return ObjectSymmetry(1 + min(across, 1), _tuple(self.axis), True)
         axes = omega / omega.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        one_axis = len(axes) > 0 and bool(((axes @ axes[0]).abs() >= _PARALLEL).all())
+        one_axis = len(axes) > 0 and bool(((axes @ axes[0]).abs() >= MODEL.min_parallel_cosine).all())
         return ObjectSymmetry(1 + len(axes), _tuple(axes[0]) if one_axis else None, False)
 
 
-def self_symmetry(
-    obj: DistanceModel, B: Samples, extremes: Tensor, rotations: Tensor, generator: torch.Generator
+def propose_symmetries(
+    obj: DistanceModel, B: Samples, extremal_points: Tensor, rotations: Tensor, generator: torch.Generator
 ) -> SelfSymmetry:
-    """Likely symmetries of the object whose samples (working frame, centroid at 0) and distance model these are.
+    """Likely symmetries of the object with the samples B (working frame, centroid at 0) and the distance model ``obj``.
 
-    rotations: (K, 3, 3) to try. What is found is a set of proposals.
+    rotations: (K, 3, 3) to try. The field still has to confirm what is found.
     """
-    few = some(B, _POINTS, generator)
-    start = _rigid(rotations)
-    coarse = disagreement(residuals(obj, obj, some(few, 48, generator), some(few, 48, generator), start), 0.1)
-    T = start[coarse.argsort()[:80]]
-    refined = minimize(obj, obj, few, few, T, [0.1, 0.07, 0.05, 0.03, 0.02, 0.02], fix_scale=True)
-    scores = disagreement(refined.residuals, _WIDTH)
-    itself = float(disagreement(residuals(obj, obj, few, few, _rigid(torch.eye(3)[None].double())), _WIDTH))
-    alike = (scores <= itself + _ALIKE).nonzero().squeeze(-1)
-    T, scores = refined.T[alike], scores[alike]
-    kept = _distinct_turns(T, scores, extremes)
-    T, scores = T[kept], scores[kept]
-    axis = _continuous_axis(obj, few, T, itself)
+    few = subsample(B, MODEL.points, generator)
+    itself = SurfacePair(obj, obj, few, few)
+    context = RefinementContext(extremal_points, generator, fix_scale=True)
+    found = coarse_to_fine(itself, PoseCandidates.start(_rigid(rotations)), MODEL.stages, context)
+    max_score = _score_of_identity(itself) + MODEL.max_score_above_identity
+    found = found[found.scores <= max_score]
+    T = found.T[_distinct_symmetries(found.T, found.scores, extremal_points)]
+    axis = _continuous_axis(itself, T, max_score)
     if axis is not None:
-        across = ~_about(T, axis)
-        turns = _rigid(turns_about(axis, 8)[1:])
-        T = Sim3.cat([T[across], turns])
-    return SelfSymmetry(T, axis, torch.zeros(T.scale.numel()))
+        turns = _rigid(turns_about(axis, MODEL.axis_representatives)[1:])
+        T = Sim3.cat([T[~_about(T, axis)], turns])
+    return SelfSymmetry(T, axis, torch.zeros(len(T)))
 
 
-def confirmed(
-    proposed: SelfSymmetry, obj: DistanceModel, B: Samples, extremes: Tensor, generator: torch.Generator
+def confirm_symmetries(
+    proposed: SelfSymmetry, obj: DistanceModel, B: Samples, extremal_points: Tensor, generator: torch.Generator
 ) -> SelfSymmetry:
     """The proposals refined on the object's own field, each with its deviation there.
 
-    Costs nothing for an object without proposals, and some 4,000 field evaluations for each.
+    Costs nothing for an object without proposals, and some 4,000 field evaluations for each proposal.
     """
-    if proposed.T.scale.numel() == 0:
+    if len(proposed.T) == 0:
         return proposed
-    few = some(B, _CONFIRMING_POINTS, generator)
-    refined = minimize(obj, obj, few, few, proposed.T, _CONFIRMING_WIDTHS, fix_scale=True)
-    deviation = (refined.residuals.values.abs() > _OFF).float().mean(1)
-    kept = _distinct_turns(refined.T, deviation, extremes)
+    few = subsample(B, MODEL.confirming_points, generator)
+    settings = Settings(fix_scale=True)
+    refined = minimize(SurfacePair(obj, obj, few, few), proposed.T, MODEL.confirming_widths, settings)
+    deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1)
+    kept = _distinct_symmetries(refined.T, deviation, extremal_points)
     T, deviation = refined.T[kept], deviation[kept]
     axis = proposed.axis
-    if axis is not None and bool((deviation[_about(T, axis)] > _EXACT).any()):
+    if axis is not None and bool((deviation[_about(T, axis)] > MODEL.max_deviating_share).any()):
         axis = None
     return SelfSymmetry(T, axis, deviation)
 
 
-def _distinct_turns(T: Sim3, scores: Tensor, extremes: Tensor) -> Tensor:
-    """Numbers of the best, no two of them alike, none like the identity."""
-    moved = (T.apply(extremes.double()) - extremes.double()).norm(dim=-1).amax(-1)
-    kept = distinct(T, scores, extremes, _APART, T.scale.numel() + 1)[: 2 * _MOST]
-    return kept[moved[kept] > _APART][:_MOST]
+def _score_of_identity(itself: SurfacePair) -> float:
+    identity = _rigid(torch.eye(3)[None].double())
+    return float(disagreement(residuals(itself, identity), _SCORE_WIDTH))
+
+
+def _distinct_symmetries(T: Sim3, scores: Tensor, extremal_points: Tensor) -> Tensor:
+    """Numbers of the best transforms; no two of them are alike, and none is like the identity."""
+    points = extremal_points.double()
+    moved = (T.apply(points) - points).norm(dim=-1).amax(-1)
+    kept = distinct(T, scores, extremal_points, MODEL.min_distance, len(T) + 1)[: 2 * MODEL.max_symmetries]
+    return kept[moved[kept] > MODEL.min_distance][: MODEL.max_symmetries]
 
 
 def _rigid(rotations: Tensor) -> Sim3:
+    """Rotations (K, 3, 3) as transforms (K,), float64."""
     count = rotations.shape[0]
     return Sim3(torch.ones(count).double(), rotations.double(), torch.zeros(count, 3).double())
 
 
-def _continuous_axis(obj: DistanceModel, B: Samples, T: Sim3, itself: float) -> Tensor | None:
-    """An axis (3,) about which every turn is a symmetry, if one of the symmetries' axes is such."""
+def _continuous_axis(itself: SurfacePair, T: Sim3, max_score: float) -> Tensor | None:
+    """An axis (3,) about which every turn is a symmetry, if one of the proposals' axes is such."""
+    low, high = MODEL.axis_angles
     for omega in T.log()[:, :3]:
         angle = float(omega.norm())
-        if angle < 0.1 or angle > 3.0:  # half turns say little: what is round has others too
+        if angle < low or angle > high:
             continue
         axis: Tensor = omega / omega.norm()
-        scores = disagreement(residuals(obj, obj, B, B, _rigid(turns_about(axis, _AXIS_TURNS))), _WIDTH)
-        if bool((scores <= itself + _ALIKE).all()):
+        turns = _rigid(turns_about(axis, MODEL.axis_turns))
+        if bool((disagreement(residuals(itself, turns), _SCORE_WIDTH) <= max_score).all()):
             return axis
     return None
 
 
 def _tuple(axis: Tensor) -> tuple[float, float, float]:
-    """A unit vector, its largest entry positive: an axis has no sense."""
+    """A unit vector, its largest entry positive: an axis has no direction."""
     x, y, z = (axis * axis[axis.abs().argmax()].sign()).tolist()
     return x, y, z
 
@@ -136,5 +130,5 @@ def _tuple(axis: Tensor) -> tuple[float, float, float]:
 def _about(T: Sim3, axis: Tensor) -> Tensor:
     """(K,) bool: which of the transforms turn about the axis."""
     omega = T.log()[:, :3]
-    about: Tensor = (omega @ axis).abs() >= 0.97 * omega.norm(dim=-1)
+    about: Tensor = (omega @ axis).abs() >= MODEL.min_axis_cosine * omega.norm(dim=-1)
     return about

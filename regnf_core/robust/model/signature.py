@@ -1,4 +1,4 @@
-"""A shape's signature: what a registration would never get wrong, told in a millisecond.
+"""A shape's signature: two histograms by which shapes are compared in a millisecond.
 
 The distribution of distances between pairs of surface points (the D2 shape function, Osada et al. 2002) and that of
 point pair features (distance and the three angles between the normals and the line that joins the points, Drost et al.
@@ -10,14 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.robust.residuals import Samples
+from regnf_core.robust.constants import SIGNATURE
+from regnf_core.robust.samples import Samples
 
-_PAIRS = 20_000
 _SEED = 0
-_LONGEST = 2.5  # root mean square distances
-_DISTANCES = 40
-_PAIR_DISTANCES, _ANGLES = 10, 3
-SIGNATURE_LENGTH = _DISTANCES + _PAIR_DISTANCES * _ANGLES**3
+_FEATURE_BINS = SIGNATURE.feature_distance_bins * SIGNATURE.angle_bins**3
+SIGNATURE_LENGTH = SIGNATURE.distance_bins + _FEATURE_BINS
 
 
 def signature(samples: Samples) -> Tensor:
@@ -28,20 +26,21 @@ def signature(samples: Samples) -> Tensor:
     """
     points, normals = samples.on_surface(), samples.normals
     generator = torch.Generator().manual_seed(_SEED)
-    i, j = torch.randint(len(samples), (2, _PAIRS), generator=generator)
+    i, j = torch.randint(len(samples), (2, SIGNATURE.pairs), generator=generator)
     line = points[j] - points[i]
     length = line.norm(dim=-1)
     apart = length > 1e-6
     i, j, line, length = i[apart], j[apart], line[apart], length[apart]
-    way = line / length[:, None]
-    relative = length / (length.square().mean().sqrt() * _LONGEST)
-    at_start = (way * normals[i]).sum(-1).abs()
-    at_end = (way * normals[j]).sum(-1).abs()
+    direction = line / length[:, None]
+    relative = length / (length.square().mean().sqrt() * SIGNATURE.max_distance)
+    at_start = (direction * normals[i]).sum(-1).abs()
+    at_end = (direction * normals[j]).sum(-1).abs()
     between = ((normals[i] * normals[j]).sum(-1) + 1.0) / 2.0
-    bins = _bin(relative, _PAIR_DISTANCES)
+    bins = _bin(relative, SIGNATURE.feature_distance_bins)
     for angle in (torch.minimum(at_start, at_end), torch.maximum(at_start, at_end), between):
-        bins = bins * _ANGLES + _bin(angle, _ANGLES)
-    return torch.cat([_shares(_bin(relative, _DISTANCES), _DISTANCES), _shares(bins, SIGNATURE_LENGTH - _DISTANCES)])
+        bins = bins * SIGNATURE.angle_bins + _bin(angle, SIGNATURE.angle_bins)
+    distances = _bin(relative, SIGNATURE.distance_bins)
+    return torch.cat([_shares(distances, SIGNATURE.distance_bins), _shares(bins, _FEATURE_BINS)])
 
 
 def _bin(values: Tensor, count: int) -> Tensor:

@@ -1,26 +1,20 @@
-"""The few candidates that can win, refined on the fields themselves: coarse to fine, fewer and fewer of them."""
+"""Pose candidates: a batch of poses with their scores, surface offsets, and the iterations that led to them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.refine.levenberg_marquardt import minimize
-from regnf_core.robust.residuals import DistanceModel, Residuals, Samples
-from regnf_core.robust.samples import some
-from regnf_core.robust.search.search import disagreement
-
-_APART = 0.03  # object diameters: candidates closer together have met in one minimum
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Step:
-    """One iteration of all poses: T (H,), robust costs (H,), mean |r| each way (H,), (H,), object diameters."""
+    """One iteration of all poses: T (H,), robust costs (H,), mean |residual| (H,) of the scene's and of the object's
+    samples, the kernel width, all in object diameters, and the number of samples of each surface."""
 
     T: Sim3
     costs: Tensor
@@ -29,104 +23,62 @@ class Step:
     width: float
     samples: int
 
+    def __getitem__(self, index: Tensor) -> Step:
+        return Step(
+            self.T[index],
+            self.costs[index],
+            self.residual_scene[index],
+            self.residual_object[index],
+            self.width,
+            self.samples,
+        )
 
-@dataclass(frozen=True)
-class Stage:
-    """Refine with kernel ``widths`` on ``points`` a side; keep at most ``keep``, within ``margin`` of the best."""
-
-    points: int
-    widths: tuple[float, ...]
-    score_width: float
-    keep: int
-    margin: float
-
-
-STAGES = (
-    Stage(points=96, widths=(0.10, 0.07, 0.05, 0.035, 0.025, 0.02), score_width=0.02, keep=5, margin=0.15),
-    Stage(points=300, widths=(0.02, 0.015, 0.01, 0.01), score_width=0.015, keep=3, margin=0.10),
-)
-LAST = Stage(points=700, widths=(0.01, 0.01, 0.008, 0.008, 0.008), score_width=0.015, keep=8, margin=1.0)
-"""Widths in object diameters. LAST also refines the winner's twins."""
-
-
-@dataclass
-class Trail:
-    """The steps taken so far by the poses that are still in the race."""
-
-    steps: list[Step] = field(default_factory=list)
-
-    def keep(self, index: Tensor) -> Trail:
-        """The trail of the poses that ``index`` names."""
-        return Trail(
-            [
-                Step(
-                    s.T[index],
-                    s.costs[index],
-                    s.residual_scene[index],
-                    s.residual_object[index],
-                    s.width,
-                    s.samples,
-                )
-                for s in self.steps
-            ]
+    @classmethod
+    def cat(cls, parts: Sequence[Step]) -> Step:
+        """The same iteration of several batches."""
+        return cls(
+            Sim3.cat([one.T for one in parts]),
+            torch.cat([one.costs for one in parts]),
+            torch.cat([one.residual_scene for one in parts]),
+            torch.cat([one.residual_object for one in parts]),
+            parts[0].width,
+            parts[0].samples,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Finalists:
-    """Poses (H,), best first, their scores (H,), their residuals on the stage's samples, and how they came there.
+class PoseCandidates:
+    """Poses T (H,), their scores (H,), 0..1, smaller is better, and their history: the iterations of these poses so
+    far.
 
-    offsets: (H,), see :class:`regnf_core.robust.residuals.Residuals`.
+    offsets: (H,) float64, how much farther out the scene's surface lies than the object's, object diameters; None: the
+    surfaces coincide.
     """
 
     T: Sim3
     scores: Tensor
-    residuals: Residuals
-    trail: Trail
-    offsets: Tensor
+    offsets: Tensor | None = None
+    history: tuple[Step, ...] = ()
 
+    @classmethod
+    def start(cls, T: Sim3, with_offsets: bool = False) -> PoseCandidates:
+        """Poses that nothing is known of yet. With offsets: of 0."""
+        return cls(T, torch.zeros_like(T.scale), torch.zeros_like(T.scale) if with_offsets else None)
 
-def run_stage(
-    scene: DistanceModel,
-    obj: DistanceModel,
-    A: Samples,
-    B: Samples,
-    T: Sim3,
-    stage: Stage,
-    extremes: Tensor,
-    generator: torch.Generator,
-    trail: Trail,
-    on_step: Callable[[], None],
-    offsets: Tensor,
-    most_offset: float,
-) -> Finalists:
-    """Refine every pose of the batch on the stage's share of the samples, and keep the best distinct ones."""
-    few_A, few_B = some(A, stage.points, generator), some(B, stage.points, generator)
-    trail = Trail(list(trail.steps))
+    def __len__(self) -> int:
+        return int(self.scores.numel())
 
-    def record(iteration: int, T_now: Sim3, r: Residuals, costs: Tensor) -> None:
-        size = r.values.abs()
-        n = r.scene_count
-        trail.steps.append(
-            Step(T_now, costs, size[:, :n].mean(1), size[:, n:].mean(1), stage.widths[iteration], stage.points)
+    def __getitem__(self, index: Tensor) -> PoseCandidates:
+        offsets = None if self.offsets is None else self.offsets[index]
+        return PoseCandidates(self.T[index], self.scores[index], offsets, tuple(step[index] for step in self.history))
+
+    @classmethod
+    def cat(cls, parts: Sequence[PoseCandidates]) -> PoseCandidates:
+        """The candidates of several batches with equally long histories, one after the other."""
+        offsets = [one.offsets for one in parts if one.offsets is not None]
+        return cls(
+            Sim3.cat([one.T for one in parts]),
+            torch.cat([one.scores for one in parts]),
+            torch.cat(offsets) if offsets else None,
+            tuple(Step.cat(steps) for steps in zip(*(one.history for one in parts), strict=True)),
         )
-        on_step()
-
-    refined = minimize(
-        scene,
-        obj,
-        few_A,
-        few_B,
-        T,
-        list(stage.widths),
-        adaptive=True,
-        on_iteration=record,
-        offset=offsets,
-        most_offset=most_offset,
-    )
-    scores = disagreement(refined.residuals, stage.score_width)
-    kept = distinct(refined.T, scores, extremes, _APART, stage.keep)
-    kept = kept[scores[kept] <= scores[kept[0]] + stage.margin]
-    r = refined.residuals.of(kept)
-    assert r.offset is not None
-    return Finalists(refined.T[kept], scores[kept], r, trail.keep(kept), r.offset)

@@ -1,7 +1,7 @@
-"""A stand-in for a field, made from its oriented samples alone: distances on a grid, each with its gradient.
+"""Distances to a surface on a grid, each with its gradient, made from oriented samples alone.
 
-Looking one up costs nanoseconds where the field costs microseconds. It is good to about the samples' spacing, which
-is what thousands of hypotheses need; the fields themselves decide afterwards.
+A look-up takes nanoseconds where a field takes microseconds. Its error is about the samples' spacing, which is enough
+to compare thousands of poses; the fields themselves decide afterwards.
 """
 
 from __future__ import annotations
@@ -10,17 +10,16 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from regnf_core.robust.residuals import Samples
+from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.samples import Samples
 
-_CELLS = 40
-_REACH = 0.2  # working units round the samples that a proxy covers
-_PLANE_SPACINGS = 2.0  # nearer than this the tangent plane is the better distance
+_CELLS = SEARCH.grid_cells
 
 
-class ProxyField:
-    """Distance and gradient near oriented surface points (N, 3), in their frame, on a grid of 40 cells an edge.
+class DistanceGrid:
+    """Distance and gradient near oriented surface points (N, 3), in their frame.
 
-    The grid covers the points' box grown by ``margin`` on every side; beyond it, distances grow with the way there.
+    The grid covers the points' box grown by ``margin`` on every side. Beyond it, the distance to the grid is added.
     """
 
     def __init__(self, points: Tensor, normals: Tensor, spacing: float, margin: float) -> None:
@@ -50,15 +49,15 @@ class ProxyField:
         return value, torch.where((outside > 0)[:, None], away, gradient)
 
 
-def proxy_of(samples: Samples, spacing: float) -> ProxyField:
-    """The proxy of a surface's samples, ``spacing`` apart, in their working frame."""
-    return ProxyField(samples.on_surface(), samples.normals, spacing, _REACH)
+def distance_grid(samples: Samples, spacing: float) -> DistanceGrid:
+    """The grid around a surface's samples, ``spacing`` apart, in their working frame."""
+    return DistanceGrid(samples.on_surface(), samples.normals, spacing, SEARCH.grid_margin)
 
 
 def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, queries: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed distance (M,) of queries (M, 3) to the surface that oriented points (N, 3) stand for, and its gradient.
+    """Signed distance (M,) and gradient (M, 3) at queries (M, 3), to the surface of oriented points (N, 3).
 
-    Far off: the distance to the nearest point, signed by its normal; close by: to its tangent plane.
+    Far away: the distance to the nearest point, signed by its normal. Close: the distance to its tangent plane.
     """
     distance, index = cKDTree(points.numpy()).query(queries.numpy())
     nearest = torch.as_tensor(index)
@@ -67,7 +66,7 @@ def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, que
     height = (offset * n).sum(-1)
     far = torch.as_tensor(distance, dtype=queries.dtype)
     sign = torch.where(height >= 0, 1.0, -1.0)
-    close = far < _PLANE_SPACINGS * spacing
+    close = far < SEARCH.tangent_spacings * spacing
     value = torch.where(close, height, sign * far)
     gradient = torch.where(close[:, None], n, sign[:, None] * offset / far.clamp_min(1e-9)[:, None])
     return value, gradient

@@ -1,7 +1,7 @@
 """Seeds from feature matches: FPFH descriptors on clouds of one size, RANSAC over similarity transforms.
 
-What the published method starts from (Rusu et al. 2009), made free of units: both clouds are scaled to a root mean
-square radius of one before they are described, and the scale is estimated with the rest.
+The published method starts from the same features (Rusu et al. 2009). Here they do not depend on units: both clouds are
+scaled to a root mean square radius of one before they are described, and the scale is estimated with the rest.
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.residuals import Samples
+from regnf_core.robust.constants import FEATURES
+from regnf_core.robust.samples import Samples
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 
-_VOXEL = 0.08  # root mean square radii
-_FEATURE_RADIUS = 4.0  # voxels
-_MATCHING = MatchingOptions(max_distance=1.5 * _VOXEL, with_scaling=True, edge_length_ratio=None, max_draws=20_000)
-_FEWEST = 30  # points a described cloud must have
-_SCALES = (0.2, 5.0)  # of the normalized clouds: what lies beyond is no match
+_MATCHING = MatchingOptions(
+    max_distance=FEATURES.inlier_distance * FEATURES.voxel,
+    with_scaling=True,
+    edge_length_ratio=None,
+    max_draws=FEATURES.iterations,
+)
 
 
 def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
@@ -29,7 +31,7 @@ def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
     to_scene, to_object = _normalizing(scene), _normalizing(obj)
     with without_warnings():
         source, target = _described(scene, to_scene), _described(obj, to_object)
-        if min(len(source), len(target)) < _FEWEST:
+        if min(len(source), len(target)) < FEATURES.min_points:
             return Sim3.cat([])
         for draw in range(count):
             T = _similarity(match(source, target, _MATCHING, seed * 1009 + draw))
@@ -48,7 +50,8 @@ def _normalizing(samples: Samples) -> Sim3:
 
 def _described(samples: Samples, normalize: Sim3) -> DescribedCloud:
     """The normalized cloud with its descriptors."""
-    return describe(normalize.apply(samples.on_surface().double()), samples.normals, _VOXEL, _FEATURE_RADIUS)
+    points = normalize.apply(samples.on_surface().double())
+    return describe(points, samples.normals, FEATURES.voxel, FEATURES.feature_radius)
 
 
 def _similarity(matrix: Tensor | None) -> Sim3 | None:
@@ -56,7 +59,7 @@ def _similarity(matrix: Tensor | None) -> Sim3 | None:
     if matrix is None or not torch.isfinite(matrix).all():
         return None
     scale = torch.linalg.det(matrix[:3, :3]).clamp_min(0.0) ** (1.0 / 3.0)
-    if not _SCALES[0] < float(scale) < _SCALES[1]:
+    if not FEATURES.scales[0] < float(scale) < FEATURES.scales[1]:
         return None
     U, _, Vh = torch.linalg.svd(matrix[:3, :3])
     rotation = U @ Vh

@@ -8,10 +8,25 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.quaternions import matrix_from_quaternion
+from regnf_core.options import RegistrationOptions
+from regnf_core.robust.constants import SEARCH
+from regnf_core.surface.cameras import axis_vector
 
 _PHI = math.sqrt(2.0)
 _PSI = 1.533751168755204288118041
 """The real root of psi^4 = psi + 4, as published."""
+
+
+def start_rotations(options: RegistrationOptions, divisor: float = 1.0) -> Tensor:
+    """(K, 3, 3) rotations that a search starts from: the option ``rotations`` over ``divisor``, 24 at least.
+
+    They cover all orientations, or are turns about the option ``up_axis``.
+    """
+    count = max(SEARCH.min_rotations, int(options.robust.rotations / divisor))
+    if options.up_axis is None:
+        return super_fibonacci(count)
+    turns = max(SEARCH.min_rotations, count // SEARCH.rotations_per_turn)
+    return turns_about(axis_vector(options.up_axis), turns)
 
 
 def super_fibonacci(count: int) -> Tensor:

@@ -1,1 +1,1 @@
-"""The decision on a refined pose: evidence, verdict, covariance."""
+"""The verdict on refined poses: evidence, criteria, evaluation, covariance."""

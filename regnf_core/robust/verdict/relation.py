@@ -7,8 +7,9 @@ import math
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import RELATION
 
-_NEARLY = math.cos(math.radians(6.0))
+_NEARLY = math.cos(math.radians(RELATION.axis_angle_deg))
 
 
 def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> str:
@@ -20,7 +21,7 @@ def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> st
     omega, factor = difference[:3], math.exp(float(difference[6]))
     angle = float(omega.norm())
     words = []
-    if angle > math.radians(2.0):
+    if angle > math.radians(RELATION.min_angle_deg):
         x, y, z = (omega / angle).tolist()
         names = {name: value for name, value in zip("xyz", (x, y, z), strict=True) if abs(value) >= _NEARLY}
         degrees = round(math.degrees(angle))
@@ -32,6 +33,6 @@ def relation(T_other: Sim3, T_best: Sim3, free_axis: Tensor | None = None) -> st
             words.append(f"{degrees} degrees about ({x:.2f}, {y:.2f}, {z:.2f})")
         if free_axis is not None and abs(float(omega @ free_axis)) >= _NEARLY * angle:
             words.append("as any turn about this axis")
-    if abs(factor - 1.0) > 0.03:
+    if abs(factor - 1.0) > RELATION.min_scale_change:
         words.append(f"{factor:.2f} times the scale")
     return ", ".join(words) or "shifted"

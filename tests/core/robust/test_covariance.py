@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.residuals import Residuals, residuals
-from regnf_core.robust.samples import sample_object_surface
+from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.sampling import sample_object_surface
 from regnf_core.robust.verdict.covariance import covariance, in_object_units
 from regnf_core.robust.working_frame import WorkingFrame
 from tests.core.analytic import chair
@@ -26,7 +26,7 @@ def at_the_truth(count: int) -> tuple[Residuals, Tensor]:
     one = found.samples[torch.randperm(len(found.samples), generator=torch.Generator().manual_seed(1))[:count]]
     two = found.samples[torch.randperm(len(found.samples), generator=torch.Generator().manual_seed(2))[:count]]
     identity = Sim3.identity()[None]
-    r = residuals(found.field, found.field, one, two, identity)
+    r = residuals(SurfacePair(found.field, found.field, one, two), identity)
     return r, torch.cat([one.points, two.points]).double()
 
 

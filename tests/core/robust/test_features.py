@@ -7,7 +7,7 @@ import torch
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.pose_distance import displacement
 from regnf_core.robust.model.object_model import model_object
-from regnf_core.robust.residuals import Samples
+from regnf_core.robust.samples import Samples
 from regnf_core.robust.search.features import feature_seeds
 from tests.core.analytic import AnalyticField, sphere, union
 from tests.core.robust.shapes import random_pose
@@ -25,7 +25,7 @@ def test_the_pose_is_among_the_seeds_at_any_scale() -> None:
     one, two = model_object(TransformedField(blob(), pose.inverse())), model_object(blob())
     truth = two.frame.to_field().inverse() @ pose.inverse() @ one.frame.to_field()
     found = feature_seeds(one.samples, two.samples, 4, seed=1)
-    assert displacement(found, truth, two.extremes).min() < 0.05
+    assert displacement(found, truth, two.extremal_points).min() < 0.05
     torch.testing.assert_close(
         found.rotation @ found.rotation.mT, torch.eye(3).double().expand_as(found.rotation), atol=1e-9, rtol=0
     )

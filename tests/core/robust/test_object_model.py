@@ -81,7 +81,7 @@ def test_the_signature_does_not_depend_on_the_frame_and_tells_shapes_apart() -> 
 
 
 def test_the_signature_of_two_points_is_what_the_bins_say() -> None:
-    from regnf_core.robust.residuals import Samples
+    from regnf_core.robust.samples import Samples
 
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     up = torch.tensor([[0.0, 0.0, 1.0]] * 2)

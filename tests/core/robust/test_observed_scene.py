@@ -45,7 +45,7 @@ def test_an_invented_part_hinders_only_those_who_believe_it() -> None:
     result = register(moved, chair(), box, ROBUST)
     assert result.verdict == "registered"
     assert placement_error(result, chair_pose() @ T.inverse()) < 0.01
-    assert 0.2 < result.metrics["hidden_share_object"] < 0.7
+    assert 0.2 < result.metrics["occluded_share_object"] < 0.7
 
 
 def test_matter_that_was_seen_tells_a_look_alike() -> None:

@@ -7,16 +7,11 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.refine.levenberg_marquardt import (
-    MOST_OFFSET,
-    OFFSET_PRIOR,
-    minimize,
-    normal_equations,
-    robust_cost,
-    with_offset,
-)
-from regnf_core.robust.residuals import Residuals, residuals
-from regnf_core.robust.samples import sample_object_surface
+from regnf_core.robust.constants import REFINEMENT
+from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
+from regnf_core.robust.refine.loss import normal_equations, robust_cost
+from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.sampling import sample_object_surface
 from tests.core.analytic import AnalyticField, chair, chair_pose, room
 from tests.core.robust.shapes import detection, run
 
@@ -41,8 +36,9 @@ def some_residuals(offset: float) -> Residuals:
 def test_the_offset_is_taken_out_of_both_directions() -> None:
     found = sample_object_surface(chair(), 300, torch.Generator().manual_seed(0))
     identity = Sim3(torch.ones(1, dtype=D), torch.eye(3, dtype=D)[None], torch.zeros(1, 3, dtype=D))
-    plain = residuals(found.field, found.field, found.samples, found.samples, identity)
-    moved = residuals(found.field, found.field, found.samples, found.samples, identity, torch.tensor([0.02], dtype=D))
+    surfaces = SurfacePair(found.field, found.field, found.samples, found.samples)
+    plain = residuals(surfaces, identity)
+    moved = residuals(surfaces, identity, torch.tensor([0.02], dtype=D))
     n = len(found.samples)
     torch.testing.assert_close(moved.values[:, :n], plain.values[:, :n] - 0.02)
     torch.testing.assert_close(moved.values[:, n:], plain.values[:, n:] + 0.02)
@@ -51,7 +47,7 @@ def test_the_offset_is_taken_out_of_both_directions() -> None:
 
 def test_the_offsets_column_is_the_derivative_of_the_values() -> None:
     r = some_residuals(0.0)
-    column = with_offset(r)[0, :, 7]
+    column = r.jacobian_with_offset()[0, :, 7]
     assert column.tolist() == [-1.0] * 4 + [1.0] * 5
 
 
@@ -62,13 +58,13 @@ def test_the_gradient_is_that_of_the_cost() -> None:
     def cost(offset: float) -> float:
         shift = offset - 0.003
         r = some_residuals(offset)
-        values = r.values + with_offset(r)[..., 7] * shift
+        values = r.values + r.jacobian_with_offset()[..., 7] * shift
         return float(robust_cost(Residuals(values, r.jacobian, r.cosines, 4, offset=r.offset), width))
 
     slope = (cost(0.003 + h) - cost(0.003 - h)) / (2 * h)
     _, b = normal_equations(some_residuals(0.003), width)
     assert float(b[0, 7]) == pytest.approx(slope * width**2, rel=1e-5)
-    assert OFFSET_PRIOR > 0.0
+    assert REFINEMENT.offset_prior > 0.0
 
 
 def test_a_thick_copy_keeps_its_scale() -> None:
@@ -79,16 +75,14 @@ def test_a_thick_copy_keeps_its_scale() -> None:
     truth = target.frame.to_field().inverse() @ source.frame.to_field()
     start = truth[None].perturb(torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D))
     widths = [0.05, 0.04, 0.03, 0.02, *[0.01] * 8]
-    without = minimize(source.field, target.field, source.samples, target.samples, start, widths, adaptive=True)
-    free = minimize(
-        source.field, target.field, source.samples, target.samples, start, widths, adaptive=True,
-        offset=torch.zeros(1, dtype=D),
-    )  # fmt: skip
+    surfaces = SurfacePair(source.field, target.field, source.samples, target.samples)
+    without = minimize(surfaces, start, widths, Settings(adaptive=True))
+    free = minimize(surfaces, start, widths, Settings(adaptive=True), offset=torch.zeros(1, dtype=D))
     assert free.residuals.offset is not None
     assert abs(float(without.T.scale / truth.scale) - 1.0) > 0.008
     assert abs(float(free.T.scale / truth.scale) - 1.0) < 0.002
     assert float(free.residuals.offset) == pytest.approx(0.015, abs=0.001)
-    assert float(free.residuals.offset) <= MOST_OFFSET
+    assert float(free.residuals.offset) <= REFINEMENT.max_offset
 
 
 def rippled(field: AnalyticField, by: float, height: float) -> AnalyticField:

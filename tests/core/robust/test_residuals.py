@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.residuals import Samples, residuals
+from regnf_core.robust.residuals import SurfacePair, residuals
+from regnf_core.robust.samples import Samples
 from tests.core.robust.shapes import random_pose
 
 SCALES = [0.05, 1.0, 20.0]
@@ -37,9 +38,9 @@ def samples(field: Quadric, seed: int) -> Samples:
 
 def plain_residuals(scene: Quadric, obj: Quadric, A: Samples, B: Samples, T: Sim3) -> Tensor:
     """The definition, written out once more: S_b(T x) - s S_a(x), then s S_a(T^-1 z) - S_b(z)."""
-    forth = obj.value(T.apply(A.points)) - T.scale * scene.value(A.points)
-    back = T.scale * scene.value(T.inverse().apply(B.points)) - obj.value(B.points)
-    return torch.cat([forth, back])
+    scene_to_object = obj.value(T.apply(A.points)) - T.scale * scene.value(A.points)
+    object_to_scene = T.scale * scene.value(T.inverse().apply(B.points)) - obj.value(B.points)
+    return torch.cat([scene_to_object, object_to_scene])
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -53,7 +54,7 @@ def test_the_jacobian_is_what_autograd_says(scale: float, frame: int) -> None:
         return plain_residuals(scene, obj, A, B, Sim3(p.scale[0], p.rotation[0], p.translation[0]))
 
     expected = torch.autograd.functional.jacobian(moved, torch.full((7,), 1e-12, dtype=torch.float64))
-    found = residuals(scene, obj, A, B, T[None])
+    found = residuals(SurfacePair(scene, obj, A, B), T[None])
     torch.testing.assert_close(found.values[0], plain_residuals(scene, obj, A, B, T), rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(found.jacobian[0], expected, rtol=1e-6, atol=1e-6)
 
@@ -63,13 +64,13 @@ def test_the_jacobian_is_what_autograd_says(scale: float, frame: int) -> None:
 def test_the_jacobian_is_what_finite_differences_say(scale: float, frame: int) -> None:
     scene, obj, T = Quadric(frame), Quadric(frame + 10), random_pose(frame, scale)
     A, B = samples(scene, 3), samples(obj, 4)
-    found = residuals(scene, obj, A, B, T[None]).jacobian[0]
+    found = residuals(SurfacePair(scene, obj, A, B), T[None]).jacobian[0]
     h = 1e-6
     for k in range(7):
         step = torch.zeros(1, 7, dtype=torch.float64)
         step[0, k] = h
-        up = residuals(scene, obj, A, B, T[None].perturb(step)).values[0]
-        down = residuals(scene, obj, A, B, T[None].perturb(-step)).values[0]
+        up = residuals(SurfacePair(scene, obj, A, B), T[None].perturb(step)).values[0]
+        down = residuals(SurfacePair(scene, obj, A, B), T[None].perturb(-step)).values[0]
         scaled = found[:, k].abs().max().clamp_min(1.0)
         torch.testing.assert_close(found[:, k] / scaled, (up - down) / (2 * h) / scaled, rtol=1e-4, atol=1e-6)
 
@@ -87,6 +88,6 @@ def test_true_pose_leaves_no_residual_off_the_surface_at_any_scale() -> None:
     z = T.apply(A.points)
     value, gradient = obj.value_and_gradient(z)
     B = Samples(z, value, gradient / gradient.norm(dim=-1, keepdim=True))
-    found = residuals(scene, obj, A, B, T[None])
+    found = residuals(SurfacePair(scene, obj, A, B), T[None])
     assert found.values.abs().max() < 1e-9
     torch.testing.assert_close(found.cosines, torch.ones_like(found.cosines))

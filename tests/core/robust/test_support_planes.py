@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.scene.smoothing import smoothed
-from regnf_core.robust.scene.support_planes import support
+from regnf_core.robust.samples import Samples
+from regnf_core.robust.scene.smoothing import smooth
+from regnf_core.robust.scene.support_planes import support_planes
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -61,7 +61,7 @@ def floor_with_crumbs() -> tuple[Samples, Tensor]:
 
 def test_a_rough_floor_with_crumbs_beneath_is_set_aside_and_the_crate_is_kept() -> None:
     samples, of_crate = floor_with_crumbs()
-    aside = support(samples, generator())
+    aside = support_planes(samples, generator())
     assert aside[~of_crate].float().mean() > 0.95
     assert aside[of_crate & (samples.points[:, 2] > 0.06)].sum() == 0
 
@@ -72,25 +72,25 @@ def test_the_same_crumbs_beneath_an_accurate_plane_are_the_rest_of_an_object() -
     samples = together(
         sheet(900, 0.0, 1.0, 1), Samples(below.points, below.values, draw.abs() * torch.tensor([1, 1, 0]))
     )
-    assert not support(samples, generator()).any()
+    assert not support_planes(samples, generator()).any()
 
 
 def test_a_crate_in_the_air_has_no_support() -> None:
-    assert not support(roughened(crate(1500), 0.006, 0.35), generator()).any()
+    assert not support_planes(roughened(crate(1500), 0.006, 0.35), generator()).any()
 
 
 @pytest.mark.parametrize("height", [0.0, 0.01])
 def test_roughness_is_the_height_of_the_bumps(height: float) -> None:
-    found = smoothed(roughened(sheet(4000, 0.0, 1.0, 1), height, 0.0))
+    found = smooth(roughened(sheet(4000, 0.0, 1.0, 1), height, 0.0))
     assert found.roughness == pytest.approx(height, rel=0.15, abs=1e-6)
-    assert found.incoherence == pytest.approx(0.0, abs=1e-6)
+    assert found.normal_roughness == pytest.approx(0.0, abs=1e-6)
     assert found.points[:, 2].std() <= 0.5 * height + 1e-6
 
 
-def test_incoherence_is_the_tilt_of_the_normals_and_thin_parts_keep_their_sides() -> None:
+def test_normal_roughness_is_the_tilt_of_the_normals_and_thin_parts_keep_their_sides() -> None:
     both = roughened(together(sheet(2000, 0.0, 1.0, 1), sheet(2000, -0.02, -1.0, 2)), 0.0, 0.3)
-    found = smoothed(both)
+    found = smooth(both)
     # Tilted by 0.3 along both tangents: 1 - cos of the median angle, 0.3 sqrt(2 ln 2) = 0.353 in the tangent, 0.059.
-    assert found.incoherence == pytest.approx(0.059, abs=0.012)
+    assert found.normal_roughness == pytest.approx(0.059, abs=0.012)
     assert (found.normals[:2000, 2] > 0.9).float().mean() > 0.99
     assert (found.normals[2000:, 2] < -0.9).float().mean() > 0.99

@@ -9,9 +9,17 @@ import torch
 
 from regnf_core.geometry.pose_distance import displacement
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.refine.levenberg_marquardt import geman_mcclure_weights, minimize, robust_cost
-from regnf_core.robust.residuals import residuals
-from regnf_core.robust.samples import sample_object_surface, some
+from regnf_core.robust.kernel import (
+    geman_mcclure_agreement,
+    geman_mcclure_curvature,
+    geman_mcclure_loss,
+    geman_mcclure_weight,
+)
+from regnf_core.robust.refine.levenberg_marquardt import minimize
+from regnf_core.robust.refine.loss import robust_cost
+from regnf_core.robust.residuals import SurfacePair, residuals
+from regnf_core.robust.samples import subsample
+from regnf_core.robust.sampling import sample_object_surface
 from tests.core.analytic import chair, seen_from
 from tests.core.robust.shapes import random_pose
 
@@ -19,7 +27,18 @@ from tests.core.robust.shapes import random_pose
 def test_weights_are_those_of_geman_and_mcclure() -> None:
     # (w^2 / (w^2 + r^2))^2: 1 at zero, 1/4 at one width, 1/25 at two
     r = torch.tensor([0.0, 0.1, 0.2])
-    torch.testing.assert_close(geman_mcclure_weights(r, 0.1), torch.tensor([1.0, 0.25, 0.04]))
+    torch.testing.assert_close(geman_mcclure_weight(r, 0.1), torch.tensor([1.0, 0.25, 0.04]))
+
+
+def test_weight_and_curvature_are_the_derivatives_of_the_loss() -> None:
+    r, width = torch.tensor([0.0, 0.02, 0.1, 0.25], dtype=torch.float64, requires_grad=True), 0.1
+    loss = geman_mcclure_loss(r, width)
+    torch.testing.assert_close(loss + geman_mcclure_agreement(r, width), torch.ones_like(r))
+    (slope,) = torch.autograd.grad(loss.sum(), r, create_graph=True)
+    weight = geman_mcclure_weight(r, width)
+    torch.testing.assert_close(slope, 2 * weight * r / width**2)
+    (bend,) = torch.autograd.grad(slope.sum(), r)
+    torch.testing.assert_close(2 / width**2 * geman_mcclure_curvature(r, width, weight), bend)
 
 
 @pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
@@ -32,10 +51,9 @@ def test_many_perturbed_starts_come_back_at_once(scale: float) -> None:
     T_work = target.frame.to_field().inverse() @ truth @ source.frame.to_field()
     step = torch.randn(24, 7, generator=generator, dtype=torch.float64) * torch.tensor([0.12] * 3 + [0.04] * 3 + [0.08])
     start = T_work.expand(24).perturb(step)
-    A, B = some(source.samples, 300, generator), some(target.samples, 300, generator)
-    refined = minimize(
-        source.field, target.field, A, B, start, [0.1, 0.1, 0.08, 0.06, 0.04, 0.03, 0.02, 0.01, 0.01, 0.01]
-    )
+    A, B = subsample(source.samples, 300, generator), subsample(target.samples, 300, generator)
+    surfaces = SurfacePair(source.field, target.field, A, B)
+    refined = minimize(surfaces, start, [0.1, 0.1, 0.08, 0.06, 0.04, 0.03, 0.02, 0.01, 0.01, 0.01])
     left = displacement(refined.T, T_work, target.samples.points)
     assert displacement(start, T_work, target.samples.points).median() > 0.1
     assert left.median() < 1e-4
@@ -46,12 +64,10 @@ def test_no_iteration_raises_the_cost() -> None:
     generator = torch.Generator().manual_seed(1)
     target = sample_object_surface(chair(), 400, generator)
     start = Sim3.identity().expand(5).perturb(0.2 * torch.randn(5, 7, generator=generator, dtype=torch.float64))
-    before = robust_cost(residuals(target.field, target.field, target.samples, target.samples, start), 0.05)
+    surfaces = SurfacePair(target.field, target.field, target.samples, target.samples)
+    before = robust_cost(residuals(surfaces, start), 0.05)
     costs = [before]
-    minimize(
-        target.field, target.field, target.samples, target.samples, start, [0.05] * 6,
-        on_iteration=lambda _i, _T, _r, cost: costs.append(cost),
-    )  # fmt: skip
+    minimize(surfaces, start, [0.05] * 6, on_iteration=lambda done: costs.append(done.costs))
     assert all((later <= earlier + 1e-7).all() for earlier, later in pairwise(costs))
 
 

@@ -10,9 +10,9 @@ from regnf_core.errors import InvalidDetectionError, NoSurfaceError
 from regnf_core.fields.counting import CountingField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.robust.samples import sample_object_surface, sample_scene_surface
-from regnf_core.robust.scene.support_planes import support
-from regnf_core.robust.search.distance_grid import ProxyField
+from regnf_core.robust.sampling import sample_object_surface, sample_scene_surface
+from regnf_core.robust.scene.support_planes import support_planes
+from regnf_core.robust.search.distance_grid import DistanceGrid
 from regnf_core.robust.search.rotations import super_fibonacci, turns_about
 from tests.core.analytic import AnalyticField, chair, chair_pose, room, sphere
 from tests.core.robust.shapes import detection, random_pose
@@ -61,7 +61,7 @@ def test_floor_and_walls_are_told_from_the_chair_in_any_orientation() -> None:
     found = sample_scene_surface(scene, box, 4000, generator())
     surface = turn.inverse().apply(found.frame.out_of(found.samples.on_surface()))
     on_chair = chair().signed_distance(chair_pose().apply(surface)).abs() < 0.02
-    aside = support(found.samples, generator())
+    aside = support_planes(found.samples, generator())
     assert (aside & (surface[:, 2] < 0.005)).sum() == (surface[:, 2] < 0.005).sum() > 200
     assert (aside & on_chair & (surface[:, 2] > 0.03)).sum() == 0
 
@@ -77,11 +77,11 @@ def test_an_empty_box_and_a_box_elsewhere_are_refused() -> None:
     assert elsewhere.value.reason == "DETECTION_OUTSIDE_SCENE"
 
 
-def test_the_proxy_is_the_distance_to_within_the_spacing() -> None:
+def test_the_distance_grid_is_the_distance_to_within_the_spacing() -> None:
     found = sample_object_surface(sphere(0.5), 3000, generator())
-    proxy = ProxyField(found.samples.on_surface(), found.samples.normals, found.spacing, 0.2)
+    grid = DistanceGrid(found.samples.on_surface(), found.samples.normals, found.spacing, 0.2)
     points = 1.4 * torch.rand(4000, 3, generator=generator()) - 0.7
-    value, gradient = proxy.value_and_gradient(points)
+    value, gradient = grid.value_and_gradient(points)
     exact = points.norm(dim=-1) - 0.5
     assert (value - exact).abs().quantile(0.95) < 0.5 * found.spacing
     shell = exact.abs() < 0.1

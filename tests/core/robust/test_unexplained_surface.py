@@ -8,8 +8,9 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.robust.residuals import Samples
-from regnf_core.robust.verdict.unexplained_surface import extra_share
+from regnf_core.robust.residuals import SurfacePair
+from regnf_core.robust.samples import Samples
+from regnf_core.robust.verdict.unexplained_surface import unexplained_share
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 NONE = torch.zeros((), dtype=torch.float64)
@@ -35,12 +36,11 @@ def samples(*rows: tuple[float, float, float]) -> Samples:
 
 def share(A: Samples, right: float, T: Sim3 | None = None) -> float:
     """Of the plane z = 0 as object, in a scene whose matter reaches to ``right`` above x = 5."""
-    return extra_share(
-        Floor(0.0, right), Floor(0.0, 0.0), A, Sim3.identity() if T is None else T, NONE, RobustOptions()
-    )
+    surfaces = SurfacePair(Floor(0.0, right), Floor(0.0, 0.0), A, A)
+    return unexplained_share(surfaces, Sim3.identity() if T is None else T, NONE, RobustOptions())
 
 
-def test_what_lies_on_the_object_is_extra() -> None:
+def test_what_lies_on_the_object_is_unexplained() -> None:
     A = samples(*[(float(x), 0.0, 1.0) for x in range(5)], (6.0, 0.06, 1.0), (7.0, 0.06, 1.0), (8.0, 0.5, 1.0))
     assert share(A, 0.06) == pytest.approx(2 / 7)  # the last is too far off to be near
 
@@ -66,7 +66,8 @@ def test_it_is_the_same_in_every_frame() -> None:
             value, gradient = super().value_and_gradient(2.0 * points)
             return value / 2.0, gradient
 
-    found = extra_share(Halved(0.0, 0.06), Floor(0.0, 0.0), half, T, NONE, RobustOptions())
+    surfaces = SurfacePair(Halved(0.0, 0.06), Floor(0.0, 0.0), half, half)
+    found = unexplained_share(surfaces, T, NONE, RobustOptions())
     assert found == pytest.approx(1 / 6)
     assert share(A, 0.06) == pytest.approx(1 / 6)
 

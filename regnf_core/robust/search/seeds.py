@@ -1,8 +1,8 @@
-"""Seeds for the search: rotations from a fixed, even set; scale and shift for each from the two shapes.
+"""Seeds for the search: rotations from a fixed, even set; scale and translation for each from the two shapes.
 
-Three ways to scale and shift a rotated object onto what the box holds, since each fails where another holds: the
-centroids and root-mean-square radii (bad with clutter), the extents of the points (bad with one stray point), the
-detection box itself (bad when it is loose).
+There are three ways to scale and move a rotated object onto the surface in the box, because each fails in some cases:
+the centroids and root mean square radii (wrong with clutter), the extents of the points (wrong with one stray point),
+the detection box itself (wrong when it is loose).
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import SEARCH
 
 
-def seeds(
+def seed_poses(
     scene_points: Tensor, object_points: Tensor, box_axes: Tensor, box_size: Tensor, rotations: Tensor, scales: Tensor
 ) -> Sim3:
-    """Poses T_object_scene (H,), working frames, float64: every rotation (K, 3, 3) with every way to scale and shift.
+    """Poses T_object_scene (H,), working frames, float64: every rotation (K, 3, 3) with every way to scale and move.
 
     scene_points (N, 3): what may be the object, the box's center at 0 · box_axes (3, 3): columns, scene frame ·
     box_size (3,): full edges · scales: factors (L,) tried about the ratio of the radii.
@@ -31,9 +32,12 @@ def seeds(
     return Sim3.cat([by_moments, by_points, by_box])
 
 
-def seeds_about(T_start: Sim3, count: int, generator: torch.Generator) -> Sim3:
-    """A pose and ``count`` perturbed copies: by about 10 degrees, 5 % of the object's size, 10 % of the scale."""
-    spread = torch.tensor([0.17] * 3 + [0.05] * 3 + [0.10], dtype=torch.float64)
+def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:
+    """A single pose and perturbed copies of it (H,): by about 10 degrees, 5 % of the object's size, 10 % of the
+    scale."""
+    turn, shift, growth = SEARCH.warm_start_spread
+    count = SEARCH.warm_start_copies
+    spread = torch.tensor([turn] * 3 + [shift] * 3 + [growth], dtype=torch.float64)
     steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
     steps[0] = 0.0
     return T_start.expand(count + 1).perturb(steps)

@@ -1,0 +1,53 @@
+"""One detection and one object, ready to be registered: samples to fit, samples to judge the fit, both fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from regnf_core.fields.base import SdfField
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.options import RobustOptions
+from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.robust.residuals import SurfacePair
+from regnf_core.robust.samples import split
+from regnf_core.robust.scene.scene_view import SceneView
+
+
+@dataclass(frozen=True, eq=False)
+class RegistrationProblem:
+    """A detection and an object. Poses T (H,) map the scene's working frame to the object's.
+
+    fit: what poses are refined on · held_out: the same fields with other samples, for the verdict alone.
+    """
+
+    view: SceneView
+    model: ObjectModel
+    fit: SurfacePair
+    held_out: SurfacePair
+
+    def in_field_frames(self, T_work: Sim3) -> Sim3:
+        """A single pose between the working frames as T_object_scene."""
+        return self.model.frame.to_field() @ T_work @ self.view.frame.to_field().inverse()
+
+    def in_working_frames(self, T_object_scene: Sim3) -> Sim3:
+        """A single T_object_scene as a pose between the working frames."""
+        return self.model.frame.to_field().inverse() @ T_object_scene @ self.view.frame.to_field()
+
+
+def make_problem(
+    view: SceneView,
+    model: ObjectModel,
+    scene: SdfField,
+    obj: SdfField,
+    options: RobustOptions,
+    generator: torch.Generator,
+) -> RegistrationProblem:
+    """Divide the samples of both surfaces into those to fit and those to hold out."""
+    A, A_held = split(view.foreground, options.held_out_share, generator)
+    B, B_held = split(model.samples, options.held_out_share, generator)
+    scene_field, object_field = view.field(scene), model.field(obj)
+    fit = SurfacePair(scene_field, object_field, A, B)
+    held_out = SurfacePair(scene_field, object_field, A_held, B_held)
+    return RegistrationProblem(view, model, fit, held_out)

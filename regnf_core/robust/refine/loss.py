@@ -1,0 +1,72 @@
+"""The refinement's robust loss: kernel widths, cost, normal equations, and the score that ranks poses.
+
+The kernel itself is in regnf_core/robust/kernel.py, the numbers are REFINEMENT in regnf_core/robust/constants.py.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.robust.constants import REFINEMENT
+from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_loss, geman_mcclure_weight
+from regnf_core.robust.residuals import Residuals
+
+
+def adaptive_width(r: Residuals, lowest: float) -> Tensor:
+    """(H, 1) kernel widths: ``lowest``, or wider where the spread of a pose's residuals asks for it. Object diameters.
+
+    With a fixed narrow kernel, fields with errors everywhere would be fitted at the few places without errors.
+    """
+    spread = torch.quantile(r.values.abs(), REFINEMENT.spread_quantile, dim=1, keepdim=True)
+    return (REFINEMENT.spread_factor * spread).clamp(lowest, max(lowest, REFINEMENT.max_adaptive_width))
+
+
+def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
+    """Kernel widths of all residuals: narrower for object samples at places that were not observed."""
+    if r.unobserved is None:
+        return width
+    return torch.where(r.unobserved, REFINEMENT.unobserved_width * width, width)
+
+
+def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
+    """(H,): mean over each direction of the Geman-McClure loss, 0..1, the two directions averaged.
+
+    A narrower kernel has the same curvature at zero, and so saturates at a lower loss.
+    """
+    widths = kernel_widths(r, width)
+    loss = geman_mcclure_loss(r.values, widths) * (widths / width) ** 2
+    cost = 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
+    if r.offset is None:
+        return cost
+    prior: Tensor = 0.5 * REFINEMENT.offset_prior * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
+    return cost + prior
+
+
+def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tensor]:
+    """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64; each direction has the same total influence.
+
+    An offset is the eighth unknown.
+    """
+    n, m = r.scene_count, r.values.shape[1] - r.scene_count
+    weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
+    weights = torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
+    J = r.jacobian_with_offset()
+    weighted = (J * weights[..., None]).mT.double()
+    H, b = weighted @ J.double(), (weighted @ r.values.double()[..., None]).squeeze(-1)
+    if r.offset is not None:
+        H[:, 7, 7] += REFINEMENT.offset_prior
+        b[:, 7] += REFINEMENT.offset_prior * r.offset
+    return H, b
+
+
+def disagreement(r: Residuals, width: float) -> Tensor:
+    """(H,) scores in 0..1, smaller is better: Geman-McClure losses, larger where the normals disagree.
+
+    Each direction counts half, however many samples it has. The loss of object samples at places that were not
+    observed is limited.
+    """
+    loss = 1.0 - geman_mcclure_agreement(r.values, width) * r.cosines.clamp(0.0, 1.0)
+    if r.unobserved is not None:
+        loss = torch.where(r.unobserved, loss.clamp_max(REFINEMENT.unobserved_loss), loss)
+    return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
