@@ -16,12 +16,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-ENTRIES = (
-    "regnf_core.registration",
-    "regnf_core.batch",
-    "regnf_core.library",
-    "regnf_core.fields.safe_format",
-)
+from regnf_core import open_field, register
+from regnf_core.batch import register_batch
+from regnf_core.library import search_library
+
+ENTRIES = tuple(function.__module__ for function in (open_field, register, register_batch, search_library))
 """Where a registration starts, and where the fields that it evaluates come from."""
 _LAYOUT_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores", "type_params"})
 """Members of syntax trees that say nothing here, or that not every version of Python has."""
