@@ -13,12 +13,13 @@ from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, s
 
 from tests.ui.fixture_server import FixtureServer
 
-# SwiftShader draws WebGL without a GPU; the other switches keep the browser from calling home.
+# SwiftShader draws WebGL without a GPU, and nothing else, for it is slow. The others keep the browser from calling home.
 ARGUMENTS = [
     "--no-sandbox",
     "--use-gl=angle",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -90,8 +91,8 @@ def open_window(browser: Browser) -> Open:
 
 
 @pytest.fixture(scope="session")
-def kept_windows() -> dict[str, Page]:
-    """The windows that tests share, by their options."""
+def kept_window() -> dict[str, Page]:
+    """The window that tests share, by its options; at most one."""
     return {}
 
 
@@ -107,11 +108,15 @@ def forget(page: Page) -> None:
 
 
 @pytest.fixture
-def shared_page(open_window: Open, kept_windows: dict[str, Page], context_options: dict[str, Any]) -> Iterator[Page]:
+def shared_page(open_window: Open, kept_window: dict[str, Page], context_options: dict[str, Any]) -> Iterator[Page]:
     key = repr(context_options)
-    page = kept_windows[key] if key in kept_windows else kept_windows.setdefault(key, open_window(context_options))
-    yield page
-    forget(page)
+    if key not in kept_window:
+        for other in kept_window.values():
+            other.context.close()
+        kept_window.clear()
+        kept_window[key] = open_window(context_options)
+    yield kept_window[key]
+    forget(kept_window[key])
 
 
 @pytest.fixture
