@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, ConsoleMessage, Error, Page, Request, s
 
 from tests.ui.fixture_server import FixtureServer
 
-# SwiftShader draws WebGL without a GPU, and nothing else, for it is slow. The others keep the browser from calling home.
+# SwiftShader draws WebGL without a GPU, and nothing else, being slow. The others keep the browser from calling home.
 ARGUMENTS = [
     "--no-sandbox",
     "--use-gl=angle",
