@@ -95,7 +95,7 @@ class ArraySource:
         self._budget -= 4 * count
         if self._budget < 0:
             raise tensor_error(f"with {name} the arrays exceed the limit", "TENSOR_TOO_LARGE")
-        if len(raw) - header.data_at != count * header.item_bytes:
+        if len(raw) - header.data_at != count * header.dtype.itemsize:
             raise tensor_error(f"{name} has another size than its shape {header.shape}", "TENSOR_STORAGE_MISMATCH")
         return _array(raw, header)
 
@@ -130,5 +130,5 @@ def _faulty_deflate(name: str) -> FieldFormatError:
 
 
 def _array(raw: memoryview, header: NpyHeader) -> npt.NDArray[Any]:
-    flat = np.frombuffer(raw[header.data_at :], dtype=np.dtype(header.dtype))
+    flat = np.frombuffer(raw[header.data_at :], dtype=header.dtype)
     return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
