@@ -15,6 +15,7 @@ from typing import Any
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.blobs.base import BlobStore
 from regnf_state.logs import configure_logging
+from regnf_state.manifest import Manifest
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
@@ -57,10 +58,10 @@ class HeldEngine(TinyEngine):
             time.sleep(0.01)
 
 
-def publish(blobs: BlobStore, job_id: str, manifest: artifacts.Manifest) -> bool:
-    stands = artifacts.publish(blobs, job_id, manifest)
+def publish(blobs: BlobStore, manifest: Manifest) -> bool:
+    published = artifacts.publish(blobs, manifest)
     wait_while("hold-end")
-    return stands
+    return published
 
 
 def held_importer(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 import hashlib
 from pathlib import Path
 
+from regnf_state.manifest import Artifact, Manifest, read_manifest
 from regnf_state.memory import InMemoryBlobStore
-from regnf_worker.artifacts import discard_others, publish, read_manifest, store_artifacts
+from regnf_worker.artifacts import discard_others, publish, store_artifacts
 
 
 def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:
@@ -13,24 +14,21 @@ def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:
     (tmp_path / "trace.unknown").write_bytes(b"xyz")
     manifest = store_artifacts(blobs, "j1", 3, tmp_path, ["result.json", "trace.unknown"])
     assert read_manifest(blobs, "j1") is None, "stored is not yet published"
-    assert publish(blobs, "j1", manifest)
+    assert publish(blobs, manifest)
     assert read_manifest(blobs, "j1") == manifest
-    assert manifest["attempt"] == 3
-    assert manifest["artifacts"][1] == {
-        "name": "trace.unknown",
-        "bytes": 3,
-        "media_type": "application/octet-stream",
-        "sha256": hashlib.sha256(b"xyz").hexdigest(),
-    }
+    assert manifest.attempt == 3
+    assert manifest.artifacts[1] == Artifact("trace.unknown", 3, hashlib.sha256(b"xyz").hexdigest())
+    assert manifest.artifacts[1].media_type == "application/octet-stream"
+    assert list(manifest.served()) == ["result.json"]
 
 
 def test_a_job_has_one_result() -> None:
     blobs = InMemoryBlobStore()
-    first = {"attempt": 1, "artifacts": [{"name": "x"}]}
-    assert publish(blobs, "j1", first)
-    assert not publish(blobs, "j1", {"attempt": 2, "artifacts": []})
+    first = Manifest("j1", 1, (Artifact("x", 1, "0"),))
+    assert publish(blobs, first)
+    assert not publish(blobs, Manifest("j1", 2, ()))
     assert read_manifest(blobs, "j1") == first
     for key in ("jobs/j1/1/x", "jobs/j1/1/old", "jobs/j1/2/x", "jobs/j10/2/x"):
         blobs.put(key, b".")
-    discard_others(blobs, "j1", first)
+    discard_others(blobs, first)
     assert sorted(blobs.blobs) == ["jobs/j1/1/x", "jobs/j1/manifest.json", "jobs/j10/2/x"]

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from regnf_core.errors import CancelledError
+from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord
 from regnf_state.settings import Settings
-from regnf_worker.artifacts import publish, read_manifest
+from regnf_worker.artifacts import publish
 from regnf_worker.context import Context
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.registration import run_attempt
@@ -25,20 +26,20 @@ def test_an_attempt_that_is_not_to_be_had_does_nothing(context: Context) -> None
 
 def test_a_rerun_returns_the_result_that_stands(context: Context) -> None:
     accept(context, "crash")
-    standing = {"attempt": 7, "artifacts": []}
-    publish(context.blobs, "j1", standing)
+    published = Manifest("j1", 7, ())
+    publish(context.blobs, published)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert job(context).status == "successful"
-    assert read_manifest(context.blobs, "j1") == standing
+    assert read_manifest(context.blobs, "j1") == published
 
 
 def test_a_result_that_came_second_is_dropped(context: Context) -> None:
     accept(context)
-    standing = {"attempt": 7, "artifacts": []}
+    published = Manifest("j1", 7, ())
 
     class Slow(TinyEngine):
         def succeed(self, report: object) -> None:
-            publish(context.blobs, "j1", standing)
+            publish(context.blobs, published)
 
     run_attempt(context, "j1", 1, "w", Slow)
     assert job(context).status == "successful"

@@ -11,7 +11,7 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_service.upkeep.reaper import Reaper
-from regnf_worker.artifacts import read_manifest
+from regnf_state.manifest import read_manifest
 from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import Bench, bench, children_of, eventually
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from regnf_state.manifest import Manifest
 from regnf_worker.artifacts import publish
 from regnf_worker.context import Context
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
@@ -63,7 +64,7 @@ def test_somebody_elses_job_is_left_alone(context: Context) -> None:
 def test_a_killed_process_whose_result_stands_has_succeeded(context: Context) -> None:
     accept(context)
     context.records.update_job("j1", 1, status="running", worker="w")
-    publish(context.blobs, "j1", {"attempt": 1, "artifacts": []})
+    publish(context.blobs, Manifest("j1", 1, ()))
     settle_registration(context, "j1", 1, "w", ChildExit(signal=9))
     assert job(context).status == "successful"
 

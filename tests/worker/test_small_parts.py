@@ -11,10 +11,11 @@ import pytest
 from rq.timeouts import JobTimeoutException
 
 from regnf_state.blobs.base import StorageFullError
+from regnf_state.problems import problem_document
 from regnf_state.settings import Settings
 from regnf_worker import kernel
 from regnf_worker.context import Context, NoRedisError
-from regnf_worker.problems import fault, problem
+from regnf_worker.problems import fault
 from regnf_worker.scratch import Scratch
 
 
@@ -38,7 +39,7 @@ def test_faults_have_reasons_and_tell_no_secrets(error: Exception, reason: str) 
 
 
 def test_refusals_unknown_to_the_table_are_still_problems() -> None:
-    found = problem("TENSOR_TOO_LARGE", "too large")
+    found = problem_document("TENSOR_TOO_LARGE", "too large")
     assert (found["status"], found["title"], found["detail"]) == (422, "Tensor too large", "too large")
 
 

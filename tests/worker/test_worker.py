@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from regnf_state.manifest import read_manifest
 from regnf_state.records import FieldRecord
-from regnf_worker.artifacts import read_manifest
 from tests.worker.bench import OBJECT, SCENE, Bench, alive, bench, children_of, eventually
 
 
@@ -34,8 +34,8 @@ def test_a_job_succeeds(table: Bench) -> None:
     assert done.engine == {"version": "tiny", "device": "none"}
     manifest = read_manifest(table.context.blobs, "j1")
     assert manifest is not None
-    assert manifest["attempt"] == 1
-    assert [(one["name"], one["media_type"]) for one in manifest["artifacts"]] == [
+    assert manifest.attempt == 1
+    assert [(one.name, one.media_type) for one in manifest.artifacts] == [
         ("result.json", "application/json"),
         ("aligned.ply", "application/octet-stream"),
     ]

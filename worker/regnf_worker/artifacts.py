@@ -1,90 +1,56 @@
-"""Results into the blob store: artifacts under their attempt, then the manifest, which makes them count."""
+"""Results into the blob store: files under their attempt, then the manifest, which makes them count."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-import mimetypes
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from regnf_state.blobs.base import BlobStore
+from regnf_state.manifest import Artifact, Manifest, artifact_key, manifest_key, read_result
 
 _CHUNK_BYTES = 1 << 20
-_MEDIA_TYPES = {
-    ".npy": "application/octet-stream",
-    ".npz": "application/zip",
-    ".ply": "application/octet-stream",
-    ".glb": "model/gltf-binary",
-    ".json": "application/json",
-    ".png": "image/png",
-}
-
 _VERDICTS = ("registered", "ambiguous", "rejected")
-Manifest = dict[str, Any]
 
 
-def manifest_key(job_id: str) -> str:
-    return f"jobs/{job_id}/manifest.json"
-
-
-def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
-    """The job's result as it stands: {attempt, artifacts: [{name, bytes, media_type, sha256}]}; None without one."""
+def verdict_of(blobs: BlobStore, manifest: Manifest) -> str | None:
+    """The verdict in the result; None for a result without a known one."""
     try:
-        with blobs.open(manifest_key(job_id)) as file:
-            manifest: Manifest = json.load(file)
-    except FileNotFoundError:
-        return None
-    return manifest
-
-
-def verdict_of(blobs: BlobStore, job_id: str, manifest: Manifest) -> str | None:
-    """What the result that the manifest lists says of itself; None for one that says nothing that is known."""
-    try:
-        with blobs.open(f"jobs/{job_id}/{manifest['attempt']}/result.json") as file:
-            verdict = json.load(file).get("verdict")
+        verdict = read_result(blobs, manifest).get("verdict")
     except (FileNotFoundError, ValueError, AttributeError):
         return None
     return verdict if verdict in _VERDICTS else None
 
 
-def store_artifacts(blobs: BlobStore, job_id: str, attempt: int, folder: Path, names: list[str]) -> Manifest:
+def store_artifacts(blobs: BlobStore, job_id: str, attempt: int, folder: Path, names: Sequence[str]) -> Manifest:
     """Copy files into the store under the attempt. They do not count before the manifest is published."""
-    artifacts = [_store(blobs, f"jobs/{job_id}/{attempt}/{name}", folder / name) for name in names]
-    return {"attempt": attempt, "artifacts": artifacts}
+    stored = tuple(_store(blobs, artifact_key(job_id, attempt, name), folder / name) for name in names)
+    return Manifest(job_id, attempt, stored)
 
 
-def publish(blobs: BlobStore, job_id: str, manifest: Manifest) -> bool:
-    """Make the result stand. False when another attempt's stands already: a job has one result, ever."""
-    return blobs.put_if_absent(manifest_key(job_id), json.dumps(manifest, indent=1).encode())
+def publish(blobs: BlobStore, manifest: Manifest) -> bool:
+    """Make the result count. False when another attempt has published one already: a job has one result, ever."""
+    return blobs.put_if_absent(manifest_key(manifest.job_id), manifest.to_json())
 
 
 def discard(blobs: BlobStore, job_id: str, attempt: int) -> None:
-    """Drop what an attempt wrote that does not count."""
+    """Delete what an attempt wrote that does not count."""
     blobs.delete_prefix(f"jobs/{job_id}/{attempt}")
 
 
-def discard_others(blobs: BlobStore, job_id: str, manifest: Manifest) -> None:
-    """Drop what other attempts have left behind, now that they can no longer publish it."""
-    keep = {
-        manifest_key(job_id),
-        *(f"jobs/{job_id}/{manifest['attempt']}/{one['name']}" for one in manifest["artifacts"]),
-    }
-    for key in blobs.list(f"jobs/{job_id}"):
+def discard_others(blobs: BlobStore, manifest: Manifest) -> None:
+    """Delete what other attempts have left behind, now that they can no longer publish it."""
+    keep = set(manifest.keys())
+    for key in blobs.list(f"jobs/{manifest.job_id}"):
         if key not in keep:
             blobs.delete(key)
 
 
-def _store(blobs: BlobStore, key: str, path: Path) -> dict[str, Any]:
+def _store(blobs: BlobStore, key: str, path: Path) -> Artifact:
     digest = hashlib.sha256()
     with path.open("rb") as source, blobs.writer() as writer:
         while chunk := source.read(_CHUNK_BYTES):
             digest.update(chunk)
             writer.write(chunk)
         writer.commit(key)
-    return {
-        "name": path.name,
-        "bytes": path.stat().st_size,
-        "media_type": _MEDIA_TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream",
-        "sha256": digest.hexdigest(),
-    }
+    return Artifact(path.name, path.stat().st_size, digest.hexdigest())

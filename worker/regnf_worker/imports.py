@@ -14,10 +14,11 @@ from rq.timeouts import JobTimeoutException
 from regnf_core.errors import RegnfError
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
-from regnf_worker.problems import are_files_away, fault, new_incident, problem
+from regnf_worker.problems import are_files_away, fault, new_incident
 from regnf_worker.retry import retry_until_available
 
 _CLAIM_KEPT_S = 24 * 3600
@@ -51,11 +52,11 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except (RedisError, StorageUnavailableError):
         raise
     except RegnfError as error:
-        _refuse(context, sha256, attempt, problem(error.reason, str(error), hint=error.hint))
+        _refuse(context, sha256, attempt, problem_document(error.reason, str(error), hint=error.hint))
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
     except JobTimeoutException:
-        _refuse(context, sha256, attempt, problem("IMPORT_TIMEOUT"))
+        _refuse(context, sha256, attempt, problem_document("IMPORT_TIMEOUT"))
     except Exception as error:
         if are_files_away(error):
             raise

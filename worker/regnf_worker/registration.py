@@ -14,23 +14,17 @@ from redis.exceptions import RedisError
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.logs import log_context
+from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.ownership import sha256_of
+from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
-from regnf_worker.artifacts import (
-    Manifest,
-    discard,
-    discard_others,
-    publish,
-    read_manifest,
-    store_artifacts,
-    verdict_of,
-)
+from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
 from regnf_worker.fields import Fields, FieldsNotReadyError
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.models import ObjectModels
-from regnf_worker.problems import are_files_away, fault, new_incident, problem
+from regnf_worker.problems import are_files_away, fault, new_incident
 from regnf_worker.retry import retry_until_available
 
 logger = logging.getLogger(__name__)
@@ -68,7 +62,7 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
         except (RedisError, StorageUnavailableError):
             raise
         except RegnfError as error:
-            _fail(context, job_id, attempt, problem(error.reason, str(error), hint=error.hint))
+            _fail(context, job_id, attempt, problem_document(error.reason, str(error), hint=error.hint))
         except Exception as error:
             if are_files_away(error):
                 raise
@@ -76,8 +70,8 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
             logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
             _fail(context, job_id, attempt, fault(error, incident))
         else:
-            _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, job_id, manifest))
-            discard_others(context.blobs, job_id, manifest)
+            _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, manifest))
+            discard_others(context.blobs, manifest)
 
 
 def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:
@@ -125,7 +119,7 @@ def _work(
         heartbeat.confirm()
         manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)
     heartbeat.confirm()
-    if publish(context.blobs, record.id, manifest):
+    if publish(context.blobs, manifest):
         return manifest
     standing = read_manifest(context.blobs, record.id)
     assert standing is not None, "a manifest is never taken back while its job runs"

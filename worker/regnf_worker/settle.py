@@ -7,11 +7,12 @@ import signal
 from dataclasses import dataclass
 from typing import Any
 
+from regnf_state.manifest import read_manifest
+from regnf_state.problems import problem_document
 from regnf_state.records import ACTIVE, JobRecord, StaleAttemptError
-from regnf_worker.artifacts import discard, read_manifest, verdict_of
+from regnf_worker.artifacts import discard, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.imports import claim_import, reject
-from regnf_worker.problems import problem
 
 logger = logging.getLogger(__name__)
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
@@ -69,7 +70,7 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
     job_id, attempt = record.id, record.attempt
     manifest = read_manifest(context.blobs, job_id)
     if manifest is not None:
-        verdict = verdict_of(context.blobs, job_id, manifest)
+        verdict = verdict_of(context.blobs, manifest)
         context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
         return
     discard(context.blobs, job_id, attempt)
@@ -103,9 +104,9 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
         return
     logger.warning("import %s attempt %d: its process is gone (%s)", sha256, attempt, end)
     reason = end.reason()
-    reject(context, sha256, attempt, problem("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
+    reject(context, sha256, attempt, problem_document("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
 
 
 def _problem(end: ChildExit) -> dict[str, Any]:
     reason = end.reason()
-    return problem(reason, _DETAILS.get(reason))
+    return problem_document(reason, _DETAILS.get(reason))

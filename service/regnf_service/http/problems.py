@@ -18,9 +18,9 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
-from regnf_core.hints import HINTS
 from regnf_service.http.contract import allowed_methods
 from regnf_state.blobs.base import StorageFullError
+from regnf_state.problems import problem_document
 from regnf_state.reasons import REASONS
 from regnf_state.records import QueueFullError, QuotaError, RecordError
 
@@ -49,24 +49,15 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
         super().__init__(detail or entry.title)
         self.reason = reason
         self.status = entry.status
-        self.title = entry.title
         self.detail = detail or entry.meaning
         self.errors = list(errors)[:_MAX_ERRORS]
         self.headers = dict(headers or {})
-        self.hint = hint or HINTS.get(reason)
+        self.hint = hint
         self.extra = dict(extra or {})
 
     def document(self, instance: str | None = None, request_id: str | None = None) -> dict[str, Any]:
         """The problem object as it travels."""
-        document: dict[str, Any] = {
-            "type": f"/docs#{self.reason}",
-            "title": self.title,
-            "status": self.status,
-            "reason": self.reason,
-            "detail": self.detail,
-        }
-        if self.hint is not None:
-            document["hint"] = self.hint
+        document = problem_document(self.reason, self.detail, hint=self.hint)
         if instance is not None:
             document["instance"] = instance
         if request_id is not None:

@@ -10,7 +10,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from redis import Redis
 
@@ -19,8 +19,8 @@ from regnf_service.upkeep.lease import Lease, LeaseLostError, Term
 from regnf_service.upkeep.staleness import Staleness
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.problems import problem_document
 from regnf_state.queue import JobQueue
-from regnf_state.reasons import REASONS
 from regnf_state.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
 from regnf_state.redis.documents import PREFIX
 from regnf_state.settings import Settings
@@ -128,7 +128,7 @@ class Reaper:
             again = self._records.requeue_job(job.id, job.attempt)
             self._queue.enqueue_registration(again.id, again.attempt)
             return "requeued"
-        self._records.update_job(job.id, job.attempt, status="failed", error=_worker_lost())
+        self._records.update_job(job.id, job.attempt, status="failed", error=problem_document("WORKER_LOST"))
         return "failed"
 
     def _is_unheld(self, name: str, attempt: int) -> bool:
@@ -153,7 +153,9 @@ class Reaper:
             again = self._records.retry_import(field.sha256, field.attempt)
             self._queue.enqueue_import(again.sha256, again.attempt)
             return "requeued"
-        self._records.update_field(field.sha256, attempt=field.attempt, state="rejected", error=_worker_lost())
+        self._records.update_field(
+            field.sha256, attempt=field.attempt, state="rejected", error=problem_document("WORKER_LOST")
+        )
         if self._blobs is not None:
             self._blobs.delete_prefix(f"fields/{field.sha256}")
         return "failed"
@@ -177,15 +179,3 @@ def _note(
     if action is not None:
         actions[action].append(name)
         logger.warning("%s: %s", name, action)
-
-
-def _worker_lost() -> dict[str, Any]:
-    reason = "WORKER_LOST"
-    known = REASONS[reason]
-    return {
-        "type": f"/docs#{reason}",
-        "title": known.title,
-        "status": known.status,
-        "reason": reason,
-        "detail": known.meaning,
-    }

@@ -17,7 +17,7 @@ from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, 
 from regnf_service.http.schemas.common import whole_problem
 from regnf_service.http.schemas.results import ResultDocument
 from regnf_service.jobs.lookup import find_job
-from regnf_service.jobs.results import ARTIFACTS, Manifest, read_manifest, read_result
+from regnf_state.manifest import ARTIFACTS, Manifest, read_manifest, read_result
 from regnf_state.records import ACTIVE, JobRecord
 
 router = APIRouter(tags=["results"])
@@ -73,7 +73,7 @@ def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: Prefix
         raise Problem("JOB_EXPIRED") from error
     listed = [
         {"name": name, "bytes": entry.bytes, "sha256": entry.sha256, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
-        for name, entry in manifest.artifacts.items()
+        for name, entry in manifest.served().items()
     ]
     return JSONResponse(document | {"artifacts": listed}, headers={"Cache-Control": _CACHE})
 
@@ -120,9 +120,10 @@ async def get_artifact(
 ) -> Response:
     """The names are those of the result's `artifacts` list."""
     manifest = await in_thread(_manifest, services, id, caller)
-    if name not in manifest.artifacts:
+    artifact = manifest.served().get(name)
+    if artifact is None:
         raise Problem("ARTIFACT_NOT_FOUND")
-    size, etag = manifest.artifacts[name].bytes, f'"{manifest.artifacts[name].sha256[:32]}"'
+    size, etag = artifact.bytes, f'"{artifact.sha256[:32]}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": _CACHE}
     if held.matches(etag):
         return Response(status_code=304, headers=headers)
@@ -133,9 +134,9 @@ async def get_artifact(
     headers |= {"Content-Length": str(chosen.length), "Content-Disposition": f'attachment; filename="{name}"'}
     status = 200 if part is None else 206
     if request.method == "HEAD":
-        return Response(status_code=status, headers=headers, media_type=ARTIFACTS[name])
+        return Response(status_code=status, headers=headers, media_type=artifact.media_type)
     file = await in_thread(_open, services, manifest, name)
-    return StreamingResponse(_blocks(file, chosen), status_code=status, headers=headers, media_type=ARTIFACTS[name])
+    return StreamingResponse(_blocks(file, chosen), status_code=status, headers=headers, media_type=artifact.media_type)
 
 
 def _open(services: Services, manifest: Manifest, name: str) -> BinaryIO:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
 from regnf_core.labels import LABEL_PATTERN
+from regnf_state.problems import problem_document
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -64,5 +65,4 @@ def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:
 
 def whole_problem(error: dict[str, Any]) -> dict[str, Any]:
     """A stored problem with every member that a problem has."""
-    reason = str(error.get("reason", "INTERNAL"))
-    return {"type": f"/docs#{reason}", "title": reason, "status": 500, "reason": reason, "detail": ""} | error
+    return problem_document(str(error.get("reason", "INTERNAL"))) | error
