@@ -110,43 +110,44 @@ class RobustOptions:
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
     rotations: Annotated[int, Ge(24), Le(20_000)] = 600
-    """Rotations that the search starts from, evenly spread over all; with ``up_axis`` a tenth of them, about it.
-    More when a pose that a person sees was missed; the search takes longer in proportion."""
+    """Rotations that the search starts from, evenly spread over all orientations; with ``up_axis`` a tenth of them,
+    about it. Increase it when an obvious pose was missed; the search takes longer in proportion."""
     feature_draws: Annotated[int, Ge(0), Le(64)] = 4
-    """Feature matches (FPFH and RANSAC, scale-free) searched from as well when the first search ends in a rejection.
-    Each costs about a tenth of a second, and only then. More help in heavy clutter; with 0 the first search decides."""
+    """Feature matches (FPFH and RANSAC, at any scale) that a second search starts from, when the first one ends in a
+    rejection. Each takes about a tenth of a second. More help in heavy clutter; 0 turns the second search off."""
     scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
-    """Most samples of the scene's surface in the detection box. More when the object is small in its box."""
+    """Maximum number of samples of the scene's surface in the detection box. Increase it for an object that is small in
+    its box."""
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
-    """Most samples of the object's surface. More for thin parts."""
+    """Maximum number of samples of the object's surface. Increase it for thin parts."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
-    """Share (0..1) of the samples kept from the refinement, for the verdict. More for a surer verdict, at the cost of
-    the pose's accuracy."""
+    """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
+    reliable and the pose less accurate."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
-    """Largest residual, in size, of a sample on which both fields agree, object diameters.
-    More for coarse or noisy fields."""
+    """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
     min_inlier_share: _Ratio = 0.6
-    """Least share (0..1) of agreeing samples, in each direction; under it: LOW_OVERLAP. More is asked of accurate
-    fields. Less where the scene's copy of the object is damaged or covered."""
+    """Minimum share (0..1) of inliers, in each direction; below it: LOW_OVERLAP. Accurate fields need more. Decrease it
+    where the object in the scene is damaged or covered."""
     min_explained_share: _Ratio = 0.4
-    """Least share (0..1) of all that stands in the box that the object explains; under it: SCENE_UNEXPLAINED.
-    Less for boxes that hold other things too."""
+    """Minimum share (0..1) of the surface in the box that the object explains; below it: SCENE_UNEXPLAINED. Decrease it
+    for boxes that hold other objects too."""
     max_free_space_violations: _Ratio = 0.2
-    """Largest share (0..1) of the object's surface that lies in free space; above it: FREE_SPACE_VIOLATED. Less is
-    allowed of accurate fields. More where the scene's field lacks parts of the object."""
+    """Maximum share (0..1) of the object's surface in the scene's free space; above it: FREE_SPACE_VIOLATED. Accurate
+    fields are allowed less. Increase it where the scene's field lacks parts of the object."""
     max_occluded_share: _Ratio = 0.75
-    """Largest share (0..1) of the object's surface within the scene's matter; above it: TOO_LITTLE_SURFACE.
-    More for things of which hardly one side was seen."""
+    """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
+    Increase it for objects that were observed from one side only."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
-    """Poses whose score (0..1) is within this of the best one's, plus 0.15 times that one, explain the data as well:
-    all of them are listed. More to be told of near-twins too."""
+    """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
+    times the best score. Increase it to list less exact symmetry equivalents too."""
 
 
 @dataclass(frozen=True)
 class RegistrationOptions:
     """All options of one registration, grouped by stage.
 
-    ``robust`` steers the preset `robust`; the other groups steer the preset `paper`, with the published values.
+    The group ``robust`` is for the preset `robust`; the other groups are for the preset `paper`, with the published
+    values. Options of the other preset are ignored.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN

@@ -38,7 +38,7 @@ class IterationRecord:
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another pose that explains the data, e.g. a table's twin under its symmetry."""
+    """Another pose that matches the data equally well, for example a symmetry equivalent."""
 
     T_object_scene: Sim3
     score: float
@@ -47,10 +47,11 @@ class Alternative:
 
 @dataclass(frozen=True)
 class ObjectSymmetry:
-    """The turns that carry the object onto itself: how many there are, the identity included.
+    """The rotations that map the object onto itself. order: how many there are, the identity included.
 
-    axis: unit vector, object frame, that all of them turn about, if there is one; None for a box's three half turns.
-    With ``continuous`` every turn about the axis is one, and ``order`` counts the ends that look alike: 1 or 2.
+    axis: unit vector, object frame: the common axis of all of them; None where there is none, as for a box's three half
+    turns. With ``continuous`` every rotation about the axis is a symmetry, and ``order`` is 2 where the two ends of the
+    axis look alike, else 1.
     """
 
     order: int
@@ -60,7 +61,7 @@ class ObjectSymmetry:
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """The outcome of one registration. Transforms carry scene coordinates to object coordinates."""
+    """The outcome of one registration. Transforms map scene coordinates to object coordinates."""
 
     verdict: Verdict
     verdict_reason: str
@@ -78,11 +79,11 @@ class RegistrationResult:
     seed: int
     options: dict[str, Any]
     alternatives: list[Alternative] = field(default_factory=list)
-    """The preset `robust` lists every distinct pose that explains the data as well; empty unless ``ambiguous``."""
+    """The preset `robust` lists every distinct pose that matches the data equally well; empty unless ``ambiguous``."""
     covariance: Tensor | None = None
     """(7, 7) float64 of (omega_x, omega_y, omega_z, dt_x, dt_y, dt_z, d log s): a left perturbation of T_object_scene,
     s e^(d log s), exp(omega) R, t + dt; radians and object units. None from the preset `paper`."""
     symmetry: ObjectSymmetry | None = None
     """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
-    """The scene's surface round the detection, for viewers."""
+    """The scene's surface around the detection, for viewers."""

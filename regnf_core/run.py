@@ -27,7 +27,8 @@ class Run:
         self._progress = progress
 
     def report(self, phase: Phase, done: float) -> None:
-        """A second attempt begins at an earlier phase: the share done stands still until it is overtaken."""
+        """Report a phase and the overall share done (0..1). The share never falls: a second attempt repeats earlier
+        phases."""
         self._done = max(self._done, min(done, 1.0))
         if self._progress is not None:
             self._progress(phase, self._done)

@@ -1,16 +1,17 @@
-"""What each reason of a verdict means, in words. Torch-free: documents, command line and page all tell it from here."""
+"""What each reason of a verdict means, in words, for result documents, command line and page. Torch-free."""
 
 from __future__ import annotations
 
 VERDICT_REASONS: dict[str, str] = {
-    "SURFACES_AGREE": "Both surfaces agree, in both directions, on samples that the refinement has not seen.",
-    "SEVERAL_POSES_AGREE": "Several poses explain the data equally well: this one and the alternatives.",
-    "LOW_OVERLAP": "Too small a share of the two surfaces agrees.",
-    "LARGE_RESIDUAL": "The surfaces stay too far apart where they should coincide.",
-    "FREE_SPACE_VIOLATED": "Too much of the object would stand where the scene is free.",
-    "SURFACE_UNEXPLAINED": "Close to the object the scene has surface that is no part of it: a look-alike, or something"
-    " attached.",
-    "SCENE_UNEXPLAINED": "The object explains too little of what stands in the box.",
-    "TOO_LITTLE_SURFACE": "Too much of the object would lie within the scene's matter: too little is seen to judge by.",
+    "SURFACES_AGREE": "Object and scene match on held-out points.",
+    "SEVERAL_POSES_AGREE": "Several poses match the data equally well: this one and the alternatives.",
+    "LOW_OVERLAP": "Too small a share of the two surfaces matches.",
+    "LARGE_RESIDUAL": "The surfaces are too far apart where they should coincide.",
+    "FREE_SPACE_VIOLATED": "The object would occupy space that the scene shows as empty.",
+    "SURFACE_UNEXPLAINED": "Next to the object the scene has surface that does not belong to it: the object is a"
+    " similar one, or something is attached to it.",
+    "SCENE_UNEXPLAINED": "The object explains too little of the surface in the box.",
+    "TOO_LITTLE_SURFACE": "Too much of the object would be occluded or unobserved: the rest is too little to check the"
+    " pose.",
 }
 """By the stable UPPER_SNAKE word that results carry as ``verdict_reason``."""

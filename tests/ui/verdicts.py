@@ -11,7 +11,7 @@ from tests.ui.synthetic import Synthetic, rotation, sim3_document, similarity
 
 SIGMAS = [math.radians(0.4), math.radians(0.8), math.radians(0.2), 0.003, 0.001, 0.002, 0.005]
 ORDERING = ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
-DETAIL = "Several poses explain the data equally well: this one and the alternatives."
+DETAIL = "Several poses match the data equally well: this one and the alternatives."
 
 
 def ambiguous_result(data: Synthetic) -> dict[str, Any]:
