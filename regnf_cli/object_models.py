@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.library import ObjectModel, model_object, read_object_model, write_object_model
@@ -35,4 +36,4 @@ def object_model(path: Path, options: RobustOptions) -> ObjectModel:
 def _place(safe_field: Path) -> Path:
     with safe_field.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return default_cache_dir().parent / "object-models" / f"{digest}-1.safetensors"
+    return default_cache_dir().parent / "object-models" / f"{digest}-{ENGINE_REVISION}.safetensors"

@@ -3,7 +3,8 @@
 Keys in use:
     fields/{sha256}/original               the upload, until its import has ended
     fields/{sha256}/field.safetensors      the safe field that workers open
-    fields/{sha256}/object-model-1.safetensors   what registrations know of it as an object, made by the first of them
+    fields/{sha256}/object-model-{n}.safetensors   its model as an object by revision n of the engine; the first job
+                                           that needs the model makes it
     jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
     jobs/{id}/manifest.json                written last, atomically: the job's result is exactly what it lists
     journal/jobs/{id}/{attempt}-{event}    what was accepted and how it ended: see regnf_state.journal.journal

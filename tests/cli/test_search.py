@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from regnf_cli import object_models
 from regnf_cli.object_models import object_model
 from regnf_cli.report import show_ranking
 from regnf_cli.search import library_files
@@ -37,6 +38,17 @@ def test_the_right_chair_comes_first(run: Run, tmp_path: Path) -> None:
     written = json.loads((tmp_path / "out" / "result.json").read_text())
     assert (written["object"], len(written["candidates"])) == (document["object"], 2)
     assert len(list((tmp_path / "cache" / "regnf" / "object-models").iterdir())) == 2
+
+
+def test_a_model_of_an_older_engine_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "cache" / "regnf" / "object-models"
+    object_model(CHAIRS[0], RobustOptions())
+    (kept,) = folder.iterdir()
+    kept.write_bytes(b"of an older engine")
+    monkeypatch.setattr(object_models, "ENGINE_REVISION", object_models.ENGINE_REVISION + 1)
+    object_model(CHAIRS[0], RobustOptions())
+    assert kept.read_bytes() == b"of an older engine"
+    assert len(list(folder.iterdir())) == 2
 
 
 def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) -> None:

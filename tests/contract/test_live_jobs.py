@@ -10,6 +10,7 @@ from typing import Any
 import httpx
 import pytest
 
+from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_service.http.schemas.results import ResultDocument
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.test_openapi import validator
@@ -137,7 +138,7 @@ def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learned(
         field = client.get(f"/fields/{name}").json()
         validator("FieldDocument").validate(field)
         assert field["symmetry"]["order"] == 1
-        assert f"fields/{name}/object-model-1.safetensors" in live.files()
+        assert f"fields/{name}/object-model-{ENGINE_REVISION}.safetensors" in live.files()
     alone = finished(client, submit(client, fields, options={}, seed=5).json()["id"])
     assert client.get(alone["links"]["result"]).json()["object"] == fields["object"]
     assert client.delete(f"/fields/{sha256(data)}").status_code == 204

@@ -58,6 +58,18 @@ def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
     assert len(world.queue.registrations) == 1
 
 
+def test_a_label_and_a_score_make_no_other_job(world: World) -> None:
+    box = {"center": [0, 0.25, 0.5], "size": [1, 1, 1]}
+    first = post(world, detection=box | {"label": "chair", "score": 0.5}).json()
+    second = post(world, detection=box | {"label": "armchair", "score": 0.75})
+    assert second.json()["id"] == first["id"] == post(world, detection=box).json()["id"]
+    assert world.queue.registrations == [(first["id"], 1)]
+    record = world.records.get_job(first["id"])
+    assert record is not None
+    kept = record.request["detection"]
+    assert (kept["label"], kept["score"]) == ("chair", 0.5)
+
+
 def test_two_spellings_of_one_start_are_one_job(world: World) -> None:
     turned = [[0, -2, 0, 0.5], [2, 0, 0, 0], [0, 0, 2, -1], [0, 0, 0, 1]]
     half = 0.5**0.5
@@ -149,13 +161,13 @@ def test_candidates_are_in_use_while_the_job_is_active(world: World) -> None:
         assert world.client.delete(f"/fields/{sha}").status_code == 204
 
 
-def test_what_differs_in_anything_is_another_job(world: World) -> None:
+def test_what_may_change_the_result_is_another_job(world: World) -> None:
     truth = {"T_object_scene": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]}
     changes: list[dict[str, Any]] = [
         {},
         {"seed": 1},
         {"options": {"sampling": {"views": 6}}},
-        {"detection": BOX | {"label": "chair"}},
+        {"detection": BOX | {"max": [0.1, 0.3, 0.4]}},
         {"ground_truth": truth},
         {"initial_transform": truth["T_object_scene"]},
         {"scene": world.valid_request()["object"]},

@@ -18,6 +18,7 @@ from regnf_service.http.problems import Problem, json_pointer
 from regnf_service.http.ranges import ByteRange, parse_range
 from regnf_service.http.routes.registrations import preferred_wait
 from regnf_service.http.strict_json import parse_json
+from regnf_service.jobs import canonical
 from regnf_service.jobs.canonical import digest, job_id_of
 from regnf_state.reasons import REASONS
 
@@ -155,8 +156,22 @@ def test_job_ids_depend_on_everything_and_on_nothing_else() -> None:
     assert job_id_of(request) == job_id_of(shuffled)
     assert len({job_id_of(request | {"seed": seed}) for seed in range(20)}) == 20
     assert len(job_id_of(request)) == 32
+    noted = request["detection"] | {"label": "another", "score": 0.5}
+    assert job_id_of(request | {"detection": noted}) == job_id_of(request)
+    assert job_id_of(request | {"detection": noted | {"center": [0.0, 1.0, 3.0]}}) != job_id_of(request)
     # printf '{"a":[1.5,"x"]}' | sha256sum
     assert digest({"a": [1.5, "x"]}) == hashlib.sha256(b'{"a":[1.5,"x"]}').hexdigest()
+
+
+def test_another_revision_of_the_engine_gives_other_jobs_and_another_version_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    request = {"scene": "a", "seed": 0, "detection": {"center": [0.0, 1.0, 2.0]}}
+    known = job_id_of(request)
+    monkeypatch.setattr(canonical, "__version__", "99.0", raising=False)
+    assert job_id_of(request) == known
+    monkeypatch.setattr(canonical, "ENGINE_REVISION", canonical.ENGINE_REVISION + 1)
+    assert job_id_of(request) != known
 
 
 def test_every_reason_is_an_error_with_a_sentence() -> None:

@@ -15,6 +15,7 @@ from regnf_core.options import RegistrationOptions
 from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
+from regnf_worker import models
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate
 from regnf_worker.models import model_key
@@ -123,6 +124,14 @@ def test_a_damaged_model_is_made_again_and_replaced(context: Context) -> None:
     assert (engine.made, engine.registered) == ([b"chair"], [b"model of chair"])
     with context.blobs.open(model_key(CHAIR)) as file:
         assert file.read() == b"model of chair"
+
+
+def test_a_model_of_an_older_engine_is_left_alone(context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = ModelEngine()
+    context.blobs.put(model_key(CHAIR), b"model of an older engine")
+    monkeypatch.setattr(models, "ENGINE_REVISION", models.ENGINE_REVISION + 1)
+    assert run(context, engine, "j1", object=CHAIR).status == "successful"
+    assert engine.registered == [b"model of chair"]
 
 
 def test_the_published_method_needs_no_model(context: Context) -> None:

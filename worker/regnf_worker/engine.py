@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from regnf_core import __version__
+from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.importing.gate.gate import ImportLimits, import_field
 from regnf_core.options import RegistrationOptions
 
@@ -81,7 +82,7 @@ class CoreEngine:
         return cls(("cuda" if torch.cuda.is_available() else "cpu") if choice == "auto" else choice)
 
     def describe(self) -> dict[str, Any]:
-        return {"version": __version__, "device": self.device}
+        return {"version": __version__, "revision": ENGINE_REVISION, "device": self.device}
 
     def register(
         self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path

@@ -10,6 +10,7 @@ from typing import Any
 
 from redis.exceptions import RedisError
 
+from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import RegnfError
 from regnf_core.options import RegistrationOptions
 from regnf_state.records import FieldRecord, StaleAttemptError
@@ -20,8 +21,8 @@ logger = logging.getLogger(__name__)
 
 
 def model_key(sha256: str) -> str:
-    """Where an object's model lies."""
-    return f"fields/{sha256}/object-model-1.safetensors"
+    """Where an object's model lies: another revision of the engine does not find it, and makes its own."""
+    return f"fields/{sha256}/object-model-{ENGINE_REVISION}.safetensors"
 
 
 class ObjectModels:

@@ -1,6 +1,6 @@
 """The one form of each registration request, and the job id that follows from it.
 
-Two requests that ask for the same thing have the same canonical form, hence the same job: asking twice costs nothing.
+Two requests whose results are the same are one job: asking twice costs nothing.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from regnf_core import __version__
+from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_service.http.schemas.registrations import Question
 from regnf_service.http.schemas.transforms import rows_of
 
 _ID_DIGITS = 32
+_WITHOUT_EFFECT = frozenset({"label", "score"})
+"""Members of a detection that no result depends on."""
 
 
 def canonical_request(
@@ -47,5 +49,9 @@ def digest(value: Any) -> str:
 
 
 def job_id_of(request: dict[str, Any]) -> str:
-    """The job's id: another engine may answer differently, so its version is part of the question."""
-    return digest({"kind": "registration", "engine": __version__, "request": request})[:_ID_DIGITS]
+    """The job's id: a digest of what the result depends on, the engine's revision included.
+
+    The detection's label and score change nothing in a result, so they do not enter.
+    """
+    asked = request | {"detection": {k: v for k, v in request["detection"].items() if k not in _WITHOUT_EFFECT}}
+    return digest({"kind": "registration", "engine": ENGINE_REVISION, "request": asked})[:_ID_DIGITS]

@@ -50,7 +50,9 @@ class JobDocument(Outgoing):
         description="scene, object or the number of candidates, detection, seed, initial_transform, and the SHA-256 of "
         "the full options."
     )
-    engine: dict[str, Any] = Field({}, description="Version and device.")
+    engine: dict[str, Any] = Field(
+        {}, description="Version, revision and device. The revision grows with changed results."
+    )
     verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     webhook: WebhookDocument | None = None
