@@ -1,6 +1,6 @@
 """Euler angles as the paper learns and reports them: roll, pitch, yaw about the fixed axes x, y, z, in that order.
 
-They have a wall at pitch +-pi/2; the preset ``paper`` lives with it because the published method does.
+They are singular at pitch +-pi/2 (gimbal lock); the preset ``paper`` uses them because the published method does.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ def rotation_from_euler(angles: Tensor) -> Tensor:
 
 
 def euler_from_rotation(R: Tensor) -> Tensor:
-    """(roll, pitch, yaw) (..., 3) in radians, pitch within +-pi/2. At the wall, roll is set to zero."""
+    """(roll, pitch, yaw) (..., 3) in radians, pitch within +-pi/2. Where they are singular, roll is zero."""
     cosine = torch.hypot(R[..., 2, 1], R[..., 2, 2])
     pitch = torch.atan2(-R[..., 2, 0], cosine)
-    wall = cosine < 1e-9
-    roll = torch.where(wall, torch.zeros_like(pitch), torch.atan2(R[..., 2, 1], R[..., 2, 2]))
-    yaw = torch.where(wall, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
+    singular = cosine < 1e-9
+    roll = torch.where(singular, torch.zeros_like(pitch), torch.atan2(R[..., 2, 1], R[..., 2, 2]))
+    yaw = torch.where(singular, torch.atan2(-R[..., 0, 1], R[..., 1, 1]), torch.atan2(R[..., 1, 0], R[..., 0, 0]))
     return torch.stack([roll, pitch, yaw], dim=-1)

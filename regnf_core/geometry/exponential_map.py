@@ -1,7 +1,7 @@
 """The exponential and logarithm of Sim(3): plain batched formulas on tensors.
 
-Seven numbers of a pose always stand in one order: rotation vector omega (3, radians), translation part (3), log scale
-sigma (1). The covariance of a result has this order too.
+The seven numbers of a pose have one order everywhere: rotation vector omega (3, radians), translation part (3), log
+scale sigma (1). The covariance of a result has this order too.
 
 The tangent (omega, rho, sigma) stands for the 4x4 matrix [[skew(omega) + sigma I, rho], [0, 0]]. Its exponential has
 scale exp(sigma), rotation exp(skew(omega)) and translation W rho with

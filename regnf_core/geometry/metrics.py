@@ -1,8 +1,7 @@
 """Errors of an estimated T_object_scene against the true one.
 
-The first three are the paper's (and nerf2nerf's); the others say what they cannot: a rotation error that does not
-depend on the choice of angles, and distances between true and estimated surface points, the least of them over the
-declared symmetries.
+The first three are the paper's (and nerf2nerf's). The others add a rotation error that does not depend on the choice of
+angles, and distances between true and estimated surface points, the smallest over the declared symmetries.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ def scale_error(estimate: Sim3, truth: Sim3) -> float:
 
 
 def rotation_error(estimate: Sim3, truth: Sim3, symmetries: Symmetries | None = None) -> float:
-    """The angle, radians, of the turn between estimate and truth; the least over the symmetries."""
+    """Angle, radians, of the rotation between estimate and truth; the smallest over the symmetries."""
     S = (symmetries or Symmetries()).transforms()
     difference = Sim3(torch.ones_like(S.scale), estimate.rotation @ (S.rotation @ truth.rotation).mT, S.translation)
     return float(difference.log()[:, :3].norm(dim=-1).min())

@@ -1,4 +1,4 @@
-"""Whether plain numbers are a similarity transform. Torch-free: asked before the work begins."""
+"""Whether plain numbers are a similarity transform. Torch-free: checked before the work begins."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from typing import Any
 
 TOLERANCE = 1e-4
 """Largest Frobenius norm of M^T M / s^2 - I. ``Sim3.from_matrix`` accepts whatever passes here."""
-_LEAST_SCALE = 1e-6
-_LARGEST = 1e9
+_MIN_SCALE = 1e-6
+_MAX_NUMBER = 1e9
 
 
 def similarity_fault(rows: Any) -> str | None:
-    """What keeps a row-major 4x4 from being x -> s R x + t with s > 0 and R a rotation; None when nothing does."""
+    """Why a row-major 4x4 is not x -> s R x + t with s > 0 and R a rotation; None when it is."""
     if not _is_four_by_four(rows):
         return "not four rows of four numbers"
-    if not all(abs(number) <= _LARGEST for row in rows for number in row):
-        return "a number is not finite, or beyond all reason"
+    if not all(abs(number) <= _MAX_NUMBER for row in rows for number in row):
+        return f"a number is not finite, or larger than {_MAX_NUMBER:g}"
     if list(rows[3]) != [0, 0, 0, 1]:
         return "the last row is not 0 0 0 1"
     x, y, z = ([float(row[column]) for row in rows[:3]] for column in range(3))
     squared = (_dot(x, x) + _dot(y, y) + _dot(z, z)) / 3
-    if squared < _LEAST_SCALE**2:
+    if squared < _MIN_SCALE**2:
         return "the scale vanishes"
     lengths = sum((_dot(axis, axis) / squared - 1) ** 2 for axis in (x, y, z))
     angles = sum((_dot(a, b) / squared) ** 2 for a, b in ((x, y), (y, z), (z, x)))

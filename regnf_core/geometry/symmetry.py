@@ -1,4 +1,4 @@
-"""An object's declared symmetries, in the manner of BOP: turns that nobody could tell apart by its shape."""
+"""An object's declared symmetries, in the form of the BOP benchmark: rotations that leave its shape unchanged."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from regnf_core.options import InitializationOptions
 from regnf_core.surface.feature_matching import DescribedCloud, MatchingOptions, describe, match, without_warnings
 
 _FEATURE_RADIUS_VOXELS = 5.0
-_MIN_VOXELS = 10  # a cloud with fewer has no shape to speak of
+_MIN_VOXELS = 10  # a cloud with fewer points has too little shape for features
 _SEED_STRIDE = 7919  # between the draws of one seed, so that neighboring seeds share none
 
 

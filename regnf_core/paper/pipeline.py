@@ -16,7 +16,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, RegistrationOptions
 from regnf_core.paper.initialization import initial_transform
-from regnf_core.paper.optimization import refine
+from regnf_core.paper.optimization import Refinement, refine
 from regnf_core.paper.sampling import in_detection, sample_object, sample_scene
 from regnf_core.paper.verification import Verification, verify
 from regnf_core.result import IterationRecord, RegistrationResult
@@ -72,25 +72,8 @@ def register_paper(
     with run.phase("verifying"):
         verification = _verify(scene, obj, detection, surfaces, refined.T_object_scene, options)
 
-    return RegistrationResult(
-        verdict=verification.verdict,
-        verdict_reason=verification.reason,
-        T_object_scene=refined.T_object_scene,
-        T_object_scene_initial=T_initial,
-        scene_samples=surfaces.scene,
-        object_samples=surfaces.object,
-        metrics={
-            **verification.metrics,
-            "object_diameter": surfaces.object_diameter,
-            "iterations": float(len(refined.trace)),
-            "converged": float(refined.converged),
-            "field_evaluations": float(scene.evaluations + obj.evaluations),
-        },
-        trace=refined.trace,
-        residuals={},
-        seed=seed,
-        options=options.to_dict(),
-    )
+    evaluations = scene.evaluations + obj.evaluations
+    return _result(surfaces, T_initial, refined, verification, options, seed, evaluations)
 
 
 def cloud_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:
@@ -119,6 +102,36 @@ def _verify(
 ) -> Verification:
     bounds, size = surfaces.object_bounds, surfaces.object_diameter
     return verify(scene, obj, detection, bounds, T_object_scene, options.sampling, size, _up_axis(options))
+
+
+def _result(
+    surfaces: _Surfaces,
+    T_initial: Sim3,
+    refined: Refinement,
+    verification: Verification,
+    options: RegistrationOptions,
+    seed: int,
+    evaluations: int,
+) -> RegistrationResult:
+    return RegistrationResult(
+        verdict=verification.verdict,
+        verdict_reason=verification.reason,
+        T_object_scene=refined.T_object_scene,
+        T_object_scene_initial=T_initial,
+        scene_samples=surfaces.scene,
+        object_samples=surfaces.object,
+        metrics={
+            **verification.metrics,
+            "object_diameter": surfaces.object_diameter,
+            "iterations": float(len(refined.trace)),
+            "converged": float(refined.converged),
+            "field_evaluations": float(evaluations),
+        },
+        trace=refined.trace,
+        residuals={},
+        seed=seed,
+        options=options.to_dict(),
+    )
 
 
 def _up_axis(options: RegistrationOptions) -> Axis:

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: new samples near both surfaces, found by shaking the old ones."""
+"""Algorithm 1 of the paper: new samples near both surfaces, by random shifts of the old ones."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def resample(
     options: ResamplingOptions,
     generator: torch.Generator,
 ) -> SampleSet:
-    """The old samples and those shaken ones that Algorithm 1 accepts, thinned at random to ``max_samples``.
+    """The old samples and the shifted ones that Algorithm 1 accepts, at random at most ``max_samples`` of them.
 
-    The conditions, cheapest first, so that the fields are asked only where it matters:
+    The conditions, cheapest first, so that the fields are evaluated at few points:
     distance to the old samples >= rho / 10, |S_own(x)| <= omega_1, |S_other(T x)| <= omega_2, r(x) <= xi.
     """
     rho = options.radius_fraction * field_radius(own)

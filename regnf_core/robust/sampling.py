@@ -20,7 +20,7 @@ from regnf_core.robust.samples import Samples
 from regnf_core.robust.working_frame import WorkingField, WorkingFrame
 from regnf_core.surface.projection import project_to_surface
 from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
-from regnf_core.surface.surface_cells import Cells, surface_cells, tighten
+from regnf_core.surface.surface_cells import Cells, crop_to_surface, surface_cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +42,10 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     rough = _box_frame(low, high)
     field = WorkingField(obj, rough)
     low, high = rough.into(low).double(), rough.into(high).double()
-    inner = tighten(field.value, low, high, SAMPLING.object_base)
+    inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
     cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
     found = _samples_near(field, cells, limit, generator)
-    found = found[space.sees(found.points, found.normals)]
+    found = found[space.faces_outside(found.points, found.normals)]
     inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
     found = found[inside]
     require_object_surface(len(found))
@@ -78,7 +78,7 @@ def sample_scene_surface(
     cells = Cells(cells.centers @ rotation.T, cells.values, cells.edge)
     found = _samples_near(field, cells, limit, generator)
     axes = rotation.to(found.points)
-    found = found[space.sees(found.points @ axes, found.normals @ axes)]
+    found = found[space.faces_outside(found.points @ axes, found.normals @ axes)]
     bounds = frame.into(scene.bounds)
     found = found[((found.points >= bounds[0]) & (found.points <= bounds[1])).all(-1)]
     require_scene_surface(len(found))

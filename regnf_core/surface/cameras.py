@@ -28,7 +28,7 @@ def axis_vector(axis: str) -> Tensor:
 
 
 def camera_positions(center: Tensor, distance: float, views: int, up_axis: str, turn: float = 0.0) -> Tensor:
-    """(views, 3) positions on the upper half of a sphere round ``center`` (3,), spread by the golden angle.
+    """(views, 3) positions on the upper half of a sphere around ``center`` (3,), spread by the golden angle.
 
     Heights run from near the pole to near the horizon in equal steps, which gives every camera the same area of the
     half sphere. ``turn`` (radians) rotates all of them about the vertical: another turn, other views.
@@ -49,7 +49,7 @@ def cast_rays(positions: Tensor, target: Tensor, corners: Tensor, image_size: in
     """The rays of square images at ``positions`` (V, 3) that look at ``target`` (3,).
 
     Every ``pixel_stride``-th pixel along both axes of an ``image_size`` image, as the paper does. The field of view is
-    the narrowest square one that holds all ``corners`` (8, 3), so that no ray budget is spent on the room around.
+    the narrowest square one that holds all ``corners`` (8, 3), so that no rays are spent on the rest of the room.
     """
     per_edge = max(1, image_size // pixel_stride)
     grid = (torch.arange(per_edge, dtype=torch.float64) + 0.5) / per_edge * 2.0 - 1.0  # pixel centers in (-1, 1)

@@ -28,7 +28,7 @@ Progress = Callable[[int], None]
 def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Progress | None = None) -> int:
     """The field's surface as .glb or .ply (by the suffix), own frame and unit; returns how many triangles it has.
 
-    resolution: cells along the longest edge of the bounds. Whole or not at all. Raises NoSurfaceError and
+    resolution: cells along the longest edge of the bounds. The file is written atomically. Raises NoSurfaceError and
     InvalidInputError (INVALID_OPTIONS, FIELD_NOT_FINITE).
     """
     kind = path.suffix.lower().removeprefix(".")
@@ -60,7 +60,7 @@ def write_grid(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     for start in range(0, shape[0], slab):
         rows = np.arange(start, min(start + slab, shape[0]))
         nodes = np.stack(np.meshgrid(rows, *map(np.arange, shape[1:]), indexing="ij"), axis=-1).reshape(-1, 3)
-        distance = field.signed_distance(torch.from_numpy(lattice.places(nodes)).float())
+        distance = field.signed_distance(torch.from_numpy(lattice.points_of(nodes)).float())
         values[rows] = distance.cpu().numpy().reshape(len(rows), *shape[1:])
         if progress is not None:
             progress(values[: rows[-1] + 1].size)

@@ -1,4 +1,4 @@
-"""Which surface can be seen from outside: fields learned from images have cavities inside matter that mean nothing."""
+"""Which surface faces the outside. Fields learned from images have cavities inside matter that do not exist."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _STEP = 1.5  # cells along the normal: beyond the surface's own cell, short of t
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """A grid of cubic cells: which are free. low: (3,) its lowest corner · edge · free: (X, Y, Z) bool."""
+    """Which cells of a cubic grid are free. low: (3,) lowest corner · edge: of a cell · free: (X, Y, Z) bool."""
 
     low: Tensor
     edge: float
@@ -27,12 +27,12 @@ class FreeSpace:
         cells = (first[:, None] + offsets).reshape(-1, 3)
         self.free[cells[:, 0], cells[:, 1], cells[:, 2]] = True
 
-    def sees(self, points: Tensor, normals: Tensor) -> Tensor:
-        """(N,) bool: which surface points (N, 3) face free space that reaches the grid's border.
+    def faces_outside(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(N,) bool: which surface points (N, 3) face free space that is connected to the grid's border.
 
-        All of them where no free space does.
+        True for all points when no free space reaches the border.
         """
-        outer = self._reaching_the_border()
+        outer = self._connected_to_border()
         if not outer.any():
             return torch.ones(points.shape[0], dtype=torch.bool)
         ahead = points.double() + _STEP * self.edge * normals.double()
@@ -42,7 +42,7 @@ class FreeSpace:
         cell = torch.minimum(cell.clamp_min(0), size - 1)
         return beyond | torch.from_numpy(outer)[cell[:, 0], cell[:, 1], cell[:, 2]]
 
-    def _reaching_the_border(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def _connected_to_border(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Free cells connected to the border, and the cells beside them."""
         labels, count = ndimage.label(self.free.numpy())
         border = np.zeros(count + 1, dtype=bool)

@@ -1,7 +1,8 @@
 """The zero level of a field as a triangle mesh: marching cubes on the cells that the surface may pass through.
 
-The region is halved again and again, and blocks too far from the surface for their size are dropped; from the cells
-that are left the surface is followed to where it leads. So the field is asked for little more than these cells.
+Blocks of cells are halved level by level, and those too far from the surface for their size are dropped. From the
+cells that remain, the surface is followed into their neighbors. So the field is evaluated at few more places than the
+corners of these cells.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Progress = Callable[[int], None]
 """Called with the number of points evaluated so far."""
 
 MAX_RESOLUTION = 1024
-_COARSEST = 32
+_COARSEST_BLOCK = 32
 _PROBES = 4096
 _CORNERS: Ints = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])
 _FACES = [
@@ -49,7 +50,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Nodes at low + step (i, j, k), 0 <= i < counts: cubes that cover a box."""
+    """Nodes at low + step (i, j, k), 0 <= i < counts: cubic cells that cover a box. low: (3,) · counts: (3,)."""
 
     low: Floats
     step: float
@@ -64,10 +65,10 @@ class Lattice:
         step = float((high - low).max()) / resolution
         return cls(low, step, np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1)
 
-    def places(self, nodes: Ints | Floats) -> Floats:
-        """(N, 3) where nodes (N, 3) are; halves are allowed."""
-        places: Floats = self.low + self.step * nodes
-        return places
+    def points_of(self, nodes: Ints | Floats) -> Floats:
+        """The points (N, 3) of nodes (N, 3), given by their indices; fractions are allowed."""
+        points: Floats = self.low + self.step * nodes
+        return points
 
 
 def extract_surface(field: SdfField, resolution: int = 128, progress: Progress | None = None) -> Surface:
@@ -76,38 +77,37 @@ def extract_surface(field: SdfField, resolution: int = 128, progress: Progress |
     Raises NoSurfaceError where there is none, and InvalidInputError (FIELD_NOT_FINITE).
     """
     lattice = Lattice.over(field, resolution)
-    asked = _Asker(field, progress)
-    cells = _blocks_at_surface(asked, lattice, asked.steepness(lattice))
-    vertices, faces = _marched(_followed(asked, lattice, cells))
+    evaluator = _Evaluator(field, progress)
+    cells = _cells_near_surface(evaluator, lattice, evaluator.steepness(lattice))
+    vertices, faces = _marching_cubes(_follow_surface(evaluator, lattice, cells))
     if len(faces) == 0:
         raise NoSurfaceError("the field has no surface within its bounds", reason="NO_SURFACE_IN_OBJECT")
-    return _outward(asked, vertices, faces)
+    return _oriented(evaluator, vertices, faces)
 
 
-class _Asker:
-    """Evaluates the field and counts."""
+class _Evaluator:
+    """Evaluates the field, and reports how many points it has evaluated."""
 
     def __init__(self, field: SdfField, progress: Progress | None) -> None:
         self._field = field
         self._progress = progress
         self._points = 0
 
-    def distances(self, places: Floats) -> Floats:
-        """(N,) signed distances. Raises InvalidInputError (FIELD_NOT_FINITE)."""
+    def distances(self, points: Floats) -> Floats:
+        """(N,) signed distances at points (N, 3). Raises InvalidInputError (FIELD_NOT_FINITE)."""
         found = [np.zeros(0)]
-        for start in range(0, len(places), _CHUNK):
-            points = torch.from_numpy(places[start : start + _CHUNK]).float()
-            found.append(self._field.signed_distance(points).double().cpu().numpy())
-            self._count(len(points))
+        for start in range(0, len(points), _CHUNK):
+            chunk = torch.from_numpy(points[start : start + _CHUNK]).float()
+            found.append(self._field.signed_distance(chunk).double().cpu().numpy())
+            self._count(len(chunk))
         values: Floats = np.concatenate(found)
         if not np.isfinite(values).all():
             raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
         return values
 
-    def normals(self, places: Floats) -> Floats:
-        """(N, 3) unit gradients."""
-        points = torch.from_numpy(places).float()
-        gradient = self._field.signed_distance_and_gradient(points)[1].double().cpu().numpy()
+    def normals(self, points: Floats) -> Floats:
+        """(N, 3) unit gradients at points (N, 3)."""
+        gradient = self._field.signed_distance_and_gradient(torch.from_numpy(points).float())[1].double().cpu().numpy()
         self._count(len(points))
         normals: Floats = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
         return normals
@@ -115,7 +115,7 @@ class _Asker:
     def steepness(self, lattice: Lattice) -> float:
         """How much faster than a distance the field may change, from the gradient at random places; at least 1."""
         nodes = np.random.default_rng(0).random((_PROBES, 3)) * (lattice.counts - 1)
-        points = torch.from_numpy(lattice.places(nodes)).float()
+        points = torch.from_numpy(lattice.points_of(nodes)).float()
         gradient = self._field.signed_distance_and_gradient(points)[1]
         self._count(_PROBES)
         return max(1.0, float(gradient.norm(dim=1).max()))
@@ -126,15 +126,15 @@ class _Asker:
             self._progress(self._points)
 
 
-def _blocks_at_surface(asked: _Asker, lattice: Lattice, steepness: float) -> Ints:
+def _cells_near_surface(evaluator: _Evaluator, lattice: Lattice, steepness: float) -> Ints:
     """(C, 3) lowest nodes of the cells that the surface may pass through."""
     cells = lattice.counts - 1
-    size = _COARSEST
+    size = _COARSEST_BLOCK
     per_axis = [np.arange(0, n, size) for n in cells]
     blocks = np.stack(np.meshgrid(*per_axis, indexing="ij"), axis=-1).reshape(-1, 3)
     while size > 1:
         reach = steepness * lattice.step * size * 3**0.5 / 2.0
-        near = np.abs(asked.distances(lattice.places(blocks + size / 2.0))) <= reach
+        near = np.abs(evaluator.distances(lattice.points_of(blocks + size / 2.0))) <= reach
         size //= 2
         blocks = (blocks[near, None] + size * _CORNERS).reshape(-1, 3)
         blocks = blocks[(blocks < cells).all(axis=1)]
@@ -143,26 +143,26 @@ def _blocks_at_surface(asked: _Asker, lattice: Lattice, steepness: float) -> Int
 
 @dataclass(frozen=True)
 class _Crossed:
-    """The cells (C, 8) that the surface passes through, as indices of nodes with places (N, 3) and distances (N,)."""
+    """The cells (C, 8) that the surface passes through, as indices of nodes with points (N, 3) and distances (N,)."""
 
     corners: Ints
-    places: Floats
+    points: Floats
     distances: Floats
 
 
-def _followed(asked: _Asker, lattice: Lattice, cells: Ints) -> _Crossed:
-    """Follow the surface from cell to cell, into those too that were not suspected of it."""
-    numbers, values = np.zeros(0, np.int64), np.zeros(0)
+def _follow_surface(evaluator: _Evaluator, lattice: Lattice, cells: Ints) -> _Crossed:
+    """Follow the surface from cell to cell, also into cells that were dropped before."""
+    flat, values = np.zeros(0, np.int64), np.zeros(0)
     seen = np.zeros(0, np.int64)
     crossed = [np.zeros((0, 8), np.int64)]
     while len(cells):
-        seen = np.union1d(seen, _number(lattice, cells))
-        corners = _number(lattice, cells[:, None] + _CORNERS)
-        new = np.setdiff1d(corners, numbers)
-        order = np.argsort(np.concatenate((numbers, new)))
-        values = np.concatenate((values, asked.distances(lattice.places(_nodes(lattice, new)))))[order]
-        numbers = np.concatenate((numbers, new))[order]
-        inside = values[np.searchsorted(numbers, corners)] < 0
+        seen = np.union1d(seen, _flat_index(lattice, cells))
+        corners = _flat_index(lattice, cells[:, None] + _CORNERS)
+        new = np.setdiff1d(corners, flat)
+        order = np.argsort(np.concatenate((flat, new)))
+        values = np.concatenate((values, evaluator.distances(lattice.points_of(_unflattened(lattice, new)))))[order]
+        flat = np.concatenate((flat, new))[order]
+        inside = values[np.searchsorted(flat, corners)] < 0
         crossed.append(corners[inside.any(axis=1) & ~inside.all(axis=1)])
         found = [np.zeros((0, 3), np.int64)]
         for step, face in _FACES:
@@ -170,33 +170,33 @@ def _followed(asked: _Asker, lattice: Lattice, cells: Ints) -> _Crossed:
             found.append(cells[through] + step)
         beyond = np.unique(np.concatenate(found), axis=0)
         beyond = beyond[((beyond >= 0) & (beyond < lattice.counts - 1)).all(axis=1)]
-        cells = beyond[~np.isin(_number(lattice, beyond), seen)]
+        cells = beyond[~np.isin(_flat_index(lattice, beyond), seen)]
     kept, corners = np.unique(np.concatenate(crossed), return_inverse=True)
-    at = np.searchsorted(numbers, kept)
-    return _Crossed(corners.reshape(-1, 8), lattice.places(_nodes(lattice, kept)), values[at])
+    at = np.searchsorted(flat, kept)
+    return _Crossed(corners.reshape(-1, 8), lattice.points_of(_unflattened(lattice, kept)), values[at])
 
 
-def _number(lattice: Lattice, nodes: Ints) -> Ints:
-    numbers: Ints = nodes @ np.array([lattice.counts[1] * lattice.counts[2], lattice.counts[2], 1])
-    return numbers
+def _flat_index(lattice: Lattice, nodes: Ints) -> Ints:
+    flat: Ints = nodes @ np.array([lattice.counts[1] * lattice.counts[2], lattice.counts[2], 1])
+    return flat
 
 
-def _nodes(lattice: Lattice, numbers: Ints) -> Ints:
-    return np.stack(np.unravel_index(numbers, tuple(lattice.counts)), axis=1)
+def _unflattened(lattice: Lattice, flat: Ints) -> Ints:
+    return np.stack(np.unravel_index(flat, tuple(lattice.counts)), axis=1)
 
 
-def _marched(crossed: _Crossed) -> tuple[Floats, Ints]:
+def _marching_cubes(crossed: _Crossed) -> tuple[Floats, Ints]:
     if len(crossed.corners) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # a node exactly on the surface would be on either side of it, here and there
+    # a node exactly on the surface would count as inside for one cell and as outside for the next
     distances = np.where(crossed.distances == 0.0, np.finfo(np.float64).tiny, crossed.distances)
-    found = igl.marching_cubes(distances, crossed.places, np.ascontiguousarray(crossed.corners, np.int64))
+    found = igl.marching_cubes(distances, crossed.points, np.ascontiguousarray(crossed.corners, np.int64))
     return found[0], found[1]
 
 
-def _outward(asked: _Asker, vertices: Floats, faces: Ints) -> Surface:
-    """With normals, and faces turned so that they agree with them."""
-    normals = asked.normals(vertices)
+def _oriented(evaluator: _Evaluator, vertices: Floats, faces: Ints) -> Surface:
+    """The surface with normals; all faces are reversed when most of them disagree with the normals."""
+    normals = evaluator.normals(vertices)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     along = (np.cross(b - a, c - a) * normals[faces].sum(axis=1)).sum(axis=1)
     return Surface(vertices, faces[:, ::-1].copy() if along.sum() < 0 else faces, normals)

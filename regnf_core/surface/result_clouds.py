@@ -1,4 +1,4 @@
-"""The point clouds of a result, for pictures and viewers: dense where the object is, coarse round it."""
+"""The point clouds of a result, for pictures and viewers: dense on the object, coarse around it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from regnf_core.surface.field_residuals import object_residuals, scene_residuals
 from regnf_core.surface.scene_surroundings import sample_surroundings
 from regnf_core.surface.upsampling import upsample
 
-_DENSE = 4_200
-_COARSE = 5_500
+_OBJECT_POINTS = 4_200
+_SURROUNDING_POINTS = 5_500
 _MARGIN = 0.02  # of the object's extent: how far beyond the samples new ones may lie
 
 
@@ -29,23 +29,23 @@ def with_clouds(
     detection: OrientedBox,
     in_region: Callable[[Tensor], Tensor],
 ) -> RegistrationResult:
-    """The result with both clouds densified, their residuals, and the scene round the detection.
+    """The result with more points in both clouds, the residuals there, and the scene around the detection.
 
-    ``in_region`` says which points (N, 3) of the scene may belong to the object's cloud, (N,) bool.
-    The evaluations it took stand apart from the registration's own, as ``field_evaluations_clouds``.
+    ``in_region`` tells which points (N, 3) of the scene may belong to the object's cloud, (N,) bool.
+    The metric ``field_evaluations_clouds`` counts the evaluations for this; ``field_evaluations`` leaves them out.
     """
     scene, obj, T = CountingField(scene_field), CountingField(object_field), result.T_object_scene
     generator = torch.Generator().manual_seed(result.seed)
     extent = _extent(result.object_samples)
-    A = upsample(scene, result.scene_samples, _DENSE, generator, in_region)
-    B = upsample(obj, result.object_samples, _DENSE, generator, lambda points: extent.contains(points, _MARGIN))
+    A = upsample(scene, result.scene_samples, _OBJECT_POINTS, generator, in_region)
+    B = upsample(obj, result.object_samples, _OBJECT_POINTS, generator, lambda points: extent.contains(points, _MARGIN))
     residuals = {
         "scene_points": A.points,
         "scene_residuals": scene_residuals(scene, obj, A.points, T),
         "object_points": B.points,
         "object_residuals": object_residuals(scene, obj, B.points, T),
     }
-    around = sample_surroundings(scene, detection, _COARSE, generator)
+    around = sample_surroundings(scene, detection, _SURROUNDING_POINTS, generator)
     metrics = {**result.metrics, "field_evaluations_clouds": float(scene.evaluations + obj.evaluations)}
     return replace(result, scene_samples=A, object_samples=B, residuals=residuals, surroundings=around, metrics=metrics)
 

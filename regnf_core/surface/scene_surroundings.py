@@ -1,4 +1,4 @@
-"""The scene's surface round the detection, for pictures and viewers: where in the room does the object stand?"""
+"""Points of the scene's surface around the detection, for pictures and viewers."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def sample_surroundings(
 ) -> SurfaceSamples:
     """About ``count`` points of the scene's surface outside the detection box, scene frame, with unit normals.
 
-    Random points of the bounds are drawn onto the surface by Newton's method along the gradient; those that do not
-    arrive are dropped, and the gaps between the others filled. Far cheaper than rays from many views.
+    Random points of the bounds are projected onto the surface. Those that do not arrive are dropped, and the gaps
+    between the others are filled. This is far cheaper than rays from many views.
     """
     low, high = (corner.float() for corner in scene.bounds)
 
-    def shown(points: Tensor) -> Tensor:
+    def in_surroundings(points: Tensor) -> Tensor:
         within: Tensor = ((points >= low.to(points)) & (points <= high.to(points))).all(-1)
         return within & ~detection.contains(points)
 
     points = (low + (high - low) * torch.rand(int(_SEED_SHARE * count), 3, generator=generator)).to(scene.device)
     found = project_to_surface(scene.signed_distance_and_gradient, points, _NEWTON_STEPS)
-    kept = (found.distance.abs() <= _TOLERANCE * float((high - low).norm())) & shown(found.points)
+    kept = (found.distance.abs() <= _TOLERANCE * float((high - low).norm())) & in_surroundings(found.points)
     normals = torch.nn.functional.normalize(found.gradient[kept], dim=-1)
     seeds = SurfaceSamples(found.points[kept], normals)
-    return upsample(scene, seeds, count, generator, shown) if len(seeds.points) else seeds
+    return upsample(scene, seeds, count, generator, in_surroundings) if len(seeds.points) else seeds

@@ -1,7 +1,8 @@
 """Sphere tracing: where rays first meet a field's surface.
 
-Only rays that are still under way are evaluated in each step. A neural field is no exact distance, so the march takes
-slightly shortened steps, waits for a change of sign and then closes in on the zero between the last two points.
+Each step evaluates only the rays that have neither arrived nor left. A neural field is not an exact distance. So the
+steps are a little shorter than the distance, up to the first change of sign; then the zero between the last two points
+is refined.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.geometry.ray_box import ray_box_interval
 from regnf_core.surface.cameras import Rays
 
-_STEP_SHARE = 0.9  # of the distance to the surface: neural fields overstate it a little here and there
+_STEP_SHARE = 0.9  # of the distance to the surface: neural fields overstate it a little in places
 _MIN_STEPS_ACROSS = 1000  # the shortest step, as a fraction of the region's diagonal: thinner sheets may be missed
 _MAX_MARCH_STEPS = 400
 _REFINEMENTS = 8
@@ -24,7 +25,7 @@ _REFINEMENTS = 8
 
 @dataclass(frozen=True)
 class Hits:
-    """First meetings of rays and surface: points (M, 3) float32 and which rays they belong to, (M,) int64."""
+    """Where rays first meet the surface: points (M, 3) float32, and the indices (M,) int64 of their rays."""
 
     points: Tensor
     rays: Tensor
@@ -46,12 +47,12 @@ def finite_distance(field: SdfField, points: Tensor) -> Tensor:
 def first_hits(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float, tolerance: float) -> Hits:
     """The first zero crossing from free space into matter on every ray between ``entry`` and ``exit_`` (N,).
 
-    Rays that start inside matter are dropped: their first crossing is the far side of a wall, or the march would run
-    backwards. So are rays whose zero cannot be found to ``tolerance`` (field units): a jump in the field, no surface.
+    Rays that start inside matter are dropped: their first crossing would be a back face. Rays whose zero is not found
+    to ``tolerance`` (field units) are dropped too: there the field jumps, and has no surface.
     """
     bracket = _march(field, rays, entry, exit_, min_step)
     index, near, far, s_near, s_far = bracket
-    t, s = _close_in(field, rays, index, near, far, s_near, s_far)
+    t, s = _refine_zero(field, rays, index, near, far, s_near, s_far)
     kept = s.abs() <= tolerance
     index, t = index[kept], t[kept]
     return Hits(rays.origins[index] + t.unsqueeze(-1) * rays.directions[index], index)
@@ -60,7 +61,7 @@ def first_hits(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_st
 def _march(
     field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """March until the sign changes: ray numbers, and distances and field values on both sides of the surface."""
+    """Step until the sign changes. Ray indices, then distances along the ray and field values before and behind it."""
     index = (exit_ > entry).nonzero().squeeze(-1)
     t = entry[index]
     s = finite_distance(field, rays.origins[index] + t.unsqueeze(-1) * rays.directions[index])
@@ -74,8 +75,8 @@ def _march(
         s_ahead = finite_distance(field, rays.origins[index] + ahead.unsqueeze(-1) * rays.directions[index])
         crossed = s_ahead <= 0
         found.append((index[crossed], t[crossed], ahead[crossed], s[crossed], s_ahead[crossed]))
-        under_way = ~crossed & (ahead < exit_[index])
-        index, t, s = index[under_way], ahead[under_way], s_ahead[under_way]
+        continuing = ~crossed & (ahead < exit_[index])
+        index, t, s = index[continuing], ahead[continuing], s_ahead[continuing]
     if not found:
         empty = torch.empty(0, device=rays.origins.device)
         return index, empty, empty, empty, empty
@@ -83,12 +84,12 @@ def _march(
     return index, near, far, s_near, s_far
 
 
-def _close_in(
+def _refine_zero(
     field: SdfField, rays: Rays, index: Tensor, near: Tensor, far: Tensor, s_near: Tensor, s_far: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The best point and its field value between near (outside) and far (inside): secant steps, kept in the bracket.
 
-    The Illinois rule halves the value at an end that stays put, so that both ends close in.
+    The Illinois rule halves the value at an end that has not moved, so that both ends converge.
     """
     best_t, best_s = near.clone(), s_near.clone()
     last_side = torch.zeros_like(index)

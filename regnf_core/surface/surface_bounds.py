@@ -1,4 +1,4 @@
-"""Where in its bounds an object's surface lies: library fields often have bounds much larger than the object."""
+"""The bounding box of an object's surface: the bounds of a field are often much larger than the object."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MARGIN = 0.02
 def surface_bounds(field: SdfField) -> OrientedBox:
     """The axis-aligned box of the field's zero level, field frame.
 
-    Looks at a grid of cell centers; where a cell may hold surface, one Newton step carries its center there.
+    Evaluates a grid of cell centers. One Newton step projects the centers of cells that may hold surface onto it.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT) when no cell does, InvalidInputError (FIELD_NOT_FINITE).
     """
     low, high = field.bounds

@@ -1,7 +1,7 @@
-"""Where a field's surface runs within a region: cells subdivided only where the field says the surface may be.
+"""The cells of a region that the surface may pass through: an octree, subdivided only near the surface.
 
-Costs a few thousand evaluations where a dense grid of the same fineness costs tens of thousands, finds thin parts as
-surely as broad ones, and spreads what it finds evenly.
+This takes a few thousand evaluations, where a dense grid of the same resolution takes tens of thousands. Thin parts are
+found as well as broad ones, and the cells are spread evenly over the surface.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from regnf_core.surface.free_space import FreeSpace
 
 _REACH = 1.15 * 0.5 * 3**0.5
 """Cells whose |value| is beyond this many edges hold no surface; neural fields overstate distances a little."""
-_TIGHTENINGS = 8
+_MAX_CROPS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ def surface_cells(
 ) -> tuple[Cells, FreeSpace]:
     """The cells along the surface within low..high (3,): ``base`` along the longest edge, subdivided ``levels`` times.
 
-    ``value`` tells the signed distance (N,) at points (N, 3). The cells may be none. With them comes what the values
-    tell of the free space, on a grid of the finest cells.
+    ``value`` gives the signed distance (N,) at points (N, 3). There may be no such cells. The second result is the free
+    space that the values show, on a grid of the finest cells.
     """
     cells = _grid(value, low, high, base)
     start = cells.extent()[0]
@@ -60,12 +60,12 @@ def surface_cells(
     return cells.near(), space
 
 
-def tighten(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> tuple[Tensor, Tensor]:
-    """The part (3,), (3,) of the region low..high that may hold surface, found by ever smaller grids.
+def crop_to_surface(value: Callable[[Tensor], Tensor], low: Tensor, high: Tensor, base: int) -> tuple[Tensor, Tensor]:
+    """Corners (3,), (3,) of the part of the region low..high that may hold surface, found on smaller and smaller grids.
 
-    Where nothing is near the surface the region comes back as it was.
+    The region itself, when no cell is near the surface.
     """
-    for _ in range(_TIGHTENINGS):
+    for _ in range(_MAX_CROPS):
         near = _grid(value, low, high, base).near()
         if near.centers.shape[0] == 0:
             break

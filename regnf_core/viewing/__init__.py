@@ -1,4 +1,4 @@
-"""What a registration leaves to read and to look at: the result document, clouds, trace, residuals, a picture."""
+"""The files of a registration: result document, point clouds, history, residuals, picture."""
 
 from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.document import ranking_document, result_document

@@ -43,7 +43,7 @@ def write_artifacts(
     ``truth``, ``symmetries``, ``object_name`` and ``candidates`` are for the result document.
 
     scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
-    source), context_points.ply (the scene round the detection, where the result has it), residuals.npz,
+    source), context_points.ply (the scene around the detection, if the result has it), residuals.npz,
     trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
     """
     scene, obj = result.scene_samples, result.object_samples

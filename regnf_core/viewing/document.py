@@ -33,8 +33,8 @@ def result_document(
 ) -> dict[str, Any]:
     """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
 
-    ``symmetries`` are the object's: rotation error and MSSD are the least over them. ``device`` is where it ran.
-    ``object_name`` says whose pose it is, and ``candidates``, of :func:`ranking_document`, among which it was found.
+    ``symmetries`` are the object's: rotation error and MSSD are the smallest over them. ``device``: of the computation.
+    ``object_name``: the object that was registered. ``candidates``: of :func:`ranking_document`, after a search.
     """
     metrics = dict(result.metrics)
     if truth is not None:
@@ -64,7 +64,7 @@ def result_document(
 
 
 def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) -> list[dict[str, Any]]:
-    """A search's candidates as plain values, the likeliest first, then those ``unusable``: their names and reasons."""
+    """A search's candidates as plain values, the best first, then those ``unusable``: their names and reasons."""
     ranked: list[dict[str, Any]] = [
         {
             "object": one.name,
@@ -115,5 +115,5 @@ def _alternative(other: Alternative) -> dict[str, Any]:
 
 
 def _json_number(value: float) -> float | None:
-    """JSON knows neither NaN nor infinity."""
+    """None for NaN and infinity, which JSON cannot hold."""
     return value if math.isfinite(value) else None

@@ -16,13 +16,12 @@ _OVERSAMPLING = 2
 _COLOR = np.array([0.72, 0.75, 0.79])
 _BACKGROUND = np.array([0.975, 0.975, 0.97])
 _SIDES = ((1.0, 0.55, 0.6), (-0.7, -1.0, 0.6))
-"""Where the viewer stands: along the first and second level axis, and up."""
+"""Directions towards the viewer: along the first and the second horizontal axis, and up."""
 _DISC = 0.95
 """Radius of the discs in lattice steps: they overlap a little."""
 _INSIDE, _OUTSIDE = np.array([0.93, 0.62, 0.35]), np.array([0.45, 0.62, 0.80])
 _LINES = 20.0
 """Isolines to a diagonal."""
-_AXES = {"x": 0, "y": 1, "z": 2}
 
 
 def field_picture(field: SdfField, up_axis: str | None = None) -> Image.Image:
@@ -42,7 +41,7 @@ def field_picture(field: SdfField, up_axis: str | None = None) -> Image.Image:
 
 
 def _view(surface: Surface, side: tuple[float, float, float], up_axis: str, step: float) -> Image.Image:
-    axis = _AXES[up_axis[-1]]
+    axis = "xyz".index(up_axis[-1])
     up = np.eye(3)[axis] * (-1.0 if up_axis.startswith("-") else 1.0)
     first = np.eye(3)[(axis + 1) % 3]
     direction = side[0] * first + side[1] * np.cross(up, first) + side[2] * up

@@ -1,4 +1,4 @@
-"""preview.png: the object over the scene before and after, and how far the surfaces are apart."""
+"""preview.png: the object over the scene at the start and at the end, and the residuals of both surfaces."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfel
 
 
 def _best_direction(scene: Surfels, up: Floats) -> Floats:
-    """From above and from the side that shows most of the scanned surface."""
+    """The direction to the viewer, (3,): from above, and from the side that shows most of the scene's surface."""
     first = np.roll(up, 1)
     second = np.cross(up, first)
     turns = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)[:, None]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _AMBIENT = 0.45
-_STEEPEST = 0.12  # a disc seen at a grazing angle is drawn as if its normal leaned this much towards the viewer
+_MIN_SLANT = 0.12  # a disc seen at a grazing angle is drawn as if its normal leaned this much towards the viewer
 
 _DEPTH_STEPS = 256.0  # steps of the depth buffer a pixel
 
@@ -79,7 +79,7 @@ def paint(surfels: Surfels, nearest: NDArray[np.int64], view: View, background: 
 
 
 def _towards_viewer(surfels: Surfels, view: View) -> Floats:
-    """(N, 3) normals in the camera's axes, those that look away turned round."""
+    """(N, 3) normals in the camera's axes; those that point away from the viewer are reversed."""
     normals = surfels.normals @ view.axes.T
     return np.where(normals[:, 2:] < 0, -normals, normals)
 
@@ -94,8 +94,8 @@ def _nearest(seen: Singles, normals: Singles, size: int, radius: float) -> NDArr
     """
     keys = np.full(size * size, -1, dtype=np.int64)
     column, row, near = seen[:, 0] + size / 2, size / 2 - seen[:, 1], seen[:, 2]
-    slope = (normals[:, :2] / np.maximum(normals[:, 2:], _STEEPEST)).astype(np.float32)
-    near = near - (near.min() - np.float32(radius / _STEEPEST + 1.0))
+    slope = (normals[:, :2] / np.maximum(normals[:, 2:], _MIN_SLANT)).astype(np.float32)
+    near = near - (near.min() - np.float32(radius / _MIN_SLANT + 1.0))
     reach = int(np.ceil(radius))
     for offset in range(-reach, reach + 1):
         y = np.floor(row).astype(np.int64) + offset

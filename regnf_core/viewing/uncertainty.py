@@ -1,4 +1,4 @@
-"""How sure a pose is, in units people think in, from its covariance."""
+"""The uncertainty of a pose in degrees, object units and percent, from its covariance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ COVARIANCE_ORDERING = ("omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "lo
 
 
 def uncertainty(covariance: Tensor) -> dict[str, Any]:
-    """One standard deviation each, from the diagonal of the (7, 7) covariance; null for what is no variance.
+    """Standard deviations, from the diagonal of the (7, 7) covariance; null for an entry that is not a variance.
 
     rotation_deg: degrees about the object frame's x, y, z · translation: of T_object_scene's, along x, y, z, object
     units · scale_percent: of the scale.
