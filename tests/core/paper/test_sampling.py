@@ -1,4 +1,4 @@
-"""Cameras, sphere tracing and the surface points they give, against shapes whose surface is known."""
+"""Surface points of scene and object as cameras see them, against shapes whose surface is known."""
 
 from __future__ import annotations
 
@@ -6,98 +6,16 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfaceError
-from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
-from regnf_core.surface.cameras import Rays, camera_positions, cast_rays
-from regnf_core.surface.sphere_tracing import first_hits
 from regnf_core.surface.surface_bounds import surface_bounds
-from regnf_core.surface.upsampling import upsample
-from tests.core.analytic import AnalyticField, boxes, chair, chair_box, chair_pose, room, sphere
+from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere
 
 OPTIONS = SamplingOptions(pixel_stride=16)
 BALL_BOX = OrientedBox.from_corners([-0.3, -0.3, -0.3], [0.3, 0.3, 0.3])
-
-
-def trace(field: AnalyticField, origins: list[list[float]], directions: list[list[float]]) -> tuple[Tensor, Tensor]:
-    rays = Rays(torch.tensor(origins), torch.tensor(directions))
-    count = len(origins)
-    hits = first_hits(field, rays, torch.zeros(count), torch.full((count,), 3.0), 1e-3, 1e-4)
-    order = hits.rays.argsort()
-    return hits.points[order], hits.rays[order]
-
-
-def test_cameras_stand_on_the_upper_half_sphere_and_apart() -> None:
-    center = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    axes: list[tuple[Axis, int]] = [("x", 0), ("y", 1), ("z", 2)]
-    for axis, number in axes:
-        offsets = camera_positions(center, 0.9, 5, axis) - center
-        torch.testing.assert_close(offsets.norm(dim=1), torch.full((5,), 0.9, dtype=torch.float64))
-        torch.testing.assert_close(
-            offsets[:, number], 0.9 * torch.tensor([0.9, 0.7, 0.5, 0.3, 0.1], dtype=torch.float64)
-        )
-        angles = torch.pdist(offsets / 0.9)
-        assert float(angles.min()) > 0.6  # chord of about 35 degrees
-
-
-def test_every_corner_of_the_box_is_in_view_and_the_view_is_no_wider() -> None:
-    position = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
-    corners = OrientedBox.from_corners([-0.5, -0.2, -1.0], [0.5, 0.2, 1.0]).corners()
-    rays = cast_rays(position, torch.zeros(3, dtype=torch.float64), corners, 512, 8)
-    assert rays.directions.shape == (64 * 64, 3)
-    torch.testing.assert_close(rays.directions.norm(dim=1), torch.ones(64 * 64))
-    # The nearest corner is 0.5 and 0.2 off the axis at depth 1; pixel centers reach 63/64 of the way.
-    slopes = (rays.directions[:, :2] / -rays.directions[:, 2:]).abs().amax(0)
-    torch.testing.assert_close(slopes, torch.full((2,), 0.5 * 63 / 64), rtol=1e-4, atol=0)
-
-
-def test_first_hits_by_hand() -> None:
-    ball = sphere(0.5)
-    points, rays = trace(
-        ball,
-        [[2.0, 0, 0], [0, 2.0, 0.3], [0, 2.0, 0.6], [0.1, 0, 0]],
-        [[-1.0, 0, 0], [0, -1.0, 0], [0, -1.0, 0], [1.0, 0, 0]],
-    )
-    # The third ray misses; the fourth starts inside matter and must not come out on the far side.
-    assert rays.tolist() == [0, 1]
-    torch.testing.assert_close(points, torch.tensor([[0.5, 0, 0], [0, 0.4, 0.3]]), rtol=0, atol=1e-5)
-
-
-def test_the_visible_side_of_two_sheets_is_returned() -> None:
-    sheets = boxes([([-1, -1, 0.3], [1, 1, 0.32]), ([-1, -1, -0.1], [1, 1, 0.0])])
-    points, _ = trace(sheets, [[0.1, 0.2, 0.9]], [[0, 0, -1.0]])
-    torch.testing.assert_close(points, torch.tensor([[0.1, 0.2, 0.32]]), rtol=0, atol=1e-4)
-
-
-def test_a_field_that_is_no_distance_still_gives_its_zero() -> None:
-    def warped(points: Tensor) -> Tensor:
-        distance = points.norm(dim=-1) - 0.5
-        return distance * (1.3 + 0.4 * (9 * points).sin().prod(-1))  # slopes of 0.9 to 1.7
-
-    generator = torch.Generator().manual_seed(0)
-    origins = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1) * 1.5
-    aims = torch.nn.functional.normalize(0.2 * torch.randn(200, 3, generator=generator) - origins, dim=1)
-    field = AnalyticField(warped, [[-2, -2, -2], [2, 2, 2]])
-    points, rays = trace(field, origins.tolist(), aims.tolist())
-    assert len(rays) > 100
-    assert float((points.norm(dim=1) - 0.5).abs().max()) < 2e-4
-    towards = (points - origins[rays]).norm(dim=1)
-    nearest = (origins[rays].norm(dim=1) - 0.5).min()
-    assert float(towards.min()) >= float(nearest) - 1e-4
-    assert bool((points * aims[rays]).sum(-1).lt(0.05).all())  # on the side that faces the camera
-
-
-def test_rays_at_rest_are_not_evaluated_again() -> None:
-    counted = CountingField(sphere(0.5))
-    origins = torch.tensor([[0.51, 0.0, 0.0]]).repeat(1000, 1)
-    origins[0] = torch.tensor([3.0, 0.0, 0.0])
-    rays = Rays(origins, torch.tensor([[-1.0, 0.0, 0.0]]).expand(1000, 3))
-    first_hits(counted, rays, torch.zeros(1000), torch.full((1000,), 4.0), 1e-3, 1e-4)
-    assert counted.evaluations < 1000 * 30
 
 
 def test_points_of_a_ball_lie_on_it_with_outward_normals() -> None:
@@ -147,18 +65,6 @@ def test_subsampling_is_by_the_generator_alone() -> None:
     assert one.points.shape == (100, 3)
     assert torch.equal(one.points, two.points)
     assert samples.subsample(10**6, torch.Generator()) is samples
-
-
-def test_upsampled_points_lie_on_the_surface_and_inside() -> None:
-    ball = sphere(0.25)
-    samples = sample_scene(ball, BALL_BOX, OPTIONS)
-    upper = samples.points[:, 2] > 0
-    half = samples[upper]
-    dense = upsample(ball, half, 3000, torch.Generator().manual_seed(0), lambda points: points[:, 2] > 0)
-    assert 2000 < len(dense.points) <= 3000
-    assert float((dense.points.norm(dim=1) - 0.25).abs().max()) < 1e-3
-    assert bool((dense.points[:, 2] > 0).all())
-    torch.testing.assert_close(dense.normals.norm(dim=1), torch.ones(len(dense.normals)))
 
 
 def reason_of(error: pytest.ExceptionInfo[InvalidInputError] | pytest.ExceptionInfo[NoSurfaceError]) -> str:
