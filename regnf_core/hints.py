@@ -18,8 +18,8 @@ HINTS: dict[str, str] = {
     "NO_INITIAL_TRANSFORM": "Too little of the object's shape is visible in the box, or it is another object. Try a "
     "tighter box, or another object of the library.",
     "LOW_OVERLAP": "The surfaces agree in part only. Use a box that encloses the whole object and nothing else.",
-    "SEVERAL_POSES_AGREE": "Choose a pose among the alternatives. Where things stand upright, set the option "
-    "robust.up_axis: it leaves out poses that do not.",
+    "SEVERAL_POSES_AGREE": "Choose a pose among the alternatives. If things stand upright, set the option up_axis: "
+    "poses that do not stand upright are left out.",
     "SCENE_UNEXPLAINED": "The box holds another object, or more than the object. Try a tighter box, or another object "
     "of the library.",
     "SURFACE_UNEXPLAINED": "Most often the object is a similar one, for example a chair without its cushion. If "
@@ -52,10 +52,16 @@ _MIN_SIMILARITY = 0.6
 
 def suggestion(name: str, known: Iterable[str]) -> str | None:
     """ "Did you mean `center`?" for a name that is not known; None where nothing is near."""
+    near = nearest_name(name, known)
+    return f"Did you mean `{near}`?" if near else None
+
+
+def nearest_name(name: str, known: Iterable[str]) -> str | None:
+    """The known name that is meant by one that is not known: its new name, or the most similar one."""
     names = sorted(known)
     renamed = RENAMED.get(name)
     if renamed in names:
-        return f"Did you mean `{renamed}`?"
+        return renamed
     by_lower = {one.lower(): one for one in reversed(names)}
     near = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=_MIN_SIMILARITY)
-    return f"Did you mean `{by_lower[near[0]]}`?" if near else None
+    return by_lower[near[0]] if near else None

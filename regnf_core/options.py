@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from difflib import get_close_matches
 from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.errors import InvalidOptionsError
+from regnf_core.hints import nearest_name
 
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
@@ -192,19 +192,17 @@ class RegistrationOptions:
 
 
 def did_you_mean(location: Sequence[str | int]) -> str:
-    """A hint for an unknown option: "; did you mean `up_axis`?", or nothing where no name is close.
+    """A hint for an unknown option: "; did you mean `up_axis`?", or nothing where no name is near.
 
-    location: the option's path below ``options``, as pydantic gives it. Names of earlier versions are known.
+    location: the option's path below ``options``, as pydantic gives it.
     """
-    path = tuple(str(part) for part in location)
-    if path in _FORMER_NAMES:
-        return f"; did you mean `{_FORMER_NAMES[path]}`?"
+    *group, name = (str(part) for part in location)
     names = _names()
-    elsewhere = [".".join((*group, path[-1])) for group in names if path[-1] in names[group]]
-    close = elsewhere or [
-        ".".join((*path[:-1], name)) for name in get_close_matches(path[-1], names.get(path[:-1], ()), n=1, cutoff=0.7)
-    ]
-    return f"; did you mean `{close[0]}`?" if close else ""
+    elsewhere = [other for other, known in names.items() if name in known]
+    if elsewhere:
+        return f"; did you mean `{'.'.join((*elsewhere[0], name))}`?"
+    near = nearest_name(name, names.get(tuple(group), ()))
+    return f"; did you mean `{'.'.join((*group, near))}`?" if near else ""
 
 
 def _names() -> dict[tuple[str, ...], list[str]]:
@@ -218,13 +216,4 @@ def _names() -> dict[tuple[str, ...], list[str]]:
 
 UNKNOWN_OPTION = "unexpected_keyword_argument"
 """The type of pydantic's error about an unknown option."""
-_FORMER_NAMES = {
-    ("robust", "max_hidden_share"): "robust.max_occluded_share",
-    ("sampling", "up_axis"): "up_axis",
-    ("robust", "up_axis"): "up_axis",
-    ("initialisation",): "initialization",
-    ("optimisation",): "optimization",
-    ("optimisation", "regulariser_weight"): "optimization.regularizer_weight",
-    ("optimization", "regulariser_weight"): "optimization.regularizer_weight",
-}
 _ADAPTER = TypeAdapter(RegistrationOptions)

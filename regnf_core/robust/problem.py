@@ -1,4 +1,4 @@
-"""One detection and one object, ready to be registered: samples to fit, samples to judge the fit, both fields."""
+"""One detection and one object, ready to be registered: both fields, samples to fit, held-out samples."""
 
 from __future__ import annotations
 

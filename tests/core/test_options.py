@@ -17,6 +17,7 @@ from regnf_core.options import RegistrationOptions
         ({"sampling": {"up_axis": "y"}}, "up_axis"),
         ({"initialisation": {"draws": 3}}, "initialization"),
         ({"optimization": {"regulariser_weight": 0.5}}, "optimization.regularizer_weight"),
+        ({"robust": {"max_hidden_share": 0.5}}, "robust.max_occluded_share"),
         ({"robust": {"rotation": 300}}, "robust.rotations"),
         ({"rotations": 300}, "robust.rotations"),
         ({"upaxis": "z"}, "up_axis"),
