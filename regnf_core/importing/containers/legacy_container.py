@@ -14,7 +14,8 @@ from typing import Any
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.container import MAX_PICKLE_BYTES, Entry
 from regnf_core.importing.containers.zip_members import MAX_ENTRIES
-from regnf_core.importing.pickle.pickle_reader import LeadingPickle, PickleLimits, read_leading_pickle
+from regnf_core.importing.pickle.pickle_machine import PickleLimits
+from regnf_core.importing.pickle.pickle_reader import LeadingPickle, read_leading_pickle
 from regnf_core.importing.pickle.pickle_values import StorageRef
 
 _MAGIC = 0x1950A86A20F9469CFC6C

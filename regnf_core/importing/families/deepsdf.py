@@ -33,9 +33,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     network = checkpoint.get("model_state_dict")
     prefix = next((p for p in _PREFIXES if strip_prefix(network, p)), None)
     if prefix is None:
-        if network is None and _CODES in checkpoint:
-            message = "DeepSDF's latent codes without its network; upload both in one file"
-            raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
+        _refuse_codes_alone(checkpoint)
         return None
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY, ("latent", "latent_index"))
@@ -65,6 +63,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         "bounds [-1, 1]: the cube round the unit sphere, into which DeepSDF scales its shapes",
     )
     return ConvertedField(FAMILY, why, description, _at_code(layers, latent, (0, *whole)).tensors() | norms)
+
+
+def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:
+    """Raise FieldFormatError (FIELD_NOT_RECOGNIZED) if the checkpoint is the half of a DeepSDF without the network."""
+    if checkpoint.get("model_state_dict") is None and _CODES in checkpoint:
+        message = "DeepSDF's latent codes without its network; upload both in one file"
+        raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
 
 
 def _latent(

@@ -60,21 +60,27 @@ def run_child(
         if stopped is None and not _exits_by(process.pid, deadline):
             stopped = "late"
     finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = code = os.waitstatus_to_exitcode(status)
-        for stream in (process.stdin, process.stdout, process.stderr):
-            with contextlib.suppress(BrokenPipeError):
-                _pipe(stream).close()
+        code, cpu_seconds = _end(process)
     return ChildOutcome(
         exit_status=code if code >= 0 else None,
         signal=-code if code < 0 else None,
         stopped=stopped,
         stdout=bytes(said[0]),
         stderr=bytes(said[1]),
-        cpu_seconds=usage.ru_utime + usage.ru_stime,
+        cpu_seconds=cpu_seconds,
     )
+
+
+def _end(process: subprocess.Popen[bytes]) -> tuple[int, float]:
+    """Kill the process group, collect the child and close its pipes. Returns its exit code and processor time (s)."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    for stream in (process.stdin, process.stdout, process.stderr):
+        with contextlib.suppress(BrokenPipeError):
+            _pipe(stream).close()
+    return process.returncode, usage.ru_utime + usage.ru_stime
 
 
 def _listen(streams: tuple[IO[bytes], IO[bytes]], said: tuple[bytearray, bytearray], deadline: float) -> Stopped | None:

@@ -23,7 +23,8 @@ from regnf_core.importing.containers.container import TorchArchive, read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.importing.families import convert_checkpoint
-from regnf_core.importing.pickle.pickle_reader import PickleLimits, read_pickle
+from regnf_core.importing.pickle.pickle_machine import PickleLimits
+from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.pickle.tensors import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import torch_zip

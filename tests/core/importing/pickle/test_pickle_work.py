@@ -6,7 +6,8 @@ import struct
 
 import pytest
 
-from regnf_core.importing.pickle.pickle_reader import PickleLimits, read_pickle
+from regnf_core.importing.pickle.pickle_machine import PickleLimits
+from regnf_core.importing.pickle.pickle_reader import read_pickle
 from tests.core.importing.archives import assert_refused, text
 
 PROTO = b"\x80\x02"

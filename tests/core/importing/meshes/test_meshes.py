@@ -15,7 +15,7 @@ from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.gate.gate import import_field
 from tests.core.importing.archives import assert_refused, saved
-from tests.core.importing.mesh_files import BALL, converted, exported
+from tests.core.importing.meshes.mesh_files import BALL, converted, exported
 from tests.devdata import dev_data
 
 

@@ -16,7 +16,7 @@ from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import geometry
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
-from tests.core.importing.mesh_files import PLY_TRIANGLE, converted, exported
+from tests.core.importing.meshes.mesh_files import PLY_TRIANGLE, converted, exported
 
 
 def refused(data: bytes, reason: str, format_: str | None = None) -> None:
