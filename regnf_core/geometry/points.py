@@ -10,23 +10,28 @@ from torch import Tensor
 
 
 class NearestNeighbors:
-    """A search structure over points (M, 3)."""
+    """A search structure (k-d tree) over points (M, 3). Results are not differentiable."""
 
     def __init__(self, points: Tensor) -> None:
         self.points = points.detach()
         self._tree = cKDTree(self.points.cpu().numpy())
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance (N,) to the nearest point and its number (N,), for points (N, 3). Not differentiable."""
-        distance, index = self._tree.query(points.detach().cpu().numpy())
+        """Distance (N,) to the nearest point and its index (N,), for points (N, 3)."""
+        distance, index = self.query_several(points, 1)
+        return distance[:, 0], index[:, 0]
+
+    def query_several(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Distances (N, K) to the nearest points, nearest first, and their indices (N, K); K = ``count``, at most M."""
+        numbers = range(1, min(count, len(self.points)) + 1)
+        distance, index = self._tree.query(points.detach().cpu().numpy(), k=numbers)
         return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
 
 
 def gaps(points: Tensor) -> Tensor:
-    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbor: how sparse it is there."""
-    array = points.detach().cpu().numpy()
-    distance, _ = cKDTree(array).query(array, k=min(4, len(array)))
-    return torch.as_tensor(distance.reshape(len(array), -1)[:, -1]).to(points)
+    """(N,) distance from each point of a cloud (N, 3), N >= 1, to its third neighbor: how sparse the cloud is there."""
+    distance, _ = NearestNeighbors(points).query_several(points.detach(), 4)  # the nearest is the point itself
+    return distance[:, -1]
 
 
 def diameter(points: Tensor) -> float:

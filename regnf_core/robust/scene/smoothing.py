@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from regnf_core.geometry.points import NearestNeighbors
 from regnf_core.robust.constants import SCENE
 from regnf_core.robust.samples import Samples
 
@@ -36,9 +36,7 @@ class SmoothedSurface:
 def smooth(samples: Samples) -> SmoothedSurface:
     """The samples' surface without its roughness."""
     points = samples.on_surface()
-    count = min(SCENE.neighbors, len(samples))
-    array = points.numpy()
-    near = torch.from_numpy(cKDTree(array).query(array, k=count)[1].reshape(len(samples), count))
+    _, near = NearestNeighbors(points).query_several(points, SCENE.neighbors)
     normals = samples.normals
     for _ in range(SCENE.averaging_rounds):
         neighbors = normals[near]

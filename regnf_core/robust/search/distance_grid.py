@@ -7,9 +7,9 @@ to compare thousands of poses; the fields themselves decide afterwards.
 from __future__ import annotations
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from regnf_core.geometry.points import NearestNeighbors
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.samples import Samples
 
@@ -59,12 +59,10 @@ def nearest_sample_distance(points: Tensor, normals: Tensor, spacing: float, que
 
     Far away: the distance to the nearest point, signed by its normal. Close: the distance to its tangent plane.
     """
-    distance, index = cKDTree(points.numpy()).query(queries.numpy())
-    nearest = torch.as_tensor(index)
+    far, nearest = NearestNeighbors(points).query(queries)
     offset = queries - points[nearest]
     n = normals[nearest]
     height = (offset * n).sum(-1)
-    far = torch.as_tensor(distance, dtype=queries.dtype)
     sign = torch.where(height >= 0, 1.0, -1.0)
     close = far < SEARCH.tangent_spacings * spacing
     value = torch.where(close, height, sign * far)
