@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 
 from regnf_service.app import create_app
 from regnf_service.http.contract import contract_yaml
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.settings import Settings
 
 TARGET = Path(__file__).resolve().parents[1] / "openapi.yaml"
@@ -19,8 +18,9 @@ TARGET = Path(__file__).resolve().parents[1] / "openapi.yaml"
 def current_contract() -> str:
     """The contract of the application as it is now."""
     with TemporaryDirectory() as folder:
-        settings = Settings(state_dir=Path(folder), redis_url=None, api_tokens=frozenset())
-        return contract_yaml(create_app(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()))
+        # nothing connects to Redis before the first request
+        settings = Settings(state_dir=Path(folder), redis_url=f"unix://{folder}/none", api_tokens=frozenset())
+        return contract_yaml(create_app(settings))
 
 
 if __name__ == "__main__":

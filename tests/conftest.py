@@ -10,13 +10,12 @@ from functools import cache
 import pytest
 from redis import Redis
 
-from regnf_state.memory import InMemoryRecordStore
 from regnf_state.records import RecordStore
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.grouping import pytest_collection_modifyitems
 from tests.object_store import ObjectServer, object_server
-from tests.redis_server import installed_servers, private_redis
+from tests.redis_server import default_server, installed_servers, private_redis
 
 __all__ = ["pytest_collection_modifyitems"]
 
@@ -53,12 +52,15 @@ def redis(redis_url: str) -> Iterator[Redis]:
         yield client
 
 
-@pytest.fixture(params=["memory", *installed_servers()])
-def store(request: pytest.FixtureRequest, redis_server: Callable[[str], str]) -> Iterator[RecordStore]:
-    """Each kind of record store, empty."""
-    if request.param == "memory":
-        yield InMemoryRecordStore()
-        return
-    with connect(redis_server(request.param)) as client:
+@pytest.fixture
+def any_redis(redis_server: Callable[[str], str]) -> Iterator[Redis]:
+    """Empty; for tests that are not about Redis itself, on one kind of server."""
+    with connect(redis_server(default_server())) as client:
         client.flushall()
-        yield RedisRecordStore(client)
+        yield client
+
+
+@pytest.fixture
+def store(redis: Redis) -> RecordStore:
+    """A record store, empty."""
+    return RedisRecordStore(redis)

@@ -30,11 +30,16 @@ def installed_servers() -> dict[str, str]:
     return {name: program for name, program in found.items() if program}
 
 
+def default_server() -> str:
+    """The server that tests run on which are not about Redis itself."""
+    return os.environ.get("REGNF_TEST_REDIS", "valkey")
+
+
 def start_server(
     socket: Path, data: Path, server: str | None = None, environment: dict[str, str] | None = None
 ) -> subprocess.Popen[bytes]:
     """Start the server that is named, or that the environment names; it takes commands once this returns."""
-    program = installed_servers()[server or os.environ.get("REGNF_TEST_REDIS", "valkey")]
+    program = installed_servers()[server or default_server()]
     command = ["redis-server", *server_command(socket, data)[1:]]
     process = subprocess.Popen(command, executable=program, stdout=subprocess.DEVNULL, env=environment)
     deadline = time.monotonic() + _START_S

@@ -9,12 +9,14 @@ from redis.exceptions import TimeoutError as RedisTimeoutError
 from redis.retry import Retry
 
 SOCKET_TIMEOUT_S = 10.0
+RETRIES = 6
+"""About four seconds in all."""
 
 
-def connect(url: str, *, retries: int = 6, socket_timeout_s: float = SOCKET_TIMEOUT_S) -> Redis:
+def connect(url: str, *, retries: int = RETRIES, socket_timeout_s: float = SOCKET_TIMEOUT_S) -> Redis:
     """A client for redis://, rediss:// or unix:// addresses. Connects on first use.
 
-    A command is tried again ``retries`` times, about four seconds in all by default. Every script of ours may be
+    A command is tried again ``retries`` times. Every script of ours may be
     repeated without harm. The socket's time limit is stated because the library's own is shorter than some waits.
     """
     return Redis.from_url(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 from redis import Redis
 
@@ -42,12 +42,6 @@ class Delivery:
     last_error: str | None = None
     next_at: float | None = None
     delivered_at: float | None = None
-
-
-class Outbox(Protocol):
-    """What the job's document asks."""
-
-    def delivery(self, job_id: str) -> Delivery: ...
 
 
 def _state_key(job_id: str) -> str:

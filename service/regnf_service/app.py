@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import Depends, FastAPI
-from redis import Redis
 from starlette.middleware import Middleware
 from starlette.staticfiles import StaticFiles
 
@@ -23,14 +22,9 @@ from regnf_service.http.tokens import Callers, read_callers
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics
 from regnf_service.webhooks.service import webhooks_of
-from regnf_state.blobs.base import BlobStore
-from regnf_state.blobs.open import open_blobs
-from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.queue import JobQueue
-from regnf_state.records import RecordStore
-from regnf_state.redis.client import connect
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.redis.client import RETRIES
 from regnf_state.settings import Settings
+from regnf_state.stores import Stores, open_stores
 
 _STORAGE_WAIT_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
@@ -39,27 +33,21 @@ _ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, re
 _LENIENT_ROUTERS = (pages.router, meta.router)
 
 
-class ConfigurationError(RuntimeError):
-    """The service cannot start as it is configured."""
-
-    reason = "CONFIGURATION"
-
-
 def create_app(
-    settings: Settings | None = None,
-    records: RecordStore | None = None,
-    blobs: BlobStore | None = None,
-    queue: JobQueue | None = None,
-    limiter: RateLimiter | None = None,
+    settings: Settings | None = None, stores: Stores | None = None, limiter: RateLimiter | None = None
 ) -> FastAPI:
-    """The application over the given stores, or over Redis and the local folder that the settings name.
+    """The application over the given stores, or over those that the settings name.
 
-    Raises ConfigurationError when stores are missing and no Redis is named, TokensError when the tokens are unusable.
+    Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable.
     """
     settings = settings or Settings()
     callers = read_callers(settings.api_tokens, settings.api_tokens_file)
-    services, redis, limiter = _open(settings, records, blobs, queue, limiter)
-    metrics = Metrics(services, redis)
+    stores = stores or open_stores(settings, retries=RETRIES, storage_wait_s=_STORAGE_WAIT_S)
+    if limiter is None and settings.calls_per_s:
+        limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
+    webhooks = webhooks_of(settings, stores.redis)
+    services = Services(settings, stores.redis, stores.records, stores.blobs, stores.queue, webhooks)
+    metrics = Metrics(services)
     app = FastAPI(
         title="regnf",
         version=__version__,
@@ -67,7 +55,7 @@ def create_app(
         docs_url=None,
         redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
-        lifespan=lifespan_of(services, redis, metrics),
+        lifespan=lifespan_of(services, metrics),
         middleware=_middleware(settings, callers, metrics, limiter),
     )
     app.state.services = services
@@ -92,29 +80,6 @@ def _middleware(
     )
     limits = [Middleware(RateGate, limiter=limiter)] if limiter is not None else []
     return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), gate, *limits]
-
-
-def _open(
-    settings: Settings,
-    records: RecordStore | None,
-    blobs: BlobStore | None,
-    queue: JobQueue | None,
-    limiter: RateLimiter | None,
-) -> tuple[Services, Redis | None, RateLimiter | None]:
-    """The stores that were not given, over Redis, which is None if none is needed, and the storage of the settings."""
-    needs_redis = records is None or queue is None
-    if needs_redis and settings.redis_url is None:
-        raise ConfigurationError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
-    redis = connect(settings.redis_url) if needs_redis and settings.redis_url is not None else None
-    blobs = blobs or open_blobs(settings, _STORAGE_WAIT_S)
-    if redis is not None:
-        records = records or JournaledRecordStore(redis, settings.retention_s, blobs)
-        queue = queue or RqJobQueue(redis)
-        if limiter is None and settings.calls_per_s:
-            limiter = RedisRateLimiter(redis, settings.calls_per_s, settings.rate_limit_burst)
-    assert records is not None, "given, or made just now"
-    assert queue is not None, "given, or made just now"
-    return Services(settings, records, blobs, queue, webhooks_of(settings, redis)), redis, limiter
 
 
 def _include_routers(app: FastAPI, **how: Any) -> None:

@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 
 from fastapi import FastAPI
-from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_service.http.concurrency import pause
@@ -18,7 +17,6 @@ from regnf_service.shutdown import stopping_on_signals
 from regnf_service.upkeep.housekeeping import Housekeeper
 from regnf_service.upkeep.reaper import Reaper
 from regnf_service.webhooks.service import deliver_until_stopped
-from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.journal.rebuild import Rebuilder
 
 logger = logging.getLogger(__name__)
@@ -27,38 +25,34 @@ _CLEARING_UP_S = 5.0
 
 
 def lifespan_of(
-    services: Services, redis: Redis | None, metrics: Metrics
+    services: Services, metrics: Metrics
 ) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     """The lifespan of an application over these services: begins what goes on beside requests, and ends it in order."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.openapi()  # takes a while, so not while somebody waits for an answer
-        reaping = asyncio.create_task(_reap(services, redis)) if redis is not None else None
-        delivering = asyncio.create_task(deliver_until_stopped(services, redis)) if redis is not None else None
+        reaping = asyncio.create_task(_reap(services))
+        delivering = asyncio.create_task(deliver_until_stopped(services))
         at = services.settings
         with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
         # the server has broken off what was still arriving, and does not wait for it to be cleared away
         await services.uploads.emptied(_CLEARING_UP_S)
-        if delivering is not None:
-            await delivering
-        if reaping is not None:
-            await reaping
-        if redis is not None:
-            redis.close()
+        await delivering
+        await reaping
+        services.redis.close()
 
     return lifespan
 
 
-async def _reap(services: Services, redis: Redis) -> None:
+async def _reap(services: Services) -> None:
     """Look after lost jobs every fifteen seconds until the service stops."""
-    records, rebuilder, housekeeper = services.records, None, None
-    if isinstance(records, JournaledRecordStore):
-        rebuilder = Rebuilder(records, services.queue, services.blobs)
-        housekeeper = Housekeeper(records, services.blobs, redis, services.settings)
-    reaper = Reaper(records, services.queue, redis, services.settings, services.blobs, rebuilder, housekeeper)
+    records, queue, redis, blobs = services.records, services.queue, services.redis, services.blobs
+    rebuilder = Rebuilder(records, queue, blobs)
+    housekeeper = Housekeeper(records, blobs, redis, services.settings)
+    reaper = Reaper(records, queue, redis, services.settings, blobs, rebuilder, housekeeper)
     while not services.stopping.is_set():
         try:
             await in_thread(reaper.run_once)

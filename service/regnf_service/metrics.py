@@ -11,7 +11,6 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, start_http_
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
-from redis import Redis
 from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -37,7 +36,7 @@ _TIMES = {
 class Metrics:
     """The registry of one application. Routes are counted by their templates, never by the ids in them."""
 
-    def __init__(self, services: Services, redis: Redis | None) -> None:
+    def __init__(self, services: Services) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "regnf_http_requests", "Requests answered.", ("method", "route", "status"), registry=self.registry
@@ -49,16 +48,15 @@ class Metrics:
         self.redis_errors = Counter(
             "regnf_redis_errors", "Answers and scrapes for which Redis was away.", registry=self.registry
         )
-        self.registry.register(_Held(self, services, redis))
+        self.registry.register(_Held(self, services))
 
 
 class _Held(Collector):
     """Asks Redis at each scrape."""
 
-    def __init__(self, metrics: Metrics, services: Services, redis: Redis | None) -> None:
+    def __init__(self, metrics: Metrics, services: Services) -> None:
         self._metrics = metrics
         self._services = services
-        self._redis = redis
 
     def describe(self) -> Iterable[Metric]:
         """Nothing to compare beforehand: that would be a scrape."""
@@ -91,10 +89,8 @@ class _Held(Collector):
             "unfinished", "Jobs and imports that wait or run: what workers are needed for.", len(active) + imports
         )
         yield _gauge("workers", "Workers that have reported lately.", services.queue.live_workers())
-        if self._redis is None:
-            return
-        yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(self._redis).waiting())
-        counters = Counters(self._redis)
+        yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(services.redis).waiting())
+        counters = Counters(services.redis)
         for name, (about, names) in _COUNTS.items():
             counter = CounterMetricFamily(f"regnf_{name}", about, labels=names)
             for counted, value in counters.counts(name):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from redis import Redis
 
 from tests.contract.world import NOBODY, World, assert_refused, make_world
 
@@ -22,8 +23,8 @@ CALLS = [
 
 
 @pytest.fixture
-def guarded(tmp_path: Path) -> Iterator[World]:
-    made = make_world(tmp_path, api_tokens=TOKENS)
+def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+    made = make_world(tmp_path, any_redis, api_tokens=TOKENS)
     with made.client:
         yield made
 
@@ -69,10 +70,10 @@ def test_the_probe_and_the_page_are_open_and_tell_nothing(guarded: World) -> Non
     ],
 )
 def test_without_tokens_only_loopback_is_served(
-    tmp_path: Path, address: str, settings: dict[str, Any], status: int
+    tmp_path: Path, any_redis: Redis, address: str, settings: dict[str, Any], status: int
 ) -> None:
     host = f"[{address}]" if ":" in address else address
-    made = make_world(tmp_path, **settings)
+    made = make_world(tmp_path, any_redis, **settings)
     with made.client as client:
         answer = client.get(f"http://{host}/jobs")
         if status == 401:

@@ -8,25 +8,26 @@ from pathlib import Path
 
 import httpx
 import pytest
+from redis import Redis
 
 from regnf_service.app import create_app
 from regnf_service.http.rate_limits import RedisRateLimiter
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
+from tests.stores import stores_over
 
 ALICE, BOB = {"Authorization": "Bearer one"}, {"Authorization": "Bearer two"}
 TOKENS = frozenset({"alice:one", "bob:two"})
 
 
 @pytest.fixture
-def limited(tmp_path: Path) -> Iterator[Callable[..., World]]:
+def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
     made: list[World] = []
 
     def make(**settings: object) -> World:
-        made.append(make_world(tmp_path, **settings))
+        made.append(make_world(tmp_path, any_redis, **settings))
         return made[-1]
 
     yield make
@@ -67,9 +68,8 @@ def test_calls_at_once_take_no_more_than_there_are(redis_url: str) -> None:
 def test_one_callers_haste_is_not_anothers(tmp_path: Path, redis_url: str) -> None:
     with connect(redis_url) as redis:
         redis.flushall()
-        stores = InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()
         settings = Settings(state_dir=tmp_path, api_tokens=TOKENS)
-        app = create_app(settings, *stores, limiter=RedisRateLimiter(redis, 0.01, 2))
+        app = create_app(settings, stores_over(redis, tmp_path / "blobs"), limiter=RedisRateLimiter(redis, 0.01, 2))
         with client_of(app) as client:
             assert [client.get("/jobs", headers=ALICE).status_code for _ in range(2)] == [200, 200]
             refused = client.get("/jobs", headers=ALICE)

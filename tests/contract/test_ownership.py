@@ -8,21 +8,23 @@ from typing import Any
 
 import httpx
 import pytest
+from redis import Redis
 
 from regnf_state.ownership import reference_of
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
+from tests.stores import expire
 
 SCENE, OBJECT = field_bytes("scene"), field_bytes("object")
 ALICE, BOB = {"Authorization": "Bearer alices-token"}, {"Authorization": "Bearer bobs-token"}
 
 
 @pytest.fixture
-def shared(tmp_path: Path) -> Iterator[World]:
+def shared(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
     """A service of two callers; its client is alice's."""
     file = tmp_path / "tokens"
     file.write_text("# who may call\n\nbob:bobs-token\nbob:bobs-next-token\n")
-    made = make_world(tmp_path, api_tokens=frozenset({"alice:alices-token"}), api_tokens_file=file)
+    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"alice:alices-token"}), api_tokens_file=file)
     made.client.headers.update(ALICE)
     with made.client:
         yield made
@@ -110,10 +112,9 @@ def test_anothers_is_not_there(
 def test_a_job_that_has_expired_is_gone_to_its_owner_and_unknown_to_others(
     shared: World, bob: httpx.Client, alices_job: str
 ) -> None:
-    later = shared.records.now() + shared.settings.retention_s + 1
-    shared.records._clock = lambda: later
-    for expire in (lambda: None, shared.records.expire_jobs):
-        expire()
+    expire(shared.redis, alices_job)
+    for clean_up in (list, shared.records.expire_jobs):
+        clean_up()
         assert_refused(shared.client.get(f"/jobs/{alices_job}"), 410, "JOB_EXPIRED")
         assert_refused(bob.get(f"/jobs/{alices_job}"), 404, "JOB_NOT_FOUND")
 

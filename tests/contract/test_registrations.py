@@ -8,6 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from redis import Redis
+
 from regnf_state.records import FieldRecord
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 
@@ -192,7 +194,7 @@ def test_a_failed_job_is_started_anew(world: World) -> None:
 
 def test_a_job_that_was_never_queued_is_queued_by_the_next_call(world: World) -> None:
     job_id = world.submit()
-    world.queue.registrations.clear()
+    world.queue.lose()
     assert post(world).status_code == 202
     assert world.queue.registrations == [(job_id, 1)]
 
@@ -248,8 +250,8 @@ def test_an_idempotency_key_belongs_to_one_request(world: World) -> None:
     assert_refused(post(world, headers=key, seed=1), 422, "IDEMPOTENCY_KEY_REUSED")
 
 
-def test_a_full_queue_says_when_to_come_back(tmp_path: Path) -> None:
-    world = make_world(tmp_path, max_queued_jobs=1)
+def test_a_full_queue_says_when_to_come_back(tmp_path: Path, any_redis: Redis) -> None:
+    world = make_world(tmp_path, any_redis, max_queued_jobs=1)
     first = world.submit()
     answer = post(world, seed=1)
     assert_refused(answer, 503, "QUEUE_FULL")

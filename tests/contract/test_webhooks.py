@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from redis import Redis
 
 from tests.contract.live import eventually, live_service
 from tests.contract.test_live_transport import submit
@@ -18,9 +19,10 @@ URL = "https://hooks.example.org/job"
 
 
 @pytest.fixture
-def told(tmp_path: Path) -> Iterator[World]:
+def told(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
     made = make_world(
         tmp_path,
+        any_redis,
         webhook_hosts=frozenset({"hooks.example.org"}),
         webhook_secrets=frozenset({f"anonymous:{SECRET}"}),
     )
@@ -49,9 +51,9 @@ def test_refused(told: World, webhook: Any, reason: str, query: str) -> None:
     assert told.records.list_jobs(None, 10, None) == []
 
 
-def test_without_a_secret_of_ones_own_there_is_none(tmp_path: Path) -> None:
+def test_without_a_secret_of_ones_own_there_is_none(tmp_path: Path, any_redis: Redis) -> None:
     hosts, secrets = frozenset({"hooks.example.org"}), frozenset({f"somebody:{SECRET}"})
-    world = make_world(tmp_path, webhook_hosts=hosts, webhook_secrets=secrets)
+    world = make_world(tmp_path, any_redis, webhook_hosts=hosts, webhook_secrets=secrets)
     with world.client as client:
         asked = world.valid_request() | {"webhook": {"url": URL}}
         assert_refused(client.post("/register", json=asked), 422, "WEBHOOK_NOT_ALLOWED")

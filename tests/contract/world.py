@@ -1,4 +1,4 @@
-"""A service in one process over stores in memory, and the small things that tests ask of it."""
+"""A service in one process over an emptied Redis and a folder, and the small things that tests ask of it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Any
 
 import httpx
 from fastapi import FastAPI
+from redis import Redis
 
 from regnf_service.app import create_app
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import JobRecord
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
+from tests.stores import HeldBlobs, ShiftedJournaledRecords, WatchedQueue, stores_over
 
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
 BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
@@ -53,9 +54,10 @@ class World:
     """The service, its stores, and a client."""
 
     settings: Settings
-    records: InMemoryRecordStore
-    blobs: InMemoryBlobStore
-    queue: InMemoryJobQueue
+    redis: Redis
+    records: ShiftedJournaledRecords
+    blobs: HeldBlobs
+    queue: WatchedQueue
     app: FastAPI
     client: httpx.Client
 
@@ -114,13 +116,13 @@ class World:
         self.records.update_job(job_id, attempt, status="failed", error=error)
 
 
-def make_world(folder: Path, **settings: Any) -> World:
-    """A fresh service; ``settings`` override what suits tests."""
+def make_world(folder: Path, redis: Redis, **settings: Any) -> World:
+    """A fresh service; ``settings`` override what suits tests. Redis is emptied."""
     usual = {"state_dir": folder, "redis_url": None, "upload_stall_s": 2.0, "max_upload_bytes": 4096}
     chosen = Settings(**(usual | settings))
-    records, blobs, queue = InMemoryRecordStore(chosen.retention_s), InMemoryBlobStore(), InMemoryJobQueue()
-    app = create_app(chosen, records, blobs, queue)
-    return World(chosen, records, blobs, queue, app, client_of(app))
+    stores = stores_over(redis, chosen.blob_dir, chosen.retention_s)
+    app = create_app(chosen, stores)
+    return World(chosen, redis, stores.records, stores.blobs, stores.queue, app, client_of(app))
 
 
 def assert_refused(answer: httpx.Response, status: int, reason: str) -> dict[str, Any]:

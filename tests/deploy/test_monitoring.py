@@ -11,16 +11,13 @@ import pytest
 import yaml
 from prometheus_client import generate_latest
 
-from regnf_service.http.dependencies import Services
 from regnf_service.metrics import Metrics
-from regnf_state.memory import InMemoryBlobStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
 from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
 from regnf_state.settings import Settings
 from tests.redis_server import private_redis
+from tests.stores import services_over
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES: list[dict[str, Any]] = yaml.safe_load((ROOT / "deploy/prometheus/regnf.rules.yaml").read_text())["groups"][0][
@@ -35,7 +32,9 @@ QUERIES = [rule["expr"] for rule in RULES] + [one["expr"] for panel in BOARD["pa
 def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Every metric of a service in which everything has happened once, with its labels."""
     with private_redis() as url, connect(url) as redis:
-        store = RedisRecordStore(redis)
+        settings = Settings(state_dir=tmp_path_factory.mktemp("state"))
+        services = services_over(redis, settings)
+        store = services.records
         for name in ("ended", "waits"):
             store.create_job(JobRecord(name, "registration", "accepted", {}, {}, store.now(), store.now()), 10)
         store.update_job("ended", 1, status="running", phase="loading")
@@ -43,8 +42,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         store.create_field(FieldRecord("a" * 64, "validating", 1, store.now(), store.now()))
         store.update_field("a" * 64, state="ready")
         RedisOutbox(redis).settle("ended-1", Delivery("delivered"))
-        settings = Settings(state_dir=tmp_path_factory.mktemp("state"))
-        metrics = Metrics(Services(settings, store, InMemoryBlobStore(), RqJobQueue(redis)), redis)
+        metrics = Metrics(services)
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)
         metrics.received.labels("/").inc()

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from redis import Redis
 
 from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 from tests.gate.house import House, make_house
@@ -19,10 +20,10 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> Seeds:
 
 
 @pytest.fixture
-def house(tmp_path: Path, seeds: Seeds, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
+def house(tmp_path: Path, any_redis: Redis, seeds: Seeds, monkeypatch: pytest.MonkeyPatch) -> Iterator[House]:
     """Ends with nothing left of what was refused, and with the next good upload taken."""
     monkeypatch.setattr(tempfile, "tempdir", None)  # put back afterwards: the house sets it
-    made = make_house(tmp_path, seeds.field_file)
+    made = make_house(tmp_path, any_redis, seeds.field_file)
     with made.world.client:
         yield made
         made.assert_nothing_left()

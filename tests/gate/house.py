@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+from redis import Redis
 
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import MIB, ImportLimits
@@ -60,10 +61,10 @@ class House:
         assert self.world.client.delete(f"/fields/{sha256(self.good)}").status_code == 204
 
 
-def make_house(folder: Path, good: bytes) -> House:
+def make_house(folder: Path, redis: Redis, good: bytes) -> House:
     """A fresh one; temporary files of this process go to its own folder from now on."""
     scratch = folder / "scratch"
     scratch.mkdir()
     tempfile.tempdir = str(scratch)
-    world = make_world(folder / "state", max_upload_bytes=256 * MIB)
+    world = make_world(folder / "state", redis, max_upload_bytes=256 * MIB)
     return House(world, Context(world.settings, world.records, world.blobs, world.queue), scratch, good)

@@ -15,14 +15,14 @@ from redis import Redis
 from redis.exceptions import RedisError
 
 from regnf_service import lifespan
-from regnf_service.app import ConfigurationError, create_app
+from regnf_service.app import create_app
 from regnf_service.http.concurrency import Waiters
-from regnf_service.http.dependencies import Services
 from regnf_service.http.waiting import pause, wait_for
 from regnf_service.shutdown import stopping_on_signals
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.settings import Settings
+from regnf_state.stores import NoRedisError
 from tests.contract.world import make_world
+from tests.stores import services_over
 
 
 def test_the_application_loads_neither_torch_nor_open3d() -> None:
@@ -33,7 +33,7 @@ def test_the_application_loads_neither_torch_nor_open3d() -> None:
 
 
 def test_it_says_what_it_needs(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="REGNF_REDIS_URL"):
+    with pytest.raises(NoRedisError, match="REGNF_REDIS_URL"):
         create_app(Settings(state_dir=tmp_path, redis_url=None))
 
 
@@ -56,8 +56,8 @@ def test_signals_end_long_answers_and_reach_the_server_too() -> None:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_waiting_ends_when_the_service_stops(tmp_path: Path) -> None:
-    services = make_world(tmp_path).app.state.services
+def test_waiting_ends_when_the_service_stops(tmp_path: Path, any_redis: Redis) -> None:
+    services = make_world(tmp_path, any_redis).app.state.services
 
     async def run() -> int:
         asyncio.get_running_loop().call_later(0.05, services.stopping.set)
@@ -80,13 +80,12 @@ def test_the_more_answers_are_held_the_more_seldom_each_looks() -> None:
 
 
 def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, any_redis: Redis, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     faults: list[Exception] = [RedisError("away"), OSError("away"), KeyError("of ours")]
 
     async def run() -> None:
-        stores = InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()
-        services = Services(Settings(state_dir=tmp_path), *stores)
+        services = services_over(any_redis, Settings(state_dir=tmp_path))
         loop = asyncio.get_running_loop()
 
         class FaultyReaper:
@@ -101,7 +100,7 @@ def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(
 
         monkeypatch.setattr(lifespan, "Reaper", FaultyReaper)
         monkeypatch.setattr(lifespan, "_REAP_EVERY_S", 0.001)
-        await asyncio.wait_for(lifespan._reap(services, Redis()), 20)
+        await asyncio.wait_for(lifespan._reap(services), 20)
 
     asyncio.run(run())
     assert not faults

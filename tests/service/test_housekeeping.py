@@ -2,44 +2,29 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
 
 import pytest
 from redis import Redis
 
 from regnf_service.upkeep.housekeeping import Housekeeper, Removed
 from regnf_service.upkeep.lease import Lease, LeaseLostError
-from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.journal.rebuild import Rebuilder
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
+from tests.stores import stores_over
 
 DAY_S = 24 * 3600.0
-
-
-class ShiftedRecords(JournaledRecordStore):
-    """Their clock is ahead of Redis' own by ``ahead_s``."""
-
-    ahead_s = 0.0
-
-    def now(self) -> float:
-        return super().now() + self.ahead_s
-
-    def _read(self, key: str) -> tuple[dict[str, Any] | None, float]:
-        document, now = super()._read(key)
-        return document, now + self.ahead_s
 
 
 @dataclass
 class World:
     redis: Redis
+    folder: Path
     settings: Settings = field(default_factory=Settings)
-    blobs: InMemoryBlobStore = field(default_factory=InMemoryBlobStore)
 
     def __post_init__(self) -> None:
-        self.records = ShiftedRecords(self.redis, 7 * 24 * 3600, self.blobs)
-        Rebuilder(self.records, InMemoryJobQueue(), self.blobs).run_if_needed()
+        stores = stores_over(self.redis, self.folder)
+        self.records, self.blobs = stores.records, stores.blobs
         self.lease = Lease(self.redis, "lease", 30.0)
 
     def add_field(self, letter: str, size: int = 100, state: str = "ready") -> str:
@@ -71,9 +56,9 @@ class World:
 
 
 @pytest.fixture
-def world(redis: Redis) -> World:
+def world(redis: Redis, tmp_path: Path) -> World:
     redis.flushall()
-    return World(redis)
+    return World(redis, tmp_path)
 
 
 def test_by_default_fields_stay(world: World) -> None:
@@ -146,6 +131,7 @@ def test_folders_that_no_record_knows_go_after_a_day(world: World) -> None:
     world.add_job("j", a, a, size=10)
     world.blobs.put("jobs/unknown/1/result.json", b".")
     world.blobs.put(f"fields/{'c' * 64}/original", b".")
+    world.blobs.age()
     assert set(world.tidy().orphans) == {"jobs/unknown", f"fields/{'c' * 64}"}
     assert world.fields() == {"a"}
     assert list(world.blobs.list("jobs")) == ["jobs/j/1/result.json"]
@@ -189,9 +175,11 @@ def test_a_leader_that_no_longer_leads_deletes_nothing(world: World) -> None:
 
 def test_once_an_hour_is_enough(world: World) -> None:
     world.blobs.put("jobs/unknown/1/result.json", b".")
+    world.blobs.age()
     keeper = Housekeeper(world.records, world.blobs, world.redis, world.settings)
     with world.lease.held() as term:
         assert term is not None
         assert keeper.run_if_due(term).orphans == ("jobs/unknown",)
         world.blobs.put("jobs/unknown/1/result.json", b".")
+        world.blobs.age()
         assert keeper.run_if_due(term) == Removed()

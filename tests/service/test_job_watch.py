@@ -10,25 +10,23 @@ import pytest
 from redis import Redis
 from redis.exceptions import ConnectionError as RedisConnectionError
 
-from regnf_service.http.dependencies import Services
 from regnf_service.http.job_watch import JobWatch, Position
 from regnf_service.http.sse import event_stream
-from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.records import JobNews
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from tests.round_trips import counted_round_trips
 from tests.state.record_makers import finished, started
+from tests.stores import services_over
 
 
 @pytest.mark.parametrize("streams", [1, 40])
 def test_any_number_of_streams_is_one_round_trip_a_round(
     redis: Redis, tmp_path: Path, streams: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store = RedisRecordStore(redis)
+    services = services_over(redis, Settings(state_dir=tmp_path))
+    store = services.records
     jobs = [finished(store, "failed", f"j{number}").id for number in range(4)]
-    services = Services(Settings(state_dir=tmp_path), store, LocalBlobStore(tmp_path / "blobs"), RqJobQueue(redis))
     round_trips = counted_round_trips(monkeypatch)
 
     async def read(job_id: str) -> str:

@@ -11,17 +11,15 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
-from regnf_service.http.dependencies import Services
 from regnf_service.metrics import Metrics, served
-from regnf_state.memory import InMemoryBlobStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.counters import BOUNDS_S, Counters
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from tests.contract.world import assert_refused, make_world
 from tests.redis_server import private_redis
+from tests.stores import WatchedQueue, services_over
 
 SHA = "a" * 64
 
@@ -46,8 +44,10 @@ def scrape(metrics: Metrics) -> dict[tuple[str, ...], float]:
 
 
 def metrics_of(redis: Redis, folder: Path) -> tuple[RedisRecordStore, Metrics]:
-    store = RedisRecordStore(redis)
-    return store, Metrics(Services(Settings(state_dir=folder), store, InMemoryBlobStore(), RqJobQueue(redis)), redis)
+    services = services_over(redis, Settings(state_dir=folder))
+    assert isinstance(services.queue, WatchedQueue)
+    services.queue.workers = None  # those that have reported are counted
+    return services.records, Metrics(services)
 
 
 def job(store: RedisRecordStore, name: str) -> JobRecord:
@@ -118,8 +118,8 @@ def test_imports_by_reason(redis: Redis, tmp_path: Path) -> None:
     assert (now["regnf_imports_active",], now["regnf_import_seconds_count",], now["regnf_unfinished",]) == (1, 2, 1)
 
 
-def test_requests_by_route_never_by_id(tmp_path: Path) -> None:
-    world = make_world(tmp_path)
+def test_requests_by_route_never_by_id(tmp_path: Path, any_redis: Redis) -> None:
+    world = make_world(tmp_path, any_redis)
     with world.client as client:
         for path in (f"/fields/{SHA}", f"/fields/{'b' * 64}", f"/v1/fields/{SHA}", "/nowhere/at/all", "/healthz"):
             client.get(path)
@@ -146,10 +146,10 @@ def test_a_scrape_without_redis_says_so(tmp_path: Path) -> None:
     redis.close()
 
 
-def test_they_have_a_port_of_their_own(tmp_path: Path) -> None:
+def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None:
     from prometheus_client import start_http_server
 
-    metrics = make_world(tmp_path).app.state.metrics
+    metrics = make_world(tmp_path, any_redis).app.state.metrics
     probe, thread = start_http_server(0, "127.0.0.1", metrics.registry)
     port = probe.server_port
     probe.shutdown()

@@ -1,31 +1,40 @@
 """What the reaper finds, and what it leaves alone."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from redis import Redis
 
 from regnf_service.upkeep.reaper import Reaped, Reaper
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
+from tests.stores import HeldBlobs, ShiftedRecords, WatchedQueue
 
 SHA = "a" * 64
 
 
 @dataclass
 class World:
-    """Stores in memory with a clock that is moved by hand, and the reaper's own."""
+    """Stores whose clock is moved by hand, and the reaper's own clock."""
 
     redis: Redis
-    time: float = 1000.0
+    folder: Path
     own_time: float = 0.0
-    queue: InMemoryJobQueue = field(default_factory=InMemoryJobQueue)
-    blobs: InMemoryBlobStore = field(default_factory=InMemoryBlobStore)
 
     def __post_init__(self) -> None:
-        self.records = InMemoryRecordStore(retention_s=3600, clock=lambda: self.time)
+        self.queue, self.blobs = WatchedQueue(self.redis), HeldBlobs(self.folder)
+        self.records = ShiftedRecords(self.redis, retention_s=3600)
+        self.records.frozen = self.records.now()
         self.reaper = self.new_reaper()
+
+    @property
+    def time(self) -> float:
+        return self.records.now()
+
+    @time.setter
+    def time(self, moved: float) -> None:
+        self.records.frozen = moved
 
     def new_reaper(self, lost_after_s: float = 90) -> Reaper:
         settings = Settings(lost_after_s=lost_after_s)
@@ -41,7 +50,7 @@ class World:
         self.take(job_id, 1)
 
     def take(self, job_id: str, attempt: int) -> None:
-        self.queue.registrations.remove((job_id, attempt))
+        self.queue.take(job_id, attempt)
         self.records.update_job(job_id, attempt, status="running")
 
     def upload(self, queued: bool) -> None:
@@ -64,9 +73,8 @@ class World:
 
 
 @pytest.fixture
-def world(redis: Redis) -> World:
-    redis.flushall()
-    return World(redis)
+def world(redis: Redis, tmp_path: Path) -> World:
+    return World(redis, tmp_path)
 
 
 def test_nothing_to_do(world: World) -> None:
@@ -120,7 +128,7 @@ def test_a_lost_import_is_tried_again_and_given_up_at_last(world: World) -> None
         assert world.pass_by(15) == Reaped()
         assert world.pass_by(15) == Reaped(requeued=(SHA,))
         assert world.queue.imports == [(SHA, attempt)]
-        world.queue.imports.clear()
+        world.queue.lose()
     assert world.after(30) == Reaped(failed=(SHA,))
     record = world.records.get_field(SHA)
     assert record is not None

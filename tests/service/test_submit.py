@@ -7,15 +7,12 @@ from pathlib import Path
 import pytest
 from redis import Redis
 
-from regnf_service.http.dependencies import Services
 from regnf_service.jobs.submit import check_fields
-from regnf_state.blobs.local import LocalBlobStore
-from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.records import FieldRecord
-from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from tests.round_trips import counted_round_trips
+from tests.stores import services_over
 
 BOX = {"center": [0.0, 0.0, 0.0], "size": [1.0, 1.0, 1.0], "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
 
@@ -24,12 +21,10 @@ BOX = {"center": [0.0, 0.0, 0.0], "size": [1.0, 1.0, 1.0], "rotation_quaternion_
 def test_any_number_of_candidates_is_one_round_trip(
     redis: Redis, tmp_path: Path, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    blobs = LocalBlobStore(tmp_path / "blobs")
-    records = JournaledRecordStore(redis, 3600, blobs)
-    services = Services(Settings(state_dir=tmp_path), records, blobs, RqJobQueue(redis))
+    services = services_over(redis, Settings(state_dir=tmp_path))
     names = [f"{number:064x}" for number in range(count + 1)]
     for name in names:
-        records.restore_field(FieldRecord(name, "ready", 1, 1.0, 1.0))
+        services.records.restore_field(FieldRecord(name, "ready", 1, 1.0, 1.0))
     scene, *candidates = names
     sent = counted_round_trips(monkeypatch)
     named = {"/scene": scene} | {f"/candidates/{place}": name for place, name in enumerate(candidates)}

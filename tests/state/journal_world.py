@@ -1,15 +1,16 @@
-"""Records over a real Redis and a journal in memory, and how Redis loses them."""
+"""Records over a real Redis and a journal in a folder, and how Redis loses them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from redis import Redis
 
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.journal.rebuild import Rebuilder, Rebuilt
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue
 from regnf_state.records import FieldRecord, JobRecord
+from tests.stores import HeldBlobs, WatchedQueue
 
 SCENE, OBJECT = "a" * 64, "b" * 64
 RETENTION_S = 3600
@@ -17,13 +18,13 @@ RETENTION_S = 3600
 
 @dataclass
 class World:
-    """Records over a real Redis and a journal in memory, as one of several machines would hold them."""
+    """Records over a real Redis and a journal in a folder, as one of several machines would hold them."""
 
     redis: Redis
-    blobs: InMemoryBlobStore
-    queue: InMemoryJobQueue
+    blobs: HeldBlobs
 
     def __post_init__(self) -> None:
+        self.queue = WatchedQueue(self.redis)
         self.records = JournaledRecordStore(self.redis, RETENTION_S, self.blobs)
         self.rebuilder = Rebuilder(self.records, self.queue, self.blobs)
 
@@ -65,9 +66,9 @@ class World:
         return found
 
 
-def fresh_world(redis: Redis) -> World:
+def fresh_world(redis: Redis, folder: Path) -> World:
     """A service that has just started, over an empty Redis."""
     redis.flushall()
-    made = World(redis, InMemoryBlobStore(), InMemoryJobQueue())
+    made = World(redis, HeldBlobs(folder))
     made.rebuilder.run_if_needed()
     return made

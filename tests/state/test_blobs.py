@@ -13,7 +13,6 @@ from regnf_state.blobs.base import BlobStore, StorageFullError, StorageUnavailab
 from regnf_state.blobs.cache import FileCache
 from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.blobs.object_store import ObjectBlobStore
-from regnf_state.memory import InMemoryBlobStore
 from tests.object_store import ObjectServer, environment
 
 BAD_KEYS = [
@@ -35,11 +34,9 @@ BAD_KEYS = [
 BAD_KEYS += ["a" * 201, "/".join(["a" * 100] * 6)]
 
 
-@pytest.fixture(params=["memory", "local", "objects"])
+@pytest.fixture(params=["local", "objects"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[BlobStore]:
-    if request.param == "memory":
-        yield InMemoryBlobStore()
-    elif request.param == "local":
+    if request.param == "local":
         yield LocalBlobStore(tmp_path / "blobs")
     else:
         server: ObjectServer = request.getfixturevalue("objects")

@@ -4,12 +4,13 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from redis import Redis
 
-from regnf_state.memory import InMemoryRecordStore
 from regnf_state.records import QueueFullError, RecordStore, StaleAttemptError
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.state.record_makers import field, finished, job, started
+from tests.stores import expire
 
 # jobs: how many, which, in what order
 
@@ -127,13 +128,7 @@ def test_deleting(store: RecordStore) -> None:
     assert store.create_job(job(store), 10)[0].attempt == 1
 
 
-def test_finished_jobs_expire_and_are_remembered_as_gone_in_memory() -> None:
-    time = [1000.0]
-    store = InMemoryRecordStore(retention_s=60, clock=lambda: time[0])
-    _assert_expiry(store, lambda: time.__setitem__(0, time[0] + 61))
-
-
-def test_finished_jobs_expire_and_are_remembered_as_gone_in_redis(redis_url: str) -> None:
+def test_finished_jobs_expire_and_leave_a_tombstone(redis_url: str) -> None:
     with connect(redis_url) as redis:
         redis.flushall()
         store = RedisRecordStore(redis, retention_s=2)
@@ -171,11 +166,10 @@ def _assert_expiry(store: RecordStore, wait) -> None:  # type: ignore[no-untyped
     assert [record.id for record in store.list_jobs(None, 10, None)] == ["waiting"]
 
 
-def test_an_expired_job_can_be_asked_for_again() -> None:
-    time = [1000.0]
-    store = InMemoryRecordStore(retention_s=60, clock=lambda: time[0])
+def test_an_expired_job_can_be_asked_for_again(redis: Redis) -> None:
+    store = RedisRecordStore(redis)
     finished(store, "successful")
-    time[0] += 61
+    expire(redis, "j1")
     assert store.create_job(job(store), 10)[1]
     assert store.expire_jobs() == []
     assert not store.job_expired("j1")

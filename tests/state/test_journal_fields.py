@@ -1,6 +1,7 @@
 """What the journal remembers of fields, and how their records are made anew from it."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from redis import Redis
@@ -10,8 +11,8 @@ from tests.state.journal_world import SCENE, World, fresh_world
 
 
 @pytest.fixture
-def world(redis: Redis) -> World:
-    return fresh_world(redis)
+def world(redis: Redis, tmp_path: Path) -> World:
+    return fresh_world(redis, tmp_path)
 
 
 def test_a_ready_field_comes_back(world: World) -> None:

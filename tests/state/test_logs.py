@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from anyio import from_thread, to_thread
+from redis import Redis
 
 from regnf_state.logs import ACCESS_LOGGER, JsonFormatter, configure_logging, log_context
 from regnf_state.ownership import reference_of
@@ -37,8 +38,8 @@ def entries(lines: io.StringIO) -> list[dict[str, Any]]:
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    made = make_world(tmp_path, api_tokens=frozenset({"alice:alices-secret-token"}))
+def world(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"alice:alices-secret-token"}))
     made.client.headers["Authorization"] = "Bearer alices-secret-token"
     with made.client:
         yield made

@@ -1,4 +1,4 @@
-"""The page served by the real application, over stores in memory: its policy, its addresses, its documents."""
+"""The page served by the real application, over the real stores: its policy, its addresses, its documents."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ import uvicorn
 from playwright.sync_api import expect
 
 from regnf_service.app import create_app
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.blobs.base import BlobStore
 from regnf_state.ownership import ANONYMOUS, reference_of
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.records import FieldRecord, JobRecord, RecordStore
 from regnf_state.settings import Settings
+from regnf_state.stores import Stores
+from tests.stores import private_stores
 from tests.ui.conftest import Visit
 from tests.ui.fixture_server import field_picture
 from tests.ui.pixels import canvas_pixels, colored
@@ -34,8 +36,8 @@ class RealService:
     """The application on a port of its own, with one accepted job in its store."""
 
     origin: str
-    records: InMemoryRecordStore
-    blobs: InMemoryBlobStore
+    records: RecordStore
+    blobs: BlobStore
 
     @property
     def view(self) -> str:
@@ -57,7 +59,23 @@ class RealService:
 
 @contextmanager
 def real_service(detection: dict[str, object], settings: Settings, owner: str = ANONYMOUS) -> Iterator[RealService]:
-    records, blobs = InMemoryRecordStore(), InMemoryBlobStore()
+    with private_stores() as stores:
+        accept(stores, detection, owner)
+        app = create_app(settings, stores)
+        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        with socket.create_server(("127.0.0.1", 0)) as listener:
+            thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+            thread.start()
+            try:
+                yield RealService(f"http://127.0.0.1:{listener.getsockname()[1]}", stores.records, stores.blobs)
+            finally:
+                server.should_exit = True
+                thread.join()
+
+
+def accept(stores: Stores, detection: dict[str, object], owner: str) -> None:
+    """Record a job and its two fields."""
+    records, blobs = stores.records, stores.blobs
     now = time.time()
     inputs = {"scene": SCENE, "object": OBJECT, "seed": 7, "detection": detection}
     job = JobRecord(
@@ -74,16 +92,6 @@ def real_service(detection: dict[str, object], settings: Settings, owner: str = 
         reference = reference_of(owner, sha256)
         records.create_field(FieldRecord(reference, "ready", bytes=1, created=now, updated=now))
         blobs.put(f"fields/{reference}/preview.png", field_picture(sha256))
-    app = create_app(settings, records, blobs, InMemoryJobQueue())
-    server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
-        try:
-            yield RealService(f"http://127.0.0.1:{listener.getsockname()[1]}", records, blobs)
-        finally:
-            server.should_exit = True
-            thread.join()
 
 
 def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:

@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from redis import Redis
 
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
+from tests.worker.doubles import context_over
 from tests.worker.refusals import RefusingRedis
 
 
@@ -28,7 +29,6 @@ def redis(redis_url: str) -> Iterator[RefusingRedis]:
 
 
 @pytest.fixture
-def context(tmp_path: Path) -> Context:
-    """Everything in memory, and heart beats that do not keep a test waiting."""
-    settings = Settings(state_dir=tmp_path, heartbeat_s=0.05)
-    return Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
+def context(tmp_path: Path, any_redis: Redis) -> Context:
+    """Heartbeats that do not keep a test waiting."""
+    return context_over(any_redis, Settings(state_dir=tmp_path, heartbeat_s=0.05))

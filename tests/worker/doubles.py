@@ -1,11 +1,21 @@
-"""A job and an import over stores in memory, as a worker's process finds them."""
+"""A job and an import over the real stores, as a worker's process finds them."""
 
 from __future__ import annotations
 
+from redis import Redis
+
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.settings import Settings
 from regnf_worker.context import Context
+from tests.stores import HeldBlobs, ShiftedRecords, WatchedQueue
 
 SHA = "a" * 64
+
+
+def context_over(redis: Redis, settings: Settings) -> Context:
+    """What a job is given, over an emptied Redis and a folder; without a journal."""
+    redis.flushall()
+    return Context(settings, ShiftedRecords(redis), HeldBlobs(settings.blob_dir), WatchedQueue(redis))
 
 
 def accept(context: Context, do: str = "succeed") -> None:

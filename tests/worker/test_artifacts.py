@@ -4,12 +4,12 @@ import hashlib
 from pathlib import Path
 
 from regnf_state.manifest import Artifact, Manifest, read_manifest
-from regnf_state.memory import InMemoryBlobStore
 from regnf_worker.artifacts import discard_others, publish, store_artifacts
+from tests.stores import HeldBlobs
 
 
 def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:
-    blobs = InMemoryBlobStore()
+    blobs = HeldBlobs(tmp_path / "blobs")
     (tmp_path / "result.json").write_bytes(b"{}")
     (tmp_path / "trace.unknown").write_bytes(b"xyz")
     manifest = store_artifacts(blobs, "j1", 3, tmp_path, ["result.json", "trace.unknown"])
@@ -22,8 +22,8 @@ def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:
     assert list(manifest.served()) == ["result.json"]
 
 
-def test_a_job_has_one_result() -> None:
-    blobs = InMemoryBlobStore()
+def test_a_job_has_one_result(tmp_path: Path) -> None:
+    blobs = HeldBlobs(tmp_path)
     first = Manifest("j1", 1, (Artifact("x", 1, "0"),))
     assert publish(blobs, first)
     assert not publish(blobs, Manifest("j1", 2, ()))

@@ -1,18 +1,15 @@
 """One attempt at a registration, against stores in memory."""
 
-from pathlib import Path
-
 import pytest
 
 from regnf_core.errors import CancelledError
 from regnf_state.manifest import Manifest, read_manifest
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord
-from regnf_state.settings import Settings
 from regnf_worker.artifacts import publish
 from regnf_worker.context import Context
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.registration import run_attempt
+from tests.stores import ShiftedRecords, WatchedQueue
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine
 
@@ -62,17 +59,16 @@ def test_fields_that_are_still_imported_send_the_job_back(context: Context, monk
     monkeypatch.setattr("regnf_worker.fields._WAIT_BEFORE_GIVING_BACK_S", 0.0)
     run_attempt(context, "j1", 1, "w", TinyEngine)
     assert (job(context).status, job(context).attempt, job(context).requeues) == ("accepted", 2, 0)
-    assert isinstance(context.queue, InMemoryJobQueue)
+    assert isinstance(context.queue, WatchedQueue)
     assert context.queue.registrations == [("j1", 2)]
 
 
-def test_a_field_that_is_never_imported_fails_the_job_at_last(tmp_path: Path) -> None:
-    time = [1000.0]
-    records = InMemoryRecordStore(clock=lambda: time[0])
-    context = Context(Settings(state_dir=tmp_path), records, InMemoryBlobStore(), InMemoryJobQueue())
-    records.create_field(FieldRecord(SHA, "validating", 1, 1000.0, 1000.0))
+def test_a_field_that_is_never_imported_fails_the_job_at_last(context: Context) -> None:
+    now = context.records.now()
+    context.records.create_field(FieldRecord(SHA, "validating", 1, now, now))
     accept(context)
-    time[0] += 2 * (120 + 90) + 1
+    assert isinstance(context.records, ShiftedRecords)
+    context.records.ahead_s += 2 * (120 + 90) + 1
     run_attempt(context, "j1", 1, "w", TinyEngine)
     error = job(context).error
     assert error is not None

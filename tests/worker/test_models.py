@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from redis import Redis
 
 from regnf_core.errors import FieldFormatError, NoSurfaceError
 from regnf_core.options import RegistrationOptions
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import models
@@ -20,6 +20,7 @@ from regnf_worker.context import Context
 from regnf_worker.engine import Candidate
 from regnf_worker.models import model_key
 from regnf_worker.registration import run_attempt
+from tests.worker.doubles import context_over
 
 SCENE, CHAIR, TABLE, AIR = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
 SYMMETRY = {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": False}
@@ -72,10 +73,8 @@ class ModelEngine:
 
 
 @pytest.fixture
-def context(tmp_path: Path) -> Context:
-    made = Context(
-        Settings(state_dir=tmp_path, heartbeat_s=0.05), InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue()
-    )
+def context(tmp_path: Path, any_redis: Redis) -> Context:
+    made = context_over(any_redis, Settings(state_dir=tmp_path, heartbeat_s=0.05))
     for sha256, data in ((SCENE, b"room"), (CHAIR, b"chair"), (TABLE, b"table"), (AIR, b"air")):
         add_field(made, sha256, data)
     return made

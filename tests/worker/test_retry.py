@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from redis import Redis
 from redis.exceptions import RedisError
 from rq.exceptions import StopRequested
 
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
@@ -17,6 +17,7 @@ from regnf_worker.process import RegnfWorker
 from regnf_worker.registration import run_attempt
 from regnf_worker.retry import MAX_WAIT_S, passes, retry_until_available
 from regnf_worker.scratch import Scratch
+from tests.worker.doubles import context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
 
@@ -78,10 +79,10 @@ def test_a_refusal_and_its_end_are_logged_once(waits: list[float], caplog: pytes
 
 
 @pytest.fixture
-def worker(tmp_path: Path, redis: RefusingRedis, monkeypatch: pytest.MonkeyPatch) -> RegnfWorker:
+def worker(tmp_path: Path, any_redis: Redis, redis: RefusingRedis, monkeypatch: pytest.MonkeyPatch) -> RegnfWorker:
     monkeypatch.setattr("regnf_worker.process.connect", lambda *_, **__: redis)
     settings = Settings(state_dir=tmp_path, redis_url="unix:///nowhere")
-    context = Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
+    context = context_over(any_redis, settings)
     return RegnfWorker(context, Scratch(tmp_path / "scratch"))
 
 
@@ -124,9 +125,9 @@ def test_a_job_is_settled_once_redis_takes_it(
 
 
 @pytest.fixture
-def context(tmp_path: Path) -> Context:
+def context(tmp_path: Path, any_redis: Redis) -> Context:
     settings = Settings(state_dir=tmp_path, heartbeat_s=60)
-    return Context(settings, InMemoryRecordStore(), InMemoryBlobStore(), InMemoryJobQueue())
+    return context_over(any_redis, settings)
 
 
 @pytest.mark.parametrize("name", ["update_job", "heartbeat"])

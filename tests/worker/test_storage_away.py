@@ -2,12 +2,14 @@
 
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from redis import Redis
 
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.memory import InMemoryBlobStore, InMemoryJobQueue, InMemoryRecordStore
+from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
@@ -16,31 +18,33 @@ from regnf_worker.imports import run_import_attempt
 from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
+from tests.stores import HeldBlobs
+from tests.worker.doubles import context_over
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
 
 SHA = "a" * 64
 
 
-class AwayStore(InMemoryBlobStore):
+class AwayStore(HeldBlobs):
     """Takes nothing while it is away."""
 
     away = False
 
-    def put(self, key: str, data: bytes) -> None:
+    def writer(self) -> LocalBlobWriter:
         if self.away:
             raise StorageUnavailableError("away")
-        super().put(key, data)
+        return super().writer()
 
 
 @pytest.fixture
-def store() -> AwayStore:
-    return AwayStore()
+def store(tmp_path: Path) -> AwayStore:
+    return AwayStore(tmp_path / "blobs")
 
 
 @pytest.fixture
-def context(tmp_path: Path, store: AwayStore) -> Context:
+def context(tmp_path: Path, any_redis: Redis, store: AwayStore) -> Context:
     settings = Settings(state_dir=tmp_path, heartbeat_s=0.05)
-    return Context(settings, InMemoryRecordStore(), store, InMemoryJobQueue())
+    return replace(context_over(any_redis, settings), blobs=store)
 
 
 def test_a_job_whose_result_cannot_be_stored_is_run_again(context: Context, store: AwayStore) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 from anyio import CapacityLimiter, to_thread
 from fastapi import Depends, Query
+from redis import Redis
 from starlette.requests import Request
 
 from regnf_service.fields.uploads import Upload, open_upload
@@ -18,8 +19,9 @@ from regnf_service.http.concurrency import Slots, Waiters
 from regnf_service.http.job_watch import JobWatch
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore
+from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
-from regnf_state.records import Quota, RecordStore
+from regnf_state.records import Quota
 from regnf_state.settings import Settings
 
 _UPLOAD_THREADS = 4
@@ -32,10 +34,11 @@ class Services:
     """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
 
     settings: Settings
-    records: RecordStore
+    redis: Redis
+    records: JournaledRecordStore
     blobs: BlobStore
     queue: JobQueue
-    webhooks: Webhooks = field(default_factory=Webhooks)
+    webhooks: Webhooks
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
     # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one

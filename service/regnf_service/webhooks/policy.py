@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from regnf_service.http.problems import Problem
 from regnf_service.webhooks.signing import Secrets
 from regnf_service.webhooks.targets import AllowList
 from regnf_state.records import JobRecord
-from regnf_state.redis.webhook_outbox import Delivery, Outbox
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
 
 _POINTER = "/webhook/url"
 
 
 @dataclass(frozen=True)
 class Webhooks:
-    """The hosts that are allowed, the callers' keys, and the outbox if there is one."""
+    """The hosts that are allowed, the callers' keys, and the outbox."""
 
-    allowed: AllowList = field(default_factory=lambda: AllowList(()))
-    secrets: Secrets = field(default_factory=dict)
-    outbox: Outbox | None = None
+    allowed: AllowList
+    secrets: Secrets
+    outbox: RedisOutbox
 
     def check(self, caller: str, request: Mapping[str, Any]) -> None:
         """Raises Problem WEBHOOK_NOT_ALLOWED."""
@@ -37,4 +37,4 @@ class Webhooks:
         """How the job's message fares; None for a job without one."""
         if "webhook" not in record.request:
             return None
-        return Delivery() if self.outbox is None else self.outbox.delivery(record.id)
+        return self.outbox.delivery(record.id)

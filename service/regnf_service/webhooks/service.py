@@ -25,19 +25,19 @@ _AT_ONCE = 4
 _LOOK_EVERY_S = 1.0
 
 
-def webhooks_of(settings: Settings, redis: Redis | None) -> Webhooks:
+def webhooks_of(settings: Settings, redis: Redis) -> Webhooks:
     """What the settings say of webhooks. Raises TokensError."""
     secrets = read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
-    return Webhooks(AllowList(settings.webhook_hosts), secrets, None if redis is None else RedisOutbox(redis))
+    return Webhooks(AllowList(settings.webhook_hosts), secrets, RedisOutbox(redis))
 
 
-async def deliver_until_stopped(services: Services, redis: Redis) -> None:
+async def deliver_until_stopped(services: Services) -> None:
     """Send what is due, a few at once, until the service stops; nothing where no host is allowed."""
     webhooks = services.webhooks
     if not webhooks.allowed:
         return
     sender = HttpSender(webhooks.allowed.permits)
-    deliverer = Deliverer(services.records, RedisOutbox(redis), sender, webhooks.allowed, webhooks.secrets)
+    deliverer = Deliverer(services.records, RedisOutbox(services.redis), sender, webhooks.allowed, webhooks.secrets)
     threads = CapacityLimiter(_AT_ONCE)
     await asyncio.gather(*(_deliver(deliverer, services.stopping, threads) for _ in range(_AT_ONCE)))
 

@@ -1,0 +1,44 @@
+"""Everything that a process of the service keeps state in, opened as the settings say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from redis import Redis
+
+from regnf_state.blobs.base import BlobStore
+from regnf_state.blobs.open import open_blobs
+from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.queue import JobQueue
+from regnf_state.redis.client import connect
+from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+
+
+class NoRedisError(RuntimeError):
+    """The settings name no Redis."""
+
+    reason = "REDIS_URL_MISSING"
+
+
+@dataclass(frozen=True)
+class Stores:
+    """Records and queue in one Redis, and blobs."""
+
+    redis: Redis
+    records: JournaledRecordStore
+    blobs: BlobStore
+    queue: JobQueue
+
+
+def open_stores(settings: Settings, *, retries: int, storage_wait_s: float, existing: bool = False) -> Stores:
+    """The stores that the settings name. Raises NoRedisError.
+
+    A command to Redis is tried again ``retries`` times, and a storage that is away is waited for ``storage_wait_s``
+    seconds. ``existing``: for a job, which makes no storage of its own where that of its worker is away.
+    """
+    if settings.redis_url is None:
+        raise NoRedisError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
+    redis = connect(settings.redis_url, retries=retries)
+    blobs = open_blobs(settings, storage_wait_s, existing)
+    return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, RqJobQueue(redis))
