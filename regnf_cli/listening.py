@@ -13,6 +13,7 @@ from regnf_service.webhooks.targets import AllowList
 from regnf_state.settings import Settings
 
 _BACKLOG = 2048
+_TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
 
 
 def check_access(settings: Settings) -> None:
@@ -22,16 +23,16 @@ def check_access(settings: Settings) -> None:
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
         raise StartError(
-            f"{settings.publish or settings.host} can be reached by others and no token is asked for: "
-            "set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind something that authenticates",
+            f"{settings.publish or settings.host} can be reached by others, and no token is configured",
             reason="UNAUTHENTICATED_PUBLIC_BIND",
+            hint="Set REGNF_API_TOKENS, or REGNF_ALLOW_UNAUTHENTICATED=true behind a proxy that authenticates.",
         )
     try:
         read_callers(settings.api_tokens, settings.api_tokens_file)
         read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
         AllowList(settings.webhook_hosts)
     except TokensError as error:
-        raise StartError(str(error), reason=error.reason) from error
+        raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
 
 
 def open_socket(settings: Settings) -> socket.socket:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from regnf_cli.console import out, phase_progress
+from regnf_cli.console import err, out, phase_progress
 from regnf_cli.extras import require
 from regnf_cli.output import prepare, write_into
 from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT
@@ -80,6 +80,8 @@ def register(
             reason="INITIAL_TRANSFORM_UNSUPPORTED",
             hint="Leave --initial-transform out, or use --preset robust.",
         )
+    if scene.samefile(object_):
+        err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
     check_box_by_header(scene, box, object_)
     if server is not None:
         from regnf_cli.remote import RemoteService

@@ -27,6 +27,8 @@ def show_result(document: dict[str, Any]) -> None:
     )
     if detail := document.get("verdict_detail"):
         _line("", detail)
+    if hint := document.get("verdict_hint"):
+        _line("hint", hint)
     transform = document["T_object_scene"]
     out.print("T_object_scene (scene coordinates to object coordinates)")
     for row in transform["matrix"]:

@@ -37,11 +37,12 @@ def worker(
         os.environ["REGNF_REDIS_URL"] = redis_url  # the jobs' processes read it there too
     try:
         run_worker(read_settings())
-    except (NoRedisError, PreloadError) as error:
+    except NoRedisError as error:
+        message = "no Redis is named: neither --redis-url nor REGNF_REDIS_URL is given"
         hint = "Give --redis-url redis://HOST:6379/0, or start `regnf serve`, which brings its own Redis and worker."
-        raise StartError(
-            str(error), reason=error.reason, hint=hint if isinstance(error, NoRedisError) else None
-        ) from error
+        raise StartError(message, reason=error.reason, hint=hint) from error
+    except PreloadError as error:
+        raise StartError(str(error), reason=error.reason) from error
     except RedisConnectionError as error:
         hint = "Start Redis, or check the address in --redis-url or REGNF_REDIS_URL."
         raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE", hint=hint) from error

@@ -1,4 +1,4 @@
-"""Whether a path can be a field at all, and which file was meant when it cannot. Torch-free; opens nothing large."""
+"""Whether a path can be a field at all, and which file was meant when it cannot. Torch-free; reads a few bytes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 
 CHECKPOINT_SUFFIXES = frozenset({".ckpt", ".pt", ".pth", ".tar"})
 _TEXT_SUFFIXES = frozenset({".yml", ".yaml", ".json", ".toml", ".txt", ".log"})
@@ -18,7 +19,7 @@ _MAX_NAME = 200
 
 
 def require_field_file(path: Path) -> None:
-    """Raises InvalidInputError FILE_NOT_FOUND or FILE_IS_FOLDER, FieldFormatError FILE_EMPTY or FORMAT_NOT_RECOGNIZED.
+    """Raises InvalidInputError FILE_NOT_FOUND or FILE_IS_FOLDER, FieldFormatError as ``explain_refusal`` has it.
 
     Each names the path; for the folder of a training run and its config.yml, the hint names the checkpoint inside.
     """
@@ -28,8 +29,11 @@ def require_field_file(path: Path) -> None:
         hint = f"Did you mean {found}?" if found else "Give the checkpoint that it belongs to."
         message = f"{path}: a text file ({path.suffix}), expected a field: safe field, checkpoint or mesh"
         raise FieldFormatError(message, reason="FORMAT_NOT_RECOGNIZED", hint=hint)
-    if path.stat().st_size == 0:
-        raise FieldFormatError(f"{path}: the file is empty", reason="FILE_EMPTY", hint="Copy or download it again.")
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    if sniff_format(head) is None:
+        reason, message = explain_refusal(head)
+        raise FieldFormatError(f"{path}: {message}", reason=reason)
 
 
 def require_file(path: Path) -> None:

@@ -29,6 +29,24 @@ HINTS: dict[str, str] = {
     "around more of the object.",
     "LARGE_RESIDUAL": "Most often it is another object. With the preset paper, try the preset robust or more "
     "iterations.",
+    "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote; docs/families.md lists what is taken.",
+    "FORMAT_NOT_SUPPORTED": "docs/families.md lists the files that are taken.",
+    "FIELD_NOT_RECOGNIZED": "docs/families.md lists the networks that are taken, and what a description may add.",
+    "FILE_EMPTY": "Copy or download the file again.",
+    "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",
+    "SAFE_FORMAT_INVALID": "The file is damaged, or no field of regnf. Copy it again, or give the checkpoint that it "
+    "was made from.",
+    "RAW_PICKLE": "Save it again with torch.save.",
+    "INVALID_DETECTION": "docs/api.md shows every form of a detection.",
+    "INVALID_OPTIONS": "docs/api.md lists every option with its range.",
+    "UPLOAD_EMPTY": "Check the path of the file: `curl --data-binary @room.ckpt` sends one.",
+    "DIGEST_MISMATCH": "Take the SHA-256 of the very bytes that are sent (`sha256sum FILE`), or POST /fields, which "
+    "computes it.",
+    "INVALID_DIGEST": "`sha256sum FILE` prints it; or POST /fields, which computes it.",
+    "MALFORMED_MULTIPART": "Let the client write the body and its boundary: `curl -F name=@file`.",
+    "MISSING_PART": "docs/api.md names the parts that each address takes.",
+    "UNKNOWN_PART": "docs/api.md names the parts that each address takes.",
+    "JOB_NOT_FOUND": "GET /jobs lists the jobs that there are.",
     "WORKER_LOST": "Most often memory ran out. Post the same request to start it again, or use a worker with more "
     "memory.",
     "JOB_TIMEOUT": "Use fewer samples, or set a longer time limit for the service (REGNF_JOB_TIMEOUT_S).",

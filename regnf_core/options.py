@@ -176,7 +176,8 @@ class RegistrationOptions:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
             hint = did_you_mean(first["loc"]) if first["type"] == UNKNOWN_OPTION else ""
-            raise InvalidOptionsError(f"options.{where}: {first['msg']}{hint}") from error
+            what = "no such option" if first["type"] == UNKNOWN_OPTION else first["msg"]
+            raise InvalidOptionsError(f"options.{where}: {what}{hint}") from error
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of every option, defaults included, in a fixed order."""

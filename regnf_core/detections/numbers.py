@@ -14,12 +14,13 @@ Place = tuple[str | int, ...]
 MAX_COORDINATE = 1e6
 """Largest coordinate and edge length. Fields are evaluated in float32, which has seven digits."""
 _MAX_SHOWN = 60
+_HINT = "docs/api.md shows every form of a detection."
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,40}")
 
 
 def fault(place: Place, message: str, hint: str | None = None) -> InvalidDetectionError:
     """The error for the member at ``place``; the message begins with the member's name."""
-    return InvalidDetectionError(f"{said(place)} {message}", hint=hint, place=place)
+    return InvalidDetectionError(f"{said(place)} {message}", hint=hint or _HINT, place=place)
 
 
 def said(place: Place) -> str:
@@ -53,9 +54,10 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
         hint = "Remove the quotation marks." if isinstance(value, str) else None
         raise fault(place, f"is {shown(value)}, expected a number", hint)
     if isinstance(value, float) and not math.isfinite(value):
-        raise fault(place, f"is {shown(value)}, expected a finite number")
+        raise fault(place, f"is {shown(value)}, expected a finite number", "Leave boxes out that have no place.")
     if abs(value) > limit:
-        raise fault(place, f"is {shown(value)}, expected at most {limit:g} either way")
+        message = f"is {shown(value)}, expected at most {limit:g} either way"
+        raise fault(place, message, "Fields have seven digits: move the origin of scene and box nearer.")
     return float(value)
 
 

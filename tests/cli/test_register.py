@@ -26,7 +26,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     truth = chair_pose()
     fields = {"room.safetensors": room(truth), "chair.safetensors": chair()}
     for name in fields:
-        (tmp_path / name).write_bytes(b"in its place a field is given below")
+        (tmp_path / name).write_bytes(bytes(8) + b"{")
     monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
     box = chair_box(truth)
     (tmp_path / "box.json").write_text(json.dumps({"center": box.center.tolist(), "size": box.size.tolist()}))
@@ -41,7 +41,7 @@ def twins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     truth = Sim3.from_translation(torch.tensor([0.0, 0.0, -0.3], dtype=torch.float64))
     fields = {"room.safetensors": table_room(truth), "table.safetensors": slab_table()}
     for name in fields:
-        (tmp_path / name).write_bytes(b"in its place a field is given below")
+        (tmp_path / name).write_bytes(bytes(8) + b"{")
     monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
     (tmp_path / "box.json").write_text('{"min": [-0.48, -0.33, -0.03], "max": [0.48, 0.33, 0.49]}')
     return ["register", *(tmp_path / name for name in fields), "--detection", tmp_path / "box.json"]

@@ -128,6 +128,7 @@ FAILURE = {
     "title": "No surface in the detection",
     "status": 422,
     "reason": "NO_SURFACE_IN_DETECTION",
+    "hint": "Check the box.",
     "detail": "12 surface points were found inside the box <b>chair</b>; 500 are needed.",
     "request_id": "req-7f3a",
 }

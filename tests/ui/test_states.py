@@ -62,7 +62,7 @@ def test_failure_tells_reason_and_detail_as_text(visit: Visit) -> None:
     facts = page.locator("#message-facts").inner_text()
     assert "NO_SURFACE_IN_DETECTION" in facts
     assert "req-7f3a" in facts
-    assert page.locator("#message-hint").is_visible()
+    assert page.locator("#message-hint").inner_text() == "Check the box."
     assert not page.locator("#canvas").is_visible()
     assert visit.complaints == []
 

@@ -77,6 +77,7 @@ class ResultDocument(Outgoing):
     verdict: Verdict
     verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
     verdict_detail: str = Field("", description="The reason in words, for people.")
+    verdict_hint: str = Field("", description="What to do next, for people; empty for a registered result.")
     T_object_scene: TransformDocument = Field(description="Scene coordinates to object coordinates.")
     T_scene_object: TransformDocument = Field(description="Its inverse.")
     T_object_scene_initial: TransformDocument | None = Field(None, description="Where the refinement began.")

@@ -3,7 +3,6 @@
 import { secondsByPhase } from './documents.js';
 import { byId, copyText, el, fillFacts, show } from './dom.js';
 import { bytes, fixed, moment, number, percent, seconds, words } from './format.js';
-import { hintFor } from './hints.js';
 import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
 
 const DIRECTIONS = {
@@ -18,7 +17,7 @@ export function showVerdict(result) {
   byId('verdict-word').textContent = words(verdict);
   const why = el('span', {}, result.verdict_detail || words(reason));
   byId('verdict-reason').replaceChildren(why, ' ', el('code', { title: 'Stable reason, for programs' }, reason ?? ''));
-  const hint = verdict === 'registered' ? '' : hintFor(reason);
+  const hint = result.verdict_hint;
   if (hint) byId('verdict-reason').append(el('span', { className: 'hint' }, hint));
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;

@@ -4,7 +4,6 @@ import { ApiProblem } from './api.js';
 import { PHASES, isActive } from './documents.js';
 import { byId, el, fillFacts, show } from './dom.js';
 import { words } from './format.js';
-import { hintFor } from './hints.js';
 
 const TONES = {
   accepted: 'wait', running: 'wait', successful: 'good', failed: 'bad', dismissed: 'still',
@@ -100,7 +99,7 @@ function card({ eyebrow, title, text = '', tone }) {
 }
 
 function showProblem(problem) {
-  const hint = hintFor(problem.reason);
+  const hint = problem.hint ?? '';
   byId('message-hint').textContent = hint;
   show(byId('message-hint'), hint !== '');
   const code = problem.reason ? el('code', {}, problem.reason) : null;

@@ -1,0 +1,71 @@
+"""Files that a new user gives by mistake, at the command line."""
+
+# ruff: noqa: E501 -- a mistake is one line of a table
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.cli.conftest import DATA, Run
+from tests.mistakes.case import Case, parametrized
+
+FIELD = "expected a f|field is expected|not a field|not the file|cut short|empty|no bytes|unpack"
+
+
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def cut_checkpoint(folder: Path) -> None:
+    import torch
+
+    torch.save({"weights": torch.zeros(1000)}, folder / "whole.ckpt")
+    (folder / "cut.ckpt").write_bytes((folder / "whole.ckpt").read_bytes()[:2000])
+
+
+def foreign_checkpoint(folder: Path) -> None:
+    import torch
+
+    torch.save({"encoder": torch.zeros(10)}, folder / "other.ckpt")
+
+
+CASES = [
+    Case("scene missing", "FILE_NOT_FOUND", 2, "rom.safetensors", "no such file", "Did you mean room.safetensors", "rom.safetensors"),
+    Case("another ending", "FILE_NOT_FOUND", 2, "room.ckpt", "no such file", "Did you mean room.safetensors", "room.ckpt"),
+    Case("folder missing", "FILE_NOT_FOUND", 2, "exports/room.ckpt", "no such file", "There is no folder exports", "exports/room.ckpt"),
+    Case("empty folder", "FILE_IS_FOLDER", 2, "nothing", "expected a file", "Give a file inside", "nothing"),
+    Case("folder of a run", "FILE_IS_FOLDER", 2, "run", "expected a file", "mean run/sdfstudio_models/step-000030000.ckpt", "run"),
+    Case("config of a run", "FORMAT_NOT_RECOGNIZED", 2, "run/config.yml", FIELD, "mean run/sdfstudio_models/step-000030000.ckpt", "run/config.yml"),
+    Case("detection as scene", "FORMAT_NOT_RECOGNIZED", 2, "box.json", FIELD, "mean run/|checkpoint", "box.json"),
+    Case("empty file", "FILE_EMPTY", 2, "a.ckpt", FIELD, "again", "a.ckpt", write("a.ckpt", b"")),
+    Case("picture", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt: a PNG", FIELD, "checkpoint", "a.ckpt", write("a.ckpt", b"\x89PNG\r\n\x1a\n0000")),
+    Case("photo", "FORMAT_NOT_RECOGNIZED", 2, "a.jpg: a JPEG", FIELD, "checkpoint", "a.jpg", write("a.jpg", b"\xff\xd8\xff\xe0000")),
+    Case("web page", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt: an HTML page", FIELD, "download", "a.ckpt", write("a.ckpt", b"<!DOCTYPE html><html>")),
+    Case("Git LFS pointer", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt", FIELD, "git lfs pull", "a.ckpt", write("a.ckpt", b"version https://git-lfs.github.com/spec/v1\n")),
+    Case("gzip archive", "FORMAT_NOT_RECOGNIZED", 2, "a.tar.gz", FIELD, "unpack", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
+    Case("notes", "FORMAT_NOT_RECOGNIZED", 2, "notes.txt", FIELD, "checkpoint|mean", "notes.txt", write("notes.txt", b"to do")),
+    Case("bare pickle", "RAW_PICKLE", 2, "a.pkl", "torch.save", "Save it again", "a.pkl", write("a.pkl", b"\x80\x04\x95\0\0\0\0}.")),
+    Case("zip of other things", "FORMAT_NOT_SUPPORTED", 2, "a.zip", "torch.save", "docs/families", "a.zip", write("a.zip", b"PK\x03\x04" + bytes(22) + b"\x05\0\0\0a.txt")),
+    Case("truncated checkpoint", "FILE_TRUNCATED", 2, "cut.ckpt", "cut short", "again", "cut.ckpt", cut_checkpoint),
+    Case("truncated safe field", "SAFE_FORMAT_INVALID", 2, "a.safetensors", "safetensors", "again|docs", "a.safetensors", lambda folder: (folder / "a.safetensors").write_bytes((DATA / "armchair.safetensors").read_bytes()[:3000])),
+    Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "no known", "docs/families.md", "other.ckpt", foreign_checkpoint),
+]  # fmt: skip
+
+
+@parametrized(CASES)
+def test_a_wrong_scene(case: Case, run: Run, folder: Path) -> None:
+    case.prepare(folder)
+    outcome = run("register", case.how, "chair.safetensors", "--detection", "box.json")
+    assert outcome.code == case.code, outcome.stderr
+    assert case.reason in outcome.stderr
+    assert outcome.stdout == ""
+    case.check(outcome.stderr)
+
+
+def test_inspect_and_convert_name_the_file_too(run: Run, folder: Path) -> None:
+    (folder / "page.ckpt").write_bytes(b"<html>")
+    for arguments in (["inspect", "page.ckpt"], ["convert", "page.ckpt", "out.ply"], ["inspect", "run"]):
+        outcome = run(*arguments)
+        assert outcome.code == 2
+        assert arguments[1] in outcome.stderr
+        assert "hint: " in outcome.stderr
