@@ -41,6 +41,7 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
             "WEBHOOK_NOT_ALLOWED",  # the operator's list
             "IDEMPOTENCY_KEY_REUSED",  # what was asked before
             "QUOTA_ACTIVE_JOBS",
+            "QUOTA_WEBHOOKS",
         }
     ),
     "POST /fields": frozenset(

@@ -109,6 +109,7 @@ REASONS: dict[str, Reason] = {
     ),
     "QUEUE_FULL": Reason(503, "Queue full", "As many jobs are active as the service takes. Retry after `Retry-After`."),
     "QUOTA_ACTIVE_JOBS": Reason(429, "Quota of jobs used up", "As many of your jobs are active as may be."),
+    "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks already. Ask for its state."),
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),

@@ -79,6 +79,14 @@ class JobRecord:
     phase_since: float | None = None
     verdict: str | None = None
     """Of a successful job: what its result says."""
+    more_webhooks: list[str] = field(default_factory=list)
+    """Addresses named by later requests for this job, which are told of its end as well."""
+
+    @property
+    def webhooks(self) -> list[str]:
+        """Every address that is told of the job's end, in the order of asking."""
+        own = [self.request["webhook"]["url"]] if "webhook" in self.request else []
+        return own + self.more_webhooks
 
     @property
     def owner(self) -> str:
@@ -150,8 +158,9 @@ class RecordStore(Protocol):
         """Store a new job, or return the one that exists under its id (False).
 
         A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
-        returned, with its attempt. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
-        QuotaError when the owner has as many as it may.
+        returned, with its attempt. A webhook of ``record`` that the job does not have yet is added to it, and told at
+        once if the job has finished. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
+        QuotaError when the owner, or the job of webhooks, has as many as it may.
         """
         ...
 

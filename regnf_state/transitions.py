@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, StaleAttemptError
+from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, QuotaError, StaleAttemptError
+
+MAX_WEBHOOKS = 16
+"""How many addresses one job tells of its end."""
 
 _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
@@ -81,6 +84,7 @@ def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
         version=record.version + 1,
         attempt=record.attempt + 1,
         requeues=requeues,
+        more_webhooks=record.more_webhooks,
     )
 
 
@@ -92,9 +96,35 @@ def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> Job
     return _next_attempt(record, now, record.requeues + (1 if lost else 0))
 
 
-def restarted_job(record: JobRecord, now: float) -> JobRecord | None:
-    """A failed or dismissed job as its next attempt; None for a job that stands."""
-    return _next_attempt(record, now, 0) if record.status in ("failed", "dismissed") else None
+def restarted_job(record: JobRecord, new: JobRecord, now: float) -> JobRecord | None:
+    """A failed or dismissed job, asked for again by ``new``, as its next attempt; None for a job that stands.
+
+    Both requests have the same result; the record holds the later one. Raises QuotaError as ``joined_job`` does.
+    """
+    if record.status not in ("failed", "dismissed"):
+        return None
+    earlier = [url for url in record.webhooks if url not in new.webhooks]
+    asked = _with_webhooks(replace(record, request=new.request, inputs=new.inputs), earlier)
+    return _next_attempt(asked, now, 0)
+
+
+def joined_job(record: JobRecord, new: JobRecord) -> JobRecord:
+    """A job that stands after ``new`` has asked for the same: its webhook is told as well.
+
+    The job itself is returned when it has that webhook, or none was named. Its times stay: they are of its progress.
+    Raises QuotaError (QUOTA_WEBHOOKS).
+    """
+    added = [url for url in new.webhooks if url not in record.webhooks]
+    if not added:
+        return record
+    return replace(_with_webhooks(record, record.more_webhooks + added), version=record.version + 1)
+
+
+def _with_webhooks(record: JobRecord, more: list[str]) -> JobRecord:
+    changed = replace(record, more_webhooks=more)
+    if len(changed.webhooks) > MAX_WEBHOOKS:
+        raise QuotaError("QUOTA_WEBHOOKS")
+    return changed
 
 
 def changed_field(record: FieldRecord, attempt: int | None, changes: dict[str, Any], now: float) -> FieldRecord:

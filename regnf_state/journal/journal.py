@@ -4,6 +4,7 @@ One folder a job, objects in it that are written once and never changed:
     journal/jobs/{id}/{attempt}-accepted    the record as it was accepted; written before the caller is told
     journal/jobs/{id}/{attempt}-begun       a later attempt is about to be claimed: whoever counts attempts counts it
     journal/jobs/{id}/{attempt}-ended       the record as it ended
+    journal/jobs/{id}/{attempt}-webhooks{n} the record with n webhooks of later requests, before those are answered
 One object a field, the record as it was last written: journal/fields/{reference}.
 """
 
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from itertools import groupby
 from typing import Any, TypeVar
@@ -23,6 +24,7 @@ from regnf_state.records import FieldRecord, JobRecord
 _JOBS = "journal/jobs"
 _FIELDS = "journal/fields"
 _STORAGE_ID = "journal/storage-id"
+_WEBHOOKS = "webhooks"
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
@@ -49,6 +51,10 @@ class Journal:
         if not self._write(job, "accepted") and self._read(job.id, job.attempt, "accepted").created != job.created:
             self.forget(job.id)  # a job of this id that has outlived its retention
             self._write(job, "accepted")
+
+    def join(self, job: JobRecord) -> None:
+        """Keep the webhooks that later requests have added to the job."""
+        self._write(job, f"{_WEBHOOKS}{len(job.more_webhooks)}")
 
     def begin(self, job_id: str, attempt: int) -> None:
         self._blobs.put_if_absent(f"{_folder(job_id)}/{attempt:06d}-begun", b"")
@@ -82,13 +88,19 @@ class Journal:
         if "accepted" not in attempts:
             return None
         accepted, latest = max(attempts["accepted"]), max(int(number) for number, _ in events)
+        joined = [(int(n), name) for n, name in events if name.startswith(_WEBHOOKS) and int(n) >= accepted]
         ended = max(attempts.get("ended", [0]))
-        if ended >= accepted:
-            return self._read(job_id, ended, "ended")
-        job = self._read(job_id, accepted, "accepted")
+        kept = (ended, "ended") if ended >= accepted else (accepted, "accepted")
+        job = replace(self._read(job_id, *kept), more_webhooks=self._more_webhooks(job_id, [kept, *joined]))
+        if kept[1] == "ended":
+            return job
         if self._blobs.exists(f"jobs/{job_id}/manifest.json"):
             return replace(job, status="successful", attempt=latest, progress=1.0, updated=now, finished=now)
         return replace(job, attempt=latest + 1)
+
+    def _more_webhooks(self, job_id: str, events: Iterable[tuple[int, str]]) -> list[str]:
+        """Those of whichever event has most: a job keeps what was added to it."""
+        return max((self._read(job_id, *event).more_webhooks for event in events), key=len)
 
     def _read(self, job_id: str, attempt: int, event: str) -> JobRecord:
         with self._blobs.open(f"{_folder(job_id)}/{attempt:06d}-{event}") as file:

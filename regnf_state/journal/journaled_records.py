@@ -46,6 +46,8 @@ class JournaledRecordStore(RedisRecordStore):
             self._redis.zadd(_USED, dict.fromkeys(names, job.updated))
         if job.status == "accepted":
             self.journal.accept(job)  # also one known before: whoever recorded it may have died right there
+        if job.more_webhooks and not created:
+            self.journal.join(job)  # also those known before, for the same reason
         return job, created
 
     def get_job(self, job_id: str) -> JobRecord | None:

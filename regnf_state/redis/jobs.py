@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, cast
 
 from redis import Redis
 
@@ -107,10 +107,10 @@ class RedisRecordStore(RedisFieldRecords):
             gone = str(int((expires + self._retention_s) * 1000))
             commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
             commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
-            commands += outbox.entering(after, expires)
+            commands += outbox.entering(before, after, expires)
         else:
             commands += [("PERSIST", each) for each in (key, events)]
-            commands += outbox.forgetting(before) if before is not None else []
+            commands += outbox.forgetting(before) if before is not None and before.finished is not None else []
             commands += [("ZREM", _EXPIRING, after.id), ("DEL", _gone_key(after.id))]
         return commands
 
@@ -134,19 +134,19 @@ class RedisRecordStore(RedisFieldRecords):
         while True:
             document, now = self._read(_key(record.id))
             known = JobRecord(**document) if document is not None else None
-            fresh = transitions.restarted_job(known, now) if known is not None else record
-            if fresh is None:
-                assert known is not None
-                return known, False
+            fresh = transitions.restarted_job(known, record, now) if known is not None else record
+            after = fresh or transitions.joined_job(cast(JobRecord, known), record)
+            if after is known:
+                return after, False
             version = known.version if known is not None else 0
-            commands = self._commands(known, fresh)
-            answer = self._compare_and_set(_key(record.id), version, commands, asdict(fresh), caps)
+            commands = self._commands(known, after)
+            answer = self._compare_and_set(_key(record.id), version, commands, asdict(after), caps if fresh else ())
             if answer == "FULL":
                 raise QueueFullError(f"{max_active} jobs are active already")
             if answer.startswith("QUOTA"):
                 raise QuotaError(answer)
             if answer == "OK":
-                return fresh, True
+                return after, fresh is not None
 
     def restore_job(self, record: JobRecord) -> bool:
         """Put a record that was lost back as it is; False when the job is known."""

@@ -1,4 +1,7 @@
-"""The messages that are still to be sent, in Redis: entered together with the end of a job, so that none is lost."""
+"""The messages that are still to be sent, in Redis: entered together with the end of a job, so that none is lost.
+
+A job has a message for each of its webhooks, named by the job, its attempt and the webhook's place among them.
+"""
 
 from __future__ import annotations
 
@@ -44,33 +47,52 @@ class Delivery:
     delivered_at: float | None = None
 
 
-def _state_key(job_id: str) -> str:
-    return f"{PREFIX}webhook:{job_id}"
+def _state_key(job_id: str, place: int) -> str:
+    return f"{PREFIX}webhook:{job_id}:{place}"
 
 
-def message_of(record: JobRecord) -> str:
-    """The name of the message about the end of this attempt."""
-    return f"{record.id}-{record.attempt}"
+@dataclass(frozen=True)
+class Message:
+    """A message about the end of an attempt. place: of its receiver among the job's webhooks."""
+
+    job_id: str
+    attempt: int
+    place: int
+
+    @classmethod
+    def named(cls, name: str) -> Message:
+        """The message of this name."""
+        job_id, attempt, place = name.rsplit("-", 2)
+        return cls(job_id, int(attempt), int(place))
+
+    @property
+    def name(self) -> str:
+        return f"{self.job_id}-{self.attempt}-{self.place}"
 
 
-def entering(record: JobRecord, expires: float) -> list[Command]:
-    """What enters the message about a job that has just finished."""
-    if "webhook" not in record.request:
-        return []
-    key, message = _state_key(record.id), message_of(record)
-    return [
-        ("ZADD", _DUE, repr(record.finished), message),
-        ("DEL", key),
-        ("HSET", key, "message", message, "state", "pending", "sends", "0"),
-        ("PEXPIREAT", key, str(int(expires * 1000))),
-    ]
+def entering(before: JobRecord | None, after: JobRecord, expires: float) -> list[Command]:
+    """What enters the messages about a job that has finished: about its end, or for webhooks added since."""
+    known = before is not None and before.finished is not None and before.attempt == after.attempt
+    first = len(before.webhooks) if before is not None and known else 0
+    commands: list[Command] = []
+    for place in range(first, len(after.webhooks)):
+        key, message = _state_key(after.id, place), Message(after.id, after.attempt, place).name
+        commands += [
+            ("ZADD", _DUE, repr(after.finished), message),
+            ("DEL", key),
+            ("HSET", key, "message", message, "state", "pending", "sends", "0"),
+            ("PEXPIREAT", key, str(int(expires * 1000))),
+        ]
+    return commands
 
 
 def forgetting(record: JobRecord) -> list[Command]:
-    """What drops the message of a job that is deleted or started anew."""
-    if "webhook" not in record.request:
-        return []
-    return [("ZREM", _DUE, message_of(record)), ("DEL", _state_key(record.id))]
+    """What drops the messages of a job that is deleted or started anew."""
+    commands: list[Command] = []
+    for place in range(len(record.webhooks)):
+        message = Message(record.id, record.attempt, place).name
+        commands += [("ZREM", _DUE, message), ("DEL", _state_key(record.id, place))]
+    return commands
 
 
 class RedisOutbox:
@@ -81,37 +103,45 @@ class RedisOutbox:
         self._claim = redis.register_script(_CLAIM)
         self._settle = redis.register_script(_SETTLE)
 
-    def claim(self) -> str | None:
+    def claim(self) -> Message | None:
         """A message that is due, for this process alone for a minute; None when there is none."""
-        message: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
-        return None if message is None else text(message)
+        name: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
+        return None if name is None else Message.named(text(name))
 
-    def settle(self, message: str, delivery: Delivery, outcome: str = "dropped") -> None:
+    def settle(self, message: Message, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""
-        job_id = message.rpartition("-")[0]
         shown: dict[str, Any] = {"state": delivery.state, "sends": delivery.sends}
         for name in ("last_status", "last_error", "next_at", "delivered_at"):
             value = getattr(delivery, name)
             shown[name] = "" if value is None else value
         due = "" if delivery.next_at is None else repr(delivery.next_at)
         fields = [part for pair in shown.items() for part in pair]
-        self._settle(keys=[_DUE, _state_key(job_id)], args=[due, message, *fields])
+        key = _state_key(message.job_id, message.place)
+        self._settle(keys=[_DUE, key], args=[due, message.name, *fields])
         count(self._redis, "webhook_sends", outcome)
 
-    def delivery(self, job_id: str) -> Delivery:
-        held: Any = self._redis.hgetall(_state_key(job_id))
-        found = {text(name): text(value) for name, value in held.items()}
-        if not found:
-            return Delivery()
-        return Delivery(
-            state=cast(DeliveryState, found["state"]),
-            sends=int(found["sends"]),
-            last_status=int(found["last_status"]) if found.get("last_status") else None,
-            last_error=found.get("last_error") or None,
-            next_at=float(found["next_at"]) if found.get("next_at") else None,
-            delivered_at=float(found["delivered_at"]) if found.get("delivered_at") else None,
-        )
+    def deliveries(self, record: JobRecord) -> list[Delivery]:
+        """How the message to each of the job's webhooks fares."""
+        if not record.webhooks:
+            return []
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for place in range(len(record.webhooks)):
+                pipeline.hgetall(_state_key(record.id, place))
+            return [_delivery({text(name): text(value) for name, value in held.items()}) for held in pipeline.execute()]
 
     def waiting(self) -> int:
         """How many messages are still to be sent."""
         return int(self._redis.zcard(_DUE))
+
+
+def _delivery(found: dict[str, str]) -> Delivery:
+    if not found:
+        return Delivery()
+    return Delivery(
+        state=cast(DeliveryState, found["state"]),
+        sends=int(found["sends"]),
+        last_status=int(found["last_status"]) if found.get("last_status") else None,
+        last_error=found.get("last_error") or None,
+        next_at=float(found["next_at"]) if found.get("next_at") else None,
+        delivered_at=float(found["delivered_at"]) if found.get("delivered_at") else None,
+    )

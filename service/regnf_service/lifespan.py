@@ -24,9 +24,7 @@ _REAP_EVERY_S = 15.0
 _CLEARING_UP_S = 5.0
 
 
-def lifespan_of(
-    services: Services, metrics: Metrics
-) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
     """The lifespan of an application over these services: begins what goes on beside requests, and ends it in order."""
 
     @asynccontextmanager

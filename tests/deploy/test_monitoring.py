@@ -14,7 +14,7 @@ from prometheus_client import generate_latest
 from regnf_service.metrics import Metrics
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
-from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 from regnf_state.settings import Settings
 from tests.redis_server import private_redis
 from tests.stores import services_over
@@ -41,7 +41,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         store.update_job("ended", 1, status="successful", verdict="registered")
         store.create_field(FieldRecord("a" * 64, "validating", 1, store.now(), store.now()))
         store.update_field("a" * 64, state="ready")
-        RedisOutbox(redis).settle("ended-1", Delivery("delivered"))
+        RedisOutbox(redis).settle(Message("ended", 1, 0), Delivery("delivered"))
         metrics = Metrics(services)
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)

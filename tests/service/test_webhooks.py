@@ -23,7 +23,7 @@ from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.webhook_outbox import RedisOutbox
+from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 
 KEY = bytes(range(24))
 SECRET = f"whsec_{base64.b64encode(KEY).decode()}"
@@ -87,6 +87,21 @@ def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1")
     error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "text"} if status == "failed" else None
     store.update_job(name, record.attempt, status="running")
     return store.update_job(name, record.attempt, status=status, error=error)
+
+
+def delivery(redis: Redis, place: int = 0, name: str = "j1") -> Delivery:
+    """How the message to one of the job's webhooks fares."""
+    record = RedisRecordStore(redis).get_job(name)
+    assert record is not None
+    return RedisOutbox(redis).deliveries(record)[place]
+
+
+def ask(redis: Redis, url: str, name: str = "j1") -> JobRecord:
+    """Another request of alice's for the same job, with a webhook of its own."""
+    store = RedisRecordStore(redis)
+    request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
+    now = store.now()
+    return store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)[0]
 
 
 # signatures
@@ -165,10 +180,10 @@ def test_a_name_that_resolves_to_a_private_address_is_not_followed(redis: Redis,
     named = receiver.address.replace("127.0.0.1", "localhost")
     finish(redis, f"{named}/x")
     assert deliverer(redis, [named]).run_once()
-    assert (receiver.received, RedisOutbox(redis).delivery("j1").last_error) == ([], "ADDRESS_NOT_ALLOWED")
+    assert (receiver.received, delivery(redis).last_error) == ([], "ADDRESS_NOT_ALLOWED")
     # the list names the address itself, though with another port: then it is followed there
     assert deliverer(redis, [named, "127.0.0.1", "[::1]"]).run_once()
-    assert RedisOutbox(redis).delivery("j1").state == "delivered"
+    assert delivery(redis).state == "delivered"
 
 
 # what arrives
@@ -189,10 +204,10 @@ def test_a_message_arrives_signed(redis: Redis, receiver: Receiver, status: str)
     assert message["type"] == f"job.{status}"
     assert message["data"]["reason"] == ("NO_SURFACE_IN_DETECTION" if status == "failed" else None)
     assert (message["data"]["id"], message["data"]["attempt"]) == (record.id, 1)
-    found = RedisOutbox(redis).delivery("j1")
+    found = delivery(redis)
     assert (found.state, found.sends, found.last_status) == ("delivered", 1, 200)
     assert found.delivered_at is not None
-    assert 0 < redis.ttl("regnf:webhook:j1") <= 7 * 24 * 3600  # type: ignore[operator]
+    assert 0 < redis.ttl("regnf:webhook:j1:0") <= 7 * 24 * 3600  # type: ignore[operator]
 
 
 def test_sends_are_repeated_with_the_same_id_and_body(redis: Redis, receiver: Receiver) -> None:
@@ -201,7 +216,7 @@ def test_sends_are_repeated_with_the_same_id_and_body(redis: Redis, receiver: Re
     sent = deliverer(redis, [receiver.address])
     assert [sent.run_once() for _ in range(4)] == [True, True, True, False]
     assert len({(headers["webhook-id"], body) for _, headers, body in receiver.received}) == 1
-    found = RedisOutbox(redis).delivery("j1")
+    found = delivery(redis)
     assert (found.state, found.sends, found.last_status) == ("delivered", 3, 204)
 
 
@@ -212,13 +227,13 @@ def test_pauses_grow_and_end(redis: Redis, receiver: Receiver) -> None:
     for sends, pause in ((1, 60), (2, 3600)):
         now = RedisRecordStore(redis).now()
         assert sent.run_once()
-        found = outbox.delivery("j1")
+        found = delivery(redis)
         assert (found.state, found.sends, found.next_at is not None) == ("pending", sends, True)
         assert found.next_at == pytest.approx(now + pause, abs=20)
         assert not sent.run_once(), "not before its time"
-        redis.zadd("regnf:webhooks:due", {"j1-1": 0})
+        redis.zadd("regnf:webhooks:due", {"j1-1-0": 0})
     assert sent.run_once()
-    found = outbox.delivery("j1")
+    found = delivery(redis)
     assert (found.state, found.sends, found.next_at, outbox.waiting()) == ("failed", 3, None, 0)
 
 
@@ -228,20 +243,20 @@ def test_redirects_are_not_followed_and_gone_is_gone(redis: Redis, receiver: Rec
     finish(redis, f"{receiver.address}/here")
     deliverer(redis, [receiver.address], (60.0,)).run_once()
     assert [path for path, _, _ in receiver.received] == ["/here"]
-    found = RedisOutbox(redis).delivery("j1")
+    found = delivery(redis)
     assert (found.state, found.last_status) == (state, status)
 
 
 def test_a_receiver_that_is_not_there(redis: Redis, receiver: Receiver) -> None:
     finish(redis, "http://127.0.0.1:1/x")
     deliverer(redis, ["http://127.0.0.1:1"], (60.0,)).run_once()
-    assert RedisOutbox(redis).delivery("j1").last_error == "CONNECTION_FAILED"
+    assert delivery(redis).last_error == "CONNECTION_FAILED"
 
 
 def test_a_host_that_was_struck_off_the_list_is_told_nothing(redis: Redis, receiver: Receiver) -> None:
     finish(redis, receiver.address)
     deliverer(redis, ["hooks.example.org"], (60.0,)).run_once()
-    assert (receiver.received, RedisOutbox(redis).delivery("j1").last_error) == ([], "WEBHOOK_NOT_ALLOWED")
+    assert (receiver.received, delivery(redis).last_error) == ([], "WEBHOOK_NOT_ALLOWED")
 
 
 # that none is lost
@@ -250,11 +265,11 @@ def test_a_host_that_was_struck_off_the_list_is_told_nothing(redis: Redis, recei
 def test_a_message_outlives_who_took_it(redis: Redis, receiver: Receiver) -> None:
     """A process that dies after it took a message: another sends it once a minute is over, not before."""
     finish(redis, receiver.address)
-    assert RedisOutbox(redis).claim() == "j1-1"
+    assert RedisOutbox(redis).claim() == Message("j1", 1, 0)
     assert not deliverer(redis, [receiver.address]).run_once()
-    score = float(redis.zscore("regnf:webhooks:due", "j1-1"))  # type: ignore[arg-type]
+    score = float(redis.zscore("regnf:webhooks:due", "j1-1-0"))  # type: ignore[arg-type]
     assert score == pytest.approx(RedisRecordStore(redis).now() + 60, abs=20)
-    redis.zadd("regnf:webhooks:due", {"j1-1": 0})
+    redis.zadd("regnf:webhooks:due", {"j1-1-0": 0})
     assert deliverer(redis, [receiver.address]).run_once()
     assert len(receiver.received) == 1
 
@@ -287,11 +302,77 @@ def test_a_job_that_is_deleted_or_started_anew_takes_its_message_along(redis: Re
     record = store.get_job("j1")
     assert record is not None
     again, _ = store.create_job(record, 10)
-    assert (again.attempt, outbox.waiting(), outbox.delivery("j1").state) == (2, 0, "waiting")
+    assert (again.attempt, outbox.waiting(), delivery(redis).state) == (2, 0, "waiting")
     store.update_job("j1", 2, status="dismissed")
-    assert (outbox.waiting(), outbox.delivery("j1").state) == (1, "pending")
+    assert (outbox.waiting(), delivery(redis).state) == (1, "pending")
     store.delete_job("j1")
-    assert (outbox.waiting(), redis.exists("regnf:webhook:j1")) == (0, 0)
-    redis.zadd("regnf:webhooks:due", {"gone-1": 0})
+    assert (outbox.waiting(), redis.exists("regnf:webhook:j1:0")) == (0, 0)
+    redis.zadd("regnf:webhooks:due", {"gone-1-0": 0})
     assert deliverer(redis, [receiver.address]).run_once()
     assert (receiver.received, outbox.waiting()) == ([], 0)
+
+
+# several requests for one job
+
+
+def test_a_webhook_that_comes_after_the_end_is_told_at_once_and_the_others_not_again(
+    redis: Redis, receiver: Receiver
+) -> None:
+    sent = deliverer(redis, [receiver.address])
+    finish(redis, f"{receiver.address}/first")
+    assert (sent.run_once(), sent.run_once()) == (True, False)
+    for _ in range(2):
+        ask(redis, f"{receiver.address}/second")
+    assert (sent.run_once(), sent.run_once()) == (True, False)
+    assert [path for path, _, _ in receiver.received] == ["/first", "/second"]
+    assert len({body for _, _, body in receiver.received}) == 1, "the same end"
+    assert len({headers["webhook-id"] for _, headers, _ in receiver.received}) == 2, "another message"
+    assert [delivery(redis, place).state for place in (0, 1)] == ["delivered", "delivered"]
+    assert 0 < redis.ttl("regnf:webhook:j1:1") <= 7 * 24 * 3600  # type: ignore[operator]
+
+
+def test_every_request_is_told_of_the_end_by_itself(redis: Redis, receiver: Receiver) -> None:
+    store = RedisRecordStore(redis)
+    for path in ("first", "second", "third"):
+        ask(redis, f"{receiver.address}/{path}")
+    store.update_job("j1", 1, status="running")
+    requeued = store.requeue_job("j1", 1)
+    assert len(requeued.webhooks) == 3
+    assert (RedisOutbox(redis).waiting(), delivery(redis, 2).state) == (0, "waiting")
+    store.update_job("j1", 2, status="running")
+    store.update_job("j1", 2, status="successful")
+    receiver.statuses = [200, 410, 500]
+    sent = deliverer(redis, [receiver.address], (60.0,))
+    assert [sent.run_once() for _ in range(4)] == [True, True, True, False]
+    assert sorted(path for path, _, _ in receiver.received) == ["/first", "/second", "/third"]
+    assert sorted(delivery(redis, place).state for place in range(3)) == ["delivered", "failed", "pending"]
+
+
+def test_all_messages_of_a_job_go_with_it(redis: Redis, receiver: Receiver) -> None:
+    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    finish(redis, f"{receiver.address}/first", "failed")
+    again = ask(redis, f"{receiver.address}/second")
+    assert (again.attempt, again.webhooks) == (2, [f"{receiver.address}/second", f"{receiver.address}/first"])
+    assert outbox.waiting() == 0
+    store.update_job("j1", 2, status="dismissed")
+    assert outbox.waiting() == 2
+    store.delete_job("j1")
+    assert (outbox.waiting(), redis.keys("regnf:webhook:*")) == (0, [])
+
+
+def test_webhooks_that_come_at_the_same_time_are_all_kept(redis: Redis, redis_url: str, receiver: Receiver) -> None:
+    finish(redis, f"{receiver.address}/0")
+
+    def work(number: int) -> None:
+        with connect(redis_url) as own:
+            ask(own, f"{receiver.address}/{number}")
+
+    threads = [threading.Thread(target=work, args=(number,)) for number in range(1, 9)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    sent = deliverer(redis, [receiver.address])
+    while sent.run_once():
+        pass
+    assert sorted(path for path, _, _ in receiver.received) == [f"/{number}" for number in range(9)]

@@ -28,9 +28,10 @@ class World:
         self.records = JournaledRecordStore(self.redis, RETENTION_S, self.blobs)
         self.rebuilder = Rebuilder(self.records, self.queue, self.blobs)
 
-    def accept(self, job_id: str = "j1", created: float | None = None) -> JobRecord:
+    def accept(self, job_id: str = "j1", created: float | None = None, webhook: str | None = None) -> JobRecord:
         now = self.records.now() if created is None else created
-        job = JobRecord(job_id, "registration", "accepted", {"scene": SCENE, "object": OBJECT}, {}, now, now)
+        request = {"scene": SCENE, "object": OBJECT} | ({} if webhook is None else {"webhook": {"url": webhook}})
+        job = JobRecord(job_id, "registration", "accepted", request, {}, now, now)
         return self.records.create_job(job, 100)[0]
 
     def run(self, job_id: str = "j1", attempt: int = 1) -> None:

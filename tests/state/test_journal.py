@@ -10,6 +10,7 @@ from redis import Redis
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.journal.rebuild import Rebuilt
 from regnf_state.records import JobRecord, StaleAttemptError
+from regnf_state.redis.webhook_outbox import RedisOutbox
 from tests.state.journal_world import RETENTION_S, World, fresh_world
 
 
@@ -60,6 +61,54 @@ def test_an_ended_job_comes_back_as_it_ended(world: World, status: str) -> None:
     assert world.lose_redis() == Rebuilt(jobs=("j1",))
     assert same_but_version(world.job(), ended)
     assert world.queue.registrations == []
+
+
+@pytest.mark.parametrize("added_to", ["accepted", "running", "requeued", "successful", "failed"])
+def test_webhooks_of_later_requests_come_back(world: World, added_to: str) -> None:
+    world.accept(webhook="first")
+    if added_to != "accepted":
+        world.run()
+    if added_to == "requeued":
+        world.records.requeue_job("j1", 1)
+    if added_to in ("successful", "failed"):
+        world.end(added_to)
+    for url in ("second", "third", "second"):
+        world.accept(webhook=url)
+    added = {"first", "second", "third"}
+    assert set(world.job().webhooks) == added
+    for _ in range(2):
+        world.lose_redis()
+        assert set(world.job().webhooks) == added
+        assert len(world.job().webhooks) == 3
+    assert RedisOutbox(world.redis).waiting() == (3 if added_to == "successful" else 0)
+
+
+def test_an_older_attempts_webhooks_are_not_counted_twice(world: World) -> None:
+    world.accept()
+    world.accept(webhook="first")
+    world.accept(webhook="second")
+    world.run()
+    world.end("failed")
+    world.accept(webhook="first")
+    assert world.job().webhooks == ["first", "second"]
+    world.lose_redis()
+    assert world.job().webhooks == ["first", "second"]
+
+
+def test_a_webhook_is_not_taken_when_the_journal_takes_nothing(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.accept()
+    world.run()
+
+    def unwritable(*_: object) -> bool:
+        raise StorageUnavailableError("no")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(world.blobs, "put_if_absent", unwritable)
+        with pytest.raises(StorageUnavailableError):
+            world.accept(webhook="late")
+    world.accept(webhook="late")
+    world.lose_redis()
+    assert world.job().webhooks == ["late"]
 
 
 def test_a_waiting_job_that_was_cancelled_stays_so(world: World) -> None:

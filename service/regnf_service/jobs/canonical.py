@@ -51,7 +51,9 @@ def digest(value: Any) -> str:
 def job_id_of(request: dict[str, Any]) -> str:
     """The job's id: a digest of what the result depends on, the engine's revision included.
 
-    The detection's label and score change nothing in a result, so they do not enter.
+    The webhook and the detection's label and score change nothing in a result, so they do not enter. The record of a
+    job that exists keeps the label and score of the request that made it, and gets the webhook of each later one.
     """
-    asked = request | {"detection": {k: v for k, v in request["detection"].items() if k not in _WITHOUT_EFFECT}}
+    detection = {name: value for name, value in request["detection"].items() if name not in _WITHOUT_EFFECT}
+    asked = {name: value for name, value in request.items() if name != "webhook"} | {"detection": detection}
     return digest({"kind": "registration", "engine": ENGINE_REVISION, "request": asked})[:_ID_DIGITS]

@@ -70,13 +70,14 @@ def _bounds(found: FieldRecord | None) -> Bounds | None:
 def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_key: str | None) -> JobRecord:
     """The job for a caller's canonical request: a new one, or the one that exists, queued if it has not run.
 
-    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError.
+    A job that exists tells the request's webhook of its end too; one that has finished, at once.
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError.
     """
     request = owned_request(asked, caller)
     job_id = job_id_of(request)
     if idempotency_key is not None:
         key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]
-        existing = _earlier_answer(services, digest(key), job_id)
+        existing = _earlier_answer(services, digest(key), job_id, request)
         if existing is not None:
             return existing
     now = services.records.now()
@@ -99,16 +100,19 @@ def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_k
     return record
 
 
-def _earlier_answer(services: Services, key: str, job_id: str) -> JobRecord | None:
+def _earlier_answer(services: Services, key: str, job_id: str, request: dict[str, Any]) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
-    mine = f"{job_id} {services.records.now()!r}"
+    asked = digest(request)  # of all of it: another webhook is another request
+    mine = f"{asked} {services.records.now()!r}"
     bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
-    bound_id, _, bound_at = bound.partition(" ")
-    if bound_id != job_id:
+    bound_request, _, bound_at = bound.partition(" ")
+    if bound_request != asked:
         raise Problem("IDEMPOTENCY_KEY_REUSED")
     known = services.records.get_job(job_id) if bound != mine else None
     # a job that has not changed since the key came up is not that call's doing: the call never got so far
-    return known if known is not None and known.updated >= float(bound_at) else None
+    if known is None or known.updated < float(bound_at):
+        return None
+    return known if "webhook" not in request or request["webhook"]["url"] in known.webhooks else None
 
 
 def _inputs(request: dict[str, Any]) -> dict[str, Any]:

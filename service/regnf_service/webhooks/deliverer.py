@@ -11,7 +11,7 @@ from regnf_service.webhooks.sender import Sender, SendError
 from regnf_service.webhooks.signing import Secrets, signed_headers
 from regnf_service.webhooks.targets import AllowList
 from regnf_state.records import FINISHED, JobRecord, RecordStore
-from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 
 logger = logging.getLogger(__name__)
 BACK_OFF_S = (5.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 2 * 3600.0, 4 * 3600.0, 8 * 3600.0, 16 * 3600.0)
@@ -44,22 +44,22 @@ class Deliverer:
         message = self._outbox.claim()
         if message is None:
             return False
-        job_id, _, attempt = message.rpartition("-")
-        record = self._records.get_job(job_id)
-        if record is None or record.attempt != int(attempt) or record.status not in FINISHED:
+        record = self._records.get_job(message.job_id)
+        if record is None or not _is_about(message, record):
             self._outbox.settle(message, Delivery("failed", last_error="JOB_GONE"))
             return True
-        known = self._outbox.delivery(job_id)
-        self._settle(message, replace(known, sends=known.sends + 1, next_at=None), *self._send(record))
+        known = self._outbox.deliveries(record)[message.place]
+        sent = self._send(record, message.place)
+        self._settle(message, replace(known, sends=known.sends + 1, next_at=None), *sent)
         return True
 
-    def _send(self, record: JobRecord) -> tuple[int | None, str | None]:
+    def _send(self, record: JobRecord, place: int) -> tuple[int | None, str | None]:
         """Status of the answer, or a word for why there was none."""
-        url, keys = record.request["webhook"]["url"], self._secrets.get(record.owner)
+        url, keys = record.webhooks[place], self._secrets.get(record.owner)
         if not keys or not self._allowed.allows(url):
             return None, "WEBHOOK_NOT_ALLOWED"
         body = payload(record)
-        headers = signed_headers(keys, message_id(record), int(self._records.now()), body) | {
+        headers = signed_headers(keys, message_id(record, place), int(self._records.now()), body) | {
             "Content-Type": "application/json"
         }
         try:
@@ -67,7 +67,7 @@ class Deliverer:
         except SendError as error:
             return None, error.reason
 
-    def _settle(self, message: str, sent: Delivery, status: int | None, error: str | None) -> None:
+    def _settle(self, message: Message, sent: Delivery, status: int | None, error: str | None) -> None:
         now = self._records.now()
         sent = replace(sent, last_status=status, last_error=error)
         if status is not None and 200 <= status < 300:
@@ -77,15 +77,20 @@ class Deliverer:
         else:
             sent = replace(sent, state="pending", next_at=now + self._back_off_s[sent.sends - 1])
         logger.info(
-            "webhook %s, send %d: %s", message, sent.sends, sent.state, extra={"status": status, "error": error}
+            "webhook %s, send %d: %s", message.name, sent.sends, sent.state, extra={"status": status, "error": error}
         )
         outcome = "delivered" if sent.state == "delivered" else error or f"status_{(status or 0) // 100}xx"
         self._outbox.settle(message, sent, outcome)
 
 
-def message_id(record: JobRecord) -> str:
+def _is_about(message: Message, record: JobRecord) -> bool:
+    """Whether the record is at the end that the message tells of."""
+    return record.attempt == message.attempt and record.status in FINISHED and message.place < len(record.webhooks)
+
+
+def message_id(record: JobRecord, place: int) -> str:
     """Each message's own: the same at every send, another when a job is deleted, asked for anew and ends again."""
-    return f"{record.id}-{record.attempt}-{int(1000 * (record.finished or 0))}"
+    return f"{record.id}-{record.attempt}-{int(1000 * (record.finished or 0))}-{place}"
 
 
 def payload(record: JobRecord) -> bytes:

@@ -33,8 +33,6 @@ class Webhooks:
             fault = {"pointer": _POINTER, "detail": "the service has no secret of yours to sign with"}
             raise Problem("WEBHOOK_NOT_ALLOWED", errors=[fault])
 
-    def delivery(self, record: JobRecord) -> Delivery | None:
-        """How the job's message fares; None for a job without one."""
-        if "webhook" not in record.request:
-            return None
-        return self.outbox.delivery(record.id)
+    def deliveries(self, record: JobRecord) -> list[Delivery]:
+        """How the message to each of the job's webhooks fares."""
+        return self.outbox.deliveries(record)

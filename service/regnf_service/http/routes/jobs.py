@@ -55,29 +55,28 @@ class _Seen(NamedTuple):
 
     record: JobRecord
     position: int | None
-    delivery: Delivery | None
+    deliveries: list[Delivery]
 
 
 def _seen(services: Services, record: JobRecord) -> _Seen:
     position = services.records.queue_position(record.id) if record.status == "accepted" else None
-    return _Seen(record, position, services.webhooks.delivery(record))
+    return _Seen(record, position, services.webhooks.deliveries(record))
 
 
 def _answer(services: Services, seen: _Seen, prefix: str, status: int) -> JSONResponse:
-    record, position, delivery = seen
+    record, position, deliveries = seen
     headers = {"ETag": _etag(seen), "Cache-Control": "no-cache"}
     if record.status in ACTIVE:
         headers["Retry-After"] = _RETRY_AFTER_S
-    document = job_document(record, position, services.settings.retention_s, prefix, delivery)
+    document = job_document(record, position, services.settings.retention_s, prefix, deliveries)
     return JSONResponse(document, status_code=status, headers=headers)
 
 
 def _etag(seen: _Seen) -> str:
     # by what the document shows, not by the version: heartbeats change that every few seconds
-    record, position, delivery = seen
+    record, position, deliveries = seen
     shown: list[Any] = [record.attempt, record.status, record.phase, record.progress, record.updated, position]
-    if delivery is not None:
-        shown.append(asdict(delivery))
+    shown += map(asdict, deliveries)
     return f'"{digest(shown)[:24]}"'
 
 
@@ -126,7 +125,7 @@ async def get_job(
     def look() -> _Seen:
         record = find_job(services, id, caller)
         if wait and not held.given:
-            return _Seen(record, None, None)  # its state is all that is waited for
+            return _Seen(record, None, [])  # its state is all that is waited for
         return _seen(services, record)
 
     def is_news(seen: _Seen) -> bool:

@@ -94,6 +94,7 @@ def preferred_wait(prefer: str | None) -> int | None:
             "IDEMPOTENCY_KEY_REUSED",
             "QUEUE_FULL",
             "QUOTA_ACTIVE_JOBS",
+            "QUOTA_WEBHOOKS",
         ),
     },
     openapi_extra={
@@ -121,7 +122,10 @@ async def register(
         ),
     ] = None,
 ) -> JSONResponse:
-    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew."""
+    """The same request twice is one job: its id follows from what is asked. A job that failed is started anew.
+
+    Requests that differ in the label, the score or the webhook alone are the same. Every webhook is told of the end.
+    """
     check_idempotency_key(idempotency_key)
     kind = body.media_type(request)
     if kind == JSON:

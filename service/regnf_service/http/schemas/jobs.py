@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from typing import Any, Literal
 
 from pydantic import Field
@@ -55,7 +57,7 @@ class JobDocument(Outgoing):
     )
     verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
-    webhook: WebhookDocument | None = None
+    webhooks: list[WebhookDocument] = Field([], description="Told of the job's end, in the order of asking.")
     links: Links
 
 
@@ -67,9 +69,9 @@ class JobPage(Outgoing):
 
 
 def job_document(
-    record: JobRecord, queue_position: int | None, retention_s: float, prefix: str, delivery: Delivery | None = None
+    record: JobRecord, queue_position: int | None, retention_s: float, prefix: str, deliveries: Sequence[Delivery] = ()
 ) -> dict[str, Any]:
-    """The job as it travels; ``prefix`` is what the API's paths begin with."""
+    """The job as it travels. prefix: of the API's paths · deliveries: of all its webhooks, or none where not asked."""
     return {
         "id": record.id,
         "kind": record.kind,
@@ -88,15 +90,13 @@ def job_document(
         "engine": record.engine,
         "verdict": record.verdict,
         "error": outgoing_problem(record.error),
-        "webhook": _webhook(record, delivery),
+        "webhooks": [_webhook(url, one) for url, one in zip_longest(record.webhooks, deliveries)],
         "links": _links(record, f"{prefix}/jobs/{record.id}"),
     }
 
 
-def _webhook(record: JobRecord, delivery: Delivery | None) -> dict[str, Any] | None:
-    if "webhook" not in record.request:
-        return None
-    document: dict[str, Any] = {"url": record.request["webhook"]["url"], "state": None}
+def _webhook(url: str, delivery: Delivery | None) -> dict[str, Any]:
+    document: dict[str, Any] = {"url": url, "state": None}
     if delivery is not None:
         times = {"next_at": rfc3339(delivery.next_at), "delivered_at": rfc3339(delivery.delivered_at)}
         document |= asdict(delivery) | times

@@ -81,7 +81,7 @@ class Question(Incoming):
     )
     ground_truth: GroundTruth | None = None
     webhook: Webhook | None = Field(
-        None, description="Told of the job's end. Only hosts that the service allows; another webhook is another job."
+        None, description="Told of the job's end, at once if it has finished. Only hosts that the service allows."
     )
 
     @field_validator("initial_transform")
