@@ -2,6 +2,7 @@
 # System libraries that Python packages need and cannot bring along.
 #   scripts/system-packages.sh runtime   what open3d loads
 #   scripts/system-packages.sh test      the same, a browser for the page's tests, and a Redis beside the packaged Valkey
+#   scripts/system-packages.sh images    what scripts/images.sh builds and runs images with
 # As root on Debian or Ubuntu it installs what is missing; otherwise it names it.
 set -euo pipefail
 
@@ -9,7 +10,8 @@ runtime=(libgl1 libegl1 libx11-6 libusb-1.0-0 libidn2-0 libudev1 libgomp1)
 case "${1:-runtime}" in
     runtime) wanted=("${runtime[@]}") ;;
     test) wanted=("${runtime[@]}" chromium redis-tools) ;;
-    *) echo "usage: $0 runtime|test" >&2; exit 2 ;;
+    images) wanted=(buildah debootstrap iproute2) ;;
+    *) echo "usage: $0 runtime|test|images" >&2; exit 2 ;;
 esac
 
 if ! command -v dpkg-query >/dev/null || ! command -v apt-get >/dev/null; then
