@@ -80,6 +80,8 @@ def register(
             reason="INITIAL_TRANSFORM_UNSUPPORTED",
             hint="Leave --initial-transform out, or use --preset robust.",
         )
+    if server is None:
+        require("engine")
     if scene.samefile(object_):
         err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
     check_box_by_header(scene, box, object_)
@@ -90,7 +92,6 @@ def register(
         service = RemoteService(server, token, worker_timeout)
         document = register_remotely(service, scene, object_, request, Delivery(output, cancel_on_interrupt))
     else:
-        require("engine")
         document = _register_here(scene, object_, box, request, output)
     if as_json:
         out.print_json(json.dumps(document))

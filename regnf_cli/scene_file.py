@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from regnf_core.detections import Bounds, Detection, require_in_scene
-from regnf_core.errors import FieldFormatError, InvalidDetectionError
+from regnf_core.errors import InvalidDetectionError
+from regnf_core.field_files import stored_bounds
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
@@ -30,20 +31,6 @@ def open_scene(path: Path, box: Detection) -> SdfField:
     lower, upper = field.bounds.tolist()
     _require_in(path, box, (lower, upper), None)
     return field
-
-
-def stored_bounds(path: Path) -> Bounds | None:
-    """The bounds in a safe field's header; None for any other file."""
-    if path.suffix.lower() != ".safetensors":
-        return None
-    from regnf_core.schema.safe_format import read_description
-
-    try:
-        bounds: Any = read_description(path)["bounds"]
-        lower, upper = bounds
-    except (FieldFormatError, KeyError, TypeError, ValueError, OSError):
-        return None  # opening it says what is wrong
-    return lower, upper
 
 
 def _require_in(path: Path, box: Detection, scene: Bounds, obj: Bounds | None) -> None:

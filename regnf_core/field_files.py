@@ -1,13 +1,15 @@
-"""Whether a path can be a field at all, and which file was meant when it cannot. Torch-free; reads a few bytes."""
+"""Files of fields before they are opened: which file was meant, and the bounds in a header. Torch-free."""
 
 from __future__ import annotations
 
 import difflib
+import json
 import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
+from regnf_core.detections import Bounds
 from regnf_core.errors import FieldFormatError, InvalidInputError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 
@@ -16,6 +18,7 @@ _TEXT_SUFFIXES = frozenset({".yml", ".yaml", ".json", ".toml", ".txt", ".log"})
 _MAX_DEPTH = 4
 _MAX_ENTRIES = 5000
 _MAX_NAME = 200
+_MAX_HEADER = 1 << 20
 
 
 def require_field_file(path: Path) -> None:
@@ -45,6 +48,22 @@ def require_file(path: Path) -> None:
     if not path.exists():
         shown = str(path) if len(str(path)) <= _MAX_NAME else f"{str(path)[:_MAX_NAME]}..."
         raise InvalidInputError(f"{shown}: no such file", reason="FILE_NOT_FOUND", hint=_near(path))
+
+
+def stored_bounds(path: Path) -> Bounds | None:
+    """The lowest and the highest corner in a safe field's header; None where there is none to be read.
+
+    It needs no library beyond Python's, and promises nothing: opening the file says what is wrong with it.
+    """
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            header = json.loads(file.read(length)) if length <= _MAX_HEADER else {}
+        lower, upper = json.loads(header["__metadata__"]["field"])["bounds"]
+        corners = [[float(value) for value in corner] for corner in (lower, upper)]
+    except (KeyError, TypeError, ValueError, RecursionError, OSError):
+        return None
+    return (corners[0], corners[1]) if len(corners[0]) == len(corners[1]) == 3 else None
 
 
 def checkpoint_below(folder: Path) -> Path | None:

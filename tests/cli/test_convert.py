@@ -56,7 +56,7 @@ def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
 )
 @pytest.mark.usefixtures("cache")
 def test_refusals(output: str, reason: str, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "field.ckpt").write_bytes(b"\x07" * 4000)
+    (tmp_path / "field.ckpt").write_bytes(bytes(8) + b"{" if reason == "INVALID_OPTIONS" else b"\x07" * 4000)
     outcome = run("convert", tmp_path / "field.ckpt", tmp_path / output)
     assert outcome.code == 2
     assert outcome.stderr.startswith(f"{reason} ")
