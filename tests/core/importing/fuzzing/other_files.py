@@ -16,12 +16,12 @@ from tests.core.importing import (
     test_nglod,
     test_nvblox,
     test_pin_slam,
-    test_point_clouds,
     test_torch_ngp,
     test_voxel_block_grid,
 )
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
+from tests.core.importing.meshes import test_point_clouds
 
 
 def make_others() -> dict[str, dict[str, bytes]]:
