@@ -92,7 +92,7 @@ def outcome_of(client: httpx.Client, request: dict[str, Any]) -> tuple[str, str]
     job = finished(client, answer.json()["id"])
     result = client.get(f"/jobs/{job['id']}/result")
     if job["status"] == "failed":
-        assert_refused(result, 422, job["error"]["reason"])
+        assert assert_refused(result, 409, "JOB_FAILED")["error"] == job["error"]
         return "failed", job["error"]["reason"]
     return job["status"], result.json()["verdict"]
 

@@ -125,7 +125,7 @@ def test_failed_job_of_the_real_service(visit: Visit) -> None:
         service.records.update_job(JOB_ID, 1, status="failed", error=error)
         visit.page.goto(service.view.replace("/jobs/", "/v1/jobs/"))
         expect(visit.page.locator("#message-text")).to_have_text("12 points were found; 500 are needed.")
-        assert visit.page.locator("#message-title").inner_text() == "No surface in detection"
+        assert visit.page.locator("#message-title").inner_text() == "No surface in the detection"
         visit.page.goto("about:blank")
 
 
