@@ -1,4 +1,4 @@
-"""The same with the published method, progress, the errors against the truth, and pictures to look at.
+"""The same with the published method, with progress, errors against the known transform, and pictures.
 
 python examples/02_follow_and_look.py OUTPUT_FOLDER
 """
@@ -10,16 +10,18 @@ from pathlib import Path
 from regnf_core import OrientedBox, RegistrationOptions, Sim3, open_field, register
 from regnf_core.viewing import result_document, write_artifacts
 
+if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+    sys.exit(f"usage: {__doc__}")
 data = Path(__file__).parent / "data"
 output = Path(sys.argv[1])
 output.mkdir(parents=True, exist_ok=True)
-box = json.loads((data / "detection.json").read_text())
+box = OrientedBox.from_dict(json.loads((data / "detection.json").read_text()))
 truth = Sim3.from_dict(json.loads((data / "truth.json").read_text())["T_object_scene"])
 
 result = register(
     open_field(data / "mix-room.safetensors"),
     open_field(data / "armchair.safetensors"),
-    OrientedBox.from_quaternion(box["center"], box["size"], box["rotation_quaternion_xyzw"]),
+    box,
     RegistrationOptions.from_dict({"preset": "paper", "optimization": {"iterations": 150}}),
     seed=3,
     progress=lambda phase, share: print(f"\r{phase:>14} {share:4.0%}", end="", file=sys.stderr),

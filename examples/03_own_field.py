@@ -5,6 +5,7 @@ Registers a chair of boxes, given by formula, onto a smaller, turned copy of its
 python examples/03_own_field.py
 """
 
+import sys
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +13,8 @@ from torch import Tensor
 
 from regnf_core import OrientedBox, Sim3, register
 
+if len(sys.argv) > 1:
+    sys.exit(f"usage: {__doc__}")
 SEAT, BACK, ARM = (
     ([0, 0, 0], [0.5, 0.5, 0.1]),
     ([-0.2, 0, 0.25], [0.1, 0.5, 0.5]),
