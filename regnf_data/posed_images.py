@@ -15,8 +15,8 @@ class Instance:
     """A thing in the scene, as a detector would name it.
 
     box: in the world frame · label: its class or name · T_object_world: (4, 4) float64 from world to the library
-    object, the truth if the dataset tells it · world_pose, gt_pose: (4, 4), the thing's own frame to the world and to
-    the metric frame, as the dataset tells them; nothing is computed from these.
+    object, the truth if the dataset has it · world_pose, gt_pose: (4, 4), the thing's own frame to the world and to
+    the metric frame, as the dataset has them; nothing is computed from these.
     """
 
     label: str

@@ -1,4 +1,4 @@
-"""A function known within a box alone, carried on over all of space."""
+"""A function that is defined within a box, extended to all of space."""
 
 from __future__ import annotations
 

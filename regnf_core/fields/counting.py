@@ -10,7 +10,7 @@ from regnf_core.fields.observation import Observation, observation_of
 
 
 class CountingField:
-    """A field that counts the points it was asked for (a gradient counts as one evaluation), for reports and tests."""
+    """A field that counts the points at which it is evaluated. A value with its gradient counts as one evaluation."""
 
     def __init__(self, field: SdfField) -> None:
         self.field = field

@@ -54,7 +54,7 @@ class FeatureVolumesFunction:
 def build_feature_volumes(
     description: FeatureVolumesDescription, tensors: Mapping[str, Tensor]
 ) -> FunctionField[BoxExtension[FeatureVolumesFunction]]:
-    """The field of ``description`` with its parameters in ``tensors``, carried on beyond the cube [-1, 1]^3.
+    """The field of ``description`` with its parameters in ``tensors``, extended beyond the cube [-1, 1]^3.
 
     Tensors keep their device; they must have passed :meth:`FeatureVolumesDescription.check_tensors`.
     """

@@ -50,7 +50,7 @@ class GridMlpFunction:
 def build_grid_mlp(
     description: GridMlpDescription, tensors: Mapping[str, Tensor]
 ) -> FunctionField[BoxExtension[GridMlpFunction]]:
-    """The field of ``description`` with its parameters in ``tensors``, in float32, carried on beyond the grid's cube.
+    """The field of ``description`` with its parameters in ``tensors``, in float32, extended beyond the grid's cube.
 
     Tensors keep their device; they must have passed :meth:`GridMlpDescription.check_tensors`.
     """

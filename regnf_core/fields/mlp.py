@@ -120,7 +120,7 @@ class MlpFunction:
         return gradient[:, :3] + self.positional_encoding.pull_back(inputs[:, 3:], gradient[:, 3:])
 
     def _squashed(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """tanh as often as asked for, and its derivative."""
+        """tanh, ``output_tanh`` times, and its derivative."""
         slope = torch.ones_like(distance)
         for _ in range(self.output_tanh):
             distance = distance.tanh()

@@ -1,4 +1,4 @@
-"""What a field rests on: where a surface was measured, what was seen to be free, and what is unobserved.
+"""What was observed of a field: where a surface was measured, what was seen to be free, and what is unobserved.
 
 A field has a value everywhere, whether anything was measured there or not. Fields that were fitted to images or depths
 can say which is which; those that cannot have no observation.
@@ -56,7 +56,7 @@ class Observation:
 
 @runtime_checkable
 class Observed(Protocol):
-    """A field that may know what it rests on."""
+    """A field that may have an observation."""
 
     @property
     def observation(self) -> Observation | None:
@@ -65,7 +65,7 @@ class Observed(Protocol):
 
 
 class ObservedField:
-    """A field that knows what it rests on."""
+    """A field with an observation."""
 
     def __init__(self, field: SdfField, observation: Observation) -> None:
         self.field = field
@@ -102,5 +102,5 @@ def stored_observation(grid: ObservationGrid, words: Tensor) -> Observation:
 
 
 def observation_of(field: SdfField) -> Observation | None:
-    """What ``field`` rests on, its own frame; None where it cannot say."""
+    """The observation of ``field``, its own frame; None where there is none."""
     return field.observation if isinstance(field, Observed) else None

@@ -1,4 +1,4 @@
-"""A field in another unit, or with its sign turned round."""
+"""A field in another unit, or with the opposite sign."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ScaledField:
 
     @property
     def observation(self) -> Observation | None:
-        """What the field rests on, new unit; None where it is not known."""
+        """What was observed, new unit; None where it is not known."""
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
 

@@ -35,7 +35,7 @@ class TransformedField:
 
     @property
     def observation(self) -> Observation | None:
-        """What the field rests on, new frame; None where it is not known."""
+        """What was observed, new frame; None where it is not known."""
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(self.T_field_frame)
 

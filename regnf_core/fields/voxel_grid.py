@@ -60,7 +60,7 @@ class VoxelGridFunction:
 def build_voxel_grid(
     description: VoxelGridDescription, tensors: Mapping[str, Tensor]
 ) -> FunctionField[BoxExtension[VoxelGridFunction]]:
-    """The field of ``description`` with its values in ``tensors``, carried on beyond the grid.
+    """The field of ``description`` with its values in ``tensors``, extended beyond the grid.
 
     The tensors keep their device and type; they must have passed :meth:`VoxelGridDescription.check_tensors`.
     """

@@ -1,4 +1,4 @@
-"""The layout of a multi-resolution hash grid: how many entries each level has, and where they lie in the table.
+"""The layout of a multi-resolution hash grid: how many entries each level has, and where they are in the table.
 
 Torch-free, so that a file's shapes can be checked before anything heavy is loaded. The layout is the one that
 tiny-cuda-nn writes (Müller et al. 2022, "Instant neural graphics primitives"), float32 rounding included: scales are
@@ -106,7 +106,7 @@ class HashGridConfig:
         """This config with the per-level rounding under which the table has ``entries`` rows.
 
         Where base x growth^l is a whole number, one machine's exp2f gives r nodes and another's r + 1. The stored
-        table tells which: the pattern with the fewest changes that matches wins.
+        table shows which: the pattern with the fewest changes that matches wins.
 
         Raises FieldFormatError (FIELD_SHAPES_MISMATCH) when no pattern matches.
         """
@@ -127,7 +127,7 @@ class HashGridConfig:
     def stride_variants(self) -> Iterator[HashGridConfig]:
         """This table indexed by other roundings of its dense, doubtful levels, fewest changes first; not this config.
 
-        The table's length tells how its levels were laid out, but not how the device that trained it computed a row.
+        The table's length shows how its levels were laid out, but not how the device that trained it computed a row.
         """
         fits = {
             level: other

@@ -43,7 +43,7 @@ class ObservationGrid:
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH) unless the states are stored as this grid asks."""
-        require(OBSERVATION in tensors, f"the description tells of an {OBSERVATION}, but there is no such tensor")
+        require(OBSERVATION in tensors, f"the description has an {OBSERVATION}, but there is no such tensor")
         require(tensors[OBSERVATION].dtype in INTEGER_TYPES, f"{OBSERVATION} is not stored as whole numbers")
         require_shape(tensors, OBSERVATION, (-(-self.voxels // _PER_WORD),))
 

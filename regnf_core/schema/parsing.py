@@ -1,4 +1,4 @@
-"""What a safe field file says about its tensors: which function they parametrize, and which shapes that asks for.
+"""What a safe field file says about its tensors: which function they parametrize, and which shapes they must have.
 
 Torch-free: the import gate writes descriptions and the worker's parent reads them without loading torch.
 """

@@ -34,7 +34,7 @@ _MAX_DESCRIPTION = 1 << 20
 def write_safe_field(
     path: str | os.PathLike[str], description: dict[str, Any], tensors: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Write a field file, whole or not at all: a temporary file beside ``path`` is renamed once it is on the disk.
+    """Write a field file atomically: a temporary file beside ``path`` is renamed once it is on the disk.
 
     The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32,
     float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_KIND_UNKNOWN,
@@ -46,7 +46,7 @@ def write_safe_field(
     for name, array in tensors.items():
         if not np.isfinite(array).all():
             raise FieldFormatError(f"{name} holds a number that is not finite", reason="FIELD_NOT_FINITE")
-    # The table first: its rows are read as wide elements, which asks for an aligned start.
+    # The table first: its rows are read as wide elements, which needs an aligned start.
     order = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name != "hash_table", name))
     header = _header(description_to_dict(parsed), specs, order, tensors)
     with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:

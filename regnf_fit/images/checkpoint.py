@@ -15,7 +15,7 @@ _VERSION = 3
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:
-    """Write a trainer's state, whole or not at all. key: of the data and options that it belongs to."""
+    """Write a trainer's state atomically. key: of the data and options that it belongs to."""
     with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:
         torch.save({"version": _VERSION, "key": key, "state": state}, file)
 

@@ -23,7 +23,7 @@ _BOX_MARGIN = 0.1
 _VOXEL = 2.0 / 3.0
 """Bands: measured points closer together than this are averaged before distances to them are taken."""
 _PRECISE = 0.25
-"""Bands: the noise up to which a point tells where the surface is."""
+"""Bands: the noise up to which a point shows where the surface is."""
 _ALONE = 3.0
 """Bands: noisier points count where no precise one is as near as this."""
 _MAX_TRUST = 4.0
@@ -66,7 +66,7 @@ class DepthSupervision:
 def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator) -> DepthSupervision:
     """The pool of rays with depth whose surface lies in the bounds, and of points known to be free."""
     rays, size = prepared.training, prepared.size
-    # depths are told from the surface by their noise, or by the width of a pixel there
+    # depths are distinguished from the surface by their noise, or by the width of a pixel there
     bands = torch.maximum(options.band_deviations * rays.deviations, prepared.pixel * rays.depths)
     before, behind = bands.clamp_max(options.band * size), (0.5 * bands).clamp_max(options.band_behind * size)
     seen = (rays.depths > 0.0) & ~rays.background

@@ -21,7 +21,7 @@ from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
-from regnf_fit.images.held_out import judge
+from regnf_fit.images.held_out import evaluate
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
@@ -82,9 +82,9 @@ def reconstruct(
         write_sdfstudio(trainer.averaged, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
-    figures = judge(trainer.averaged, prepared.held_out.to(torch_device), prepared.size)
+    errors = evaluate(trainer.averaged, prepared.held_out.to(torch_device), prepared.size)
     return ReconstructionReport(
-        loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(figures)
+        loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(errors)
     )
 
 

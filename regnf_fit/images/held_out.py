@@ -19,7 +19,7 @@ _BISECTIONS = 6
 
 
 @dataclass(frozen=True)
-class HeldOutFigures:
+class HeldOutErrors:
     """psnr: decibels, over rays that met a surface · depth errors: field units, where a depth was measured too."""
 
     psnr: float | None
@@ -48,8 +48,8 @@ def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
 
 
 @torch.no_grad()
-def judge(field: RadianceField, rays: PixelRays, size: float) -> HeldOutFigures:
-    """The figures of held-out rays."""
+def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutErrors:
+    """The errors at held-out rays."""
     rays = rays.take(~rays.background)
     hits = first_hits(field, rays, size)
     met = hits.depths > 0.0
@@ -60,7 +60,7 @@ def judge(field: RadianceField, rays: PixelRays, size: float) -> HeldOutFigures:
     both = met & (rays.depths > 0.0)
     depth_error = (hits.depths - rays.depths).abs()[both]
     norms = hits.normals[met].norm(dim=1)
-    return HeldOutFigures(
+    return HeldOutErrors(
         psnr=psnr,
         depth_error=float(depth_error.mean()) if both.any() else None,
         depth_error_median=float(depth_error.median()) if both.any() else None,

@@ -32,7 +32,7 @@ def observe(images: PosedImages, voxels: int) -> Observation | None:
     a camera looked through is free, where a depth ends there is a surface, the rest is unobserved.
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
-    Voxels are judged by their centers, in every image that shows them.
+    Voxels are classified by their centers, in every image that shows them.
     """
     if images.depths is None or voxels == 0:
         return None
@@ -99,7 +99,7 @@ def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Ob
     """
     seen = observe(images, voxels)
     if seen is None:
-        raise DatasetError("what was seen is told from depths, and there are none", reason="DATASET_DEPTH_MISSING")
+        raise DatasetError("an observation needs depths, and there are none", reason="DATASET_DEPTH_MISSING")
     _check_frame(open_field(path), seen)
     description = read_description(path)
     scale = float(description["world_scale"])

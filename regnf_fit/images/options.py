@@ -15,7 +15,7 @@ Start = Literal["auto", "object", "room"]
 
 @dataclass(frozen=True)
 class LossWeights:
-    """What each term counts; docs/fitting.md tells what it does and where it comes from.
+    """What each term counts; docs/fitting.md says what it does and where it comes from.
 
     Lengths are measured in diagonals of the bounds, so that a cup and a room are weighted alike.
     """
@@ -67,7 +67,7 @@ class ReconstructionOptions(NetworkOptions):
     """Decay of the moving average of the parameters, which is what is written; 0 for none."""
     start: Start = "auto"
     observation_voxels: int = 160
-    """Voxels along the longest side of the grid that tells what was seen, where there are depths; 0: none is kept."""
+    """Voxels along the longest side of the grid of what was observed, where there are depths; 0: none is kept."""
 
     def learning_levels(self, iteration: int) -> int:
         """How many of the grid's levels learn at ``iteration``, coarsest first."""

@@ -1,4 +1,4 @@
-"""From images to what a fit draws from: rays to learn from, rays to judge by, and the shape to start from."""
+"""From images to what a fit draws from: rays to fit to, rays held out, and the shape to start from."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
     has_depth = images.depths is not None
     shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
     check_seen(int(shown.sum()) if has_depth else int((~rays.background).sum()))
-    judged = min(int(_HELD_OUT_SHARE * len(rays)), _MAX_HELD_OUT)
+    held_out = min(int(_HELD_OUT_SHARE * len(rays)), _MAX_HELD_OUT)
     order = torch.arange(len(rays))
     return PreparedImages(
-        training=rays.take(order[judged:]),
-        held_out=rays.take(order[:judged]),
+        training=rays.take(order[held_out:]),
+        held_out=rays.take(order[:held_out]),
         start=start_shape(images, start),
         bounds=torch.from_numpy(images.bounds),
         size=float(np.linalg.norm(images.bounds[1] - images.bounds[0])),

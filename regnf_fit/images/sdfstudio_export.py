@@ -12,11 +12,11 @@ from regnf_core.files import atomic_path
 from regnf_fit.images.network import RadianceField
 
 _EMBEDDING = 32
-"""Columns of the color's network for an image's appearance, which our fields have not: zeros."""
+"""Columns of the color's network for an image's appearance, which our fields do not have: zeros."""
 
 
 def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path) -> None:
-    """Write a checkpoint {step, pipeline} to ``path``, whole or not at all. bounds: (2, 3), the field's frame.
+    """Write a checkpoint {step, pipeline} to ``path`` atomically. bounds: (2, 3), the field's frame.
 
     The distances are those of the field before its table is rounded to half precision.
     """

@@ -1,1 +1,1 @@
-"""Readers of file containers: zip, npz, safetensors, SQLite; and what tells them apart."""
+"""Readers of file containers: zip, npz, safetensors, SQLite; and how they are recognized."""

@@ -1,7 +1,7 @@
-"""Arrays of a .npz file: a zip of .npy arrays, each looked at only when it is asked for.
+"""Arrays of a .npz file: a zip of .npy arrays, each read only when it is requested.
 
 The zip is checked as strictly as torch's, but for deflate, which ``numpy.savez_compressed`` uses. An entry is inflated
-to exactly the size that the directory claims for it, and the claims of what is asked for are counted before that.
+to exactly the size that the directory claims for it, and the claims of the requested arrays are added up before that.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from regnf_core.importing.containers.zip_records import malformed
 from regnf_core.importing.pickle.tensors import Float32Array, finite_float32, require_possible, tensor_error
 
 MAX_UNPACKED_BYTES = 2 << 30
-"""All arrays asked for together, as they are stored."""
+"""All requested arrays together, as they are stored."""
 _SUFFIX = ".npy"
 _FEW = 64
 """Most numbers that one of the small arrays beside the large ones has."""
@@ -41,7 +41,7 @@ class ArraySource:
 
     @property
     def names(self) -> list[str]:
-        """All arrays, in the order in which they lie."""
+        """All arrays, in the order of the file."""
         return list(self._members)
 
     def array(self, name: str) -> Float32Array:

@@ -1,4 +1,4 @@
-"""Whether a file's first bytes are those of a mesh. Two formats have no magic number: they are told by content."""
+"""Whether a file's first bytes are those of a mesh. Two formats have no magic number: their content decides."""
 
 from __future__ import annotations
 

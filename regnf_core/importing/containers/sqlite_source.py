@@ -115,7 +115,7 @@ def _check_header(data: memoryview) -> None:
     if bytes(data[:16]) != _MAGIC or page < 512 or page & (page - 1):
         raise _malformed("the header is malformed")
     if data[18] != 1 or data[19] != 1:
-        raise _malformed("part of it may lie in a write-ahead log; say PRAGMA journal_mode = DELETE and save it again")
+        raise _malformed("part of it may lie in a write-ahead log; set PRAGMA journal_mode = DELETE and save it again")
     pages = int.from_bytes(data[28:32], "big")
     if len(data) % page or pages > len(data) // page:
         raise FieldFormatError("the database was cut short", reason="FILE_TRUNCATED")

@@ -1,4 +1,4 @@
-"""The records of a zip file, decoded and bounds-checked one at a time. What they say is judged in ``container``."""
+"""The records of a zip file, decoded and bounds-checked one at a time. ``container`` checks what they say."""
 
 from __future__ import annotations
 

@@ -14,14 +14,14 @@ class Reading:
     """One function that a checkpoint's tensors may stand for: the safe file's description and tensors."""
 
     name: str
-    """What tells it from the other readings, in a few words."""
+    """A few words that distinguish it from the other readings."""
     description: dict[str, Any]
     tensors: Mapping[str, StoredArray]
 
 
 @dataclass(frozen=True)
 class ConvertedField:
-    """A field ready to be written: the safe file's description and tensors, and how the family was told."""
+    """A field ready to be written: the safe file's description and tensors, and how the family was recognized."""
 
     family: str
     why: tuple[str, ...]

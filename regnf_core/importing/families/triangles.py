@@ -36,8 +36,8 @@ def mesh_field(geometry: Geometry, origin: str, overrides: UploadDescription, fa
         f"{origin}: {len(faces)} triangles, {len(vertices)} vertices",
         "watertight"
         if loose == 0.0
-        else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number tells inside",
-        *(f"passed over: {what}" for what in geometry.left_out),
+        else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
+        *(f"ignored: {what}" for what in geometry.left_out),
     )
     return ConvertedField(
         family,

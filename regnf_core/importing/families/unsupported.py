@@ -1,4 +1,4 @@
-"""Families that are told apart but not taken yet: refused by name, which helps more than "not recognized"."""
+"""Families that are recognized but not supported: the refusal names them."""
 
 from __future__ import annotations
 

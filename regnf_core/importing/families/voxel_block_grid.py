@@ -90,7 +90,7 @@ def _read(arrays: ArraySource) -> _Blocks:
 def _truncation(blocks: _Blocks, overrides: UploadDescription) -> tuple[float, str, tuple[str, ...]]:
     """The distance that the value 1 stands for, how it was told, and warnings."""
     if overrides.truncation is not None:
-        return overrides.truncation, "the description tells the truncation", ()
+        return overrides.truncation, "the description gives the truncation", ()
     voxels, slope = tell_truncation(blocks.tsdf, blocks.seen)
     distance = voxels * blocks.voxel_size
     if slope is None:

@@ -66,10 +66,10 @@ def _misfit(reading: Reading) -> float:
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # the map of the upload; only read
         tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
     try:
-        figures, _ = check_plausibility(build_field(description, tensors), _SAMPLES)
+        measured, _ = check_plausibility(build_field(description, tensors), _SAMPLES)
     except FieldFormatError:  # no surface, or numbers that are not finite
         return math.inf
-    norms = [figures[f"gradient_{quantile}"] for quantile in ("p10", "median", "p90")]
+    norms = [measured[f"gradient_{quantile}"] for quantile in ("p10", "median", "p90")]
     return sum(abs(norm - 1.0) for norm in norms) / len(norms)
 
 

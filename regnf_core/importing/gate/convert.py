@@ -65,10 +65,10 @@ def convert_file(
     )
 
     field, started = open_field(target), time.process_time()
-    figures, more = check_plausibility(field)
+    measured, more = check_plausibility(field)
     if picture and time.process_time() - started < _QUICK_S:
         _draw(field, up_axis, out_dir / PICTURE_NAME)
-    if sign_is_open and figures["share_inside_at_bounds"] > _ALL_ROUND:
+    if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
         "family": family,
@@ -76,7 +76,7 @@ def convert_file(
         "why": why,
         "bounds": bounds,
         "parameters": parameters,
-        "plausibility": figures,
+        "plausibility": measured,
         "warnings": [*warnings, *more],
         "label": label,
     }

@@ -1,4 +1,4 @@
-"""The gate's outer side: runs one conversion in a process of its own and believes nothing but what it checks itself."""
+"""The gate's outer side: runs one conversion in a child process and trusts only what it checks itself."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def import_field(
         started = time.monotonic()
         command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
         outcome = run_child(command, request, work, _environment(limits), limits.wall_s)
-        values = _judge(outcome)
+        values = _values_of(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
         if picture and is_sound_picture(work / PICTURE_NAME):
@@ -97,7 +97,7 @@ def _environment(limits: ImportLimits) -> dict[str, str]:
     return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, str(limits.threads))}
 
 
-def _judge(outcome: ChildOutcome) -> dict[str, Any]:
+def _values_of(outcome: ChildOutcome) -> dict[str, Any]:
     """The report's values, or the error that the child's end stands for."""
     if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
         raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")

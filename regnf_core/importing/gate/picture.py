@@ -1,4 +1,4 @@
-"""The picture that an import may leave beside the field: looked at byte by byte before anybody else is shown it."""
+"""The picture that an import may write beside the field. It is checked byte by byte before it is shown."""
 
 from __future__ import annotations
 

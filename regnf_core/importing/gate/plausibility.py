@@ -1,4 +1,4 @@
-"""Does a converted field behave like a signed distance field? Evaluated once; the figures go with the field."""
+"""Does a converted field behave like a signed distance field? It is evaluated once, for the report."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zer
 
 
 def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
-    """Figures of the field, and warnings.
+    """Measurements of the field, and warnings.
 
-    Figures: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
+    Measured: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
     gradient_p10, gradient_median and gradient_p90 (the gradient's norm there).
 
     ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
     along the gradient.
     Raises FieldFormatError: FIELD_NOT_FINITE, FIELD_NOT_A_FUNCTION when a point's distance depends on which others are
-    asked for, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
+    evaluated, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
     """
     lower, upper = field.bounds[0].float(), field.bounds[1].float()
     generator = torch.Generator().manual_seed(seed)
@@ -45,7 +45,7 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
     if not both_sides or norms.numel() == 0:
         raise FieldFormatError("the field has no surface within its bounds", reason="NO_ZERO_LEVEL")
     low, median, high = torch.quantile(norms, torch.tensor([0.1, 0.5, 0.9])).tolist()
-    figures = {
+    measured = {
         "share_inside": float(inside.float().mean()),
         "share_inside_at_bounds": _share_inside_at_bounds(field, (lower, upper), samples, generator),
         "surface_points": float(norms.numel()),
@@ -53,7 +53,7 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
         "gradient_median": median,
         "gradient_p90": high,
     }
-    return figures, _warnings(figures)
+    return measured, _warnings(measured)
 
 
 def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None:
@@ -61,7 +61,7 @@ def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None
     again = field.signed_distance(points[:_ASKED_AGAIN].flip(0)).flip(0)
     _require_finite(again)
     if (again - distance[:_ASKED_AGAIN]).abs().max() > _SAME * distance.abs().max():
-        message = "a point's distance depends on which others are asked for"
+        message = "a point's distance depends on which other points are evaluated"
         raise FieldFormatError(message, reason="FIELD_NOT_A_FUNCTION")
 
 
@@ -112,13 +112,13 @@ def _require_finite(values: Tensor) -> None:
         raise FieldFormatError("the field gives numbers that are not finite", reason="FIELD_NOT_FINITE")
 
 
-def _warnings(figures: dict[str, float]) -> list[str]:
+def _warnings(measured: dict[str, float]) -> list[str]:
     warnings = []
-    median = figures["gradient_median"]
+    median = measured["gradient_median"]
     if not _GRADIENT_RANGE[0] <= median <= _GRADIENT_RANGE[1]:
-        text = f"the gradient's norm at the surface is {median:.2f}, not about 1: is the family or the grid another?"
+        text = f"the gradient's norm at the surface is {median:.2f}, not about 1: the family or the grid may be wrong"
         warnings.append(f"GRADIENT_NOT_UNIT: {text}")
-    if figures["share_inside"] > 0.9:
-        text = "over nine tenths of the bounds are inside matter: is the sign turned round? Then say sign -1"
+    if measured["share_inside"] > 0.9:
+        text = "over nine tenths of the bounds are inside matter: if the sign is inverted, give sign: -1"
         warnings.append(f"MOSTLY_INSIDE: {text}")
     return warnings

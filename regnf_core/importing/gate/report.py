@@ -40,7 +40,7 @@ class ImportReport:
     """Lowest and highest corner of the region where the field has meaning."""
     parameters: int
     plausibility: dict[str, float]
-    """Figures of the evaluated field; see ``plausibility``."""
+    """What was measured of the evaluated field; see ``plausibility``."""
     warnings: tuple[str, ...]
     """Each begins with a stable UPPER_SNAKE word and a colon."""
     label: str | None

@@ -23,7 +23,7 @@ _SYSTEM = """
 /etc/ld.so.cache /etc/localtime /etc/ssl/openssl.cnf /dev/null /dev/urandom
 /proc/cpuinfo /proc/meminfo /proc/stat /sys/devices/system/cpu /sys/devices/system/node
 """
-"""Where libraries lie, and what they ask of the machine as they load. No service keeps a secret there."""
+"""Where libraries are, and which facts about the machine they read as they load. No service keeps a secret there."""
 
 
 def confine(limits: ImportLimits, parent_pid: int, upload: int, folder: Path) -> dict[str, bool]:

@@ -28,7 +28,7 @@ class Geometry:
     normals: Float64Array | None = None
     """(V, 3), where the file has one a vertex."""
     left_out: tuple[str, ...] = ()
-    """What the file holds or names that was not looked at, a few words each."""
+    """What the file holds or names that was not read, a few words each."""
 
 
 def malformed(message: str) -> FieldFormatError:

@@ -1,4 +1,4 @@
-"""glTF 2.0 in its binary form: the triangles of all nodes at their poses. Textures, skins, morphs are passed over."""
+"""glTF 2.0 in its binary form: the triangles of all nodes at their poses. Textures, skins and morphs are ignored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: vertices and polygons. Materials, curves and all else is passed over; no other file is opened."""
+"""Wavefront OBJ: vertices and polygons. Everything else is ignored; no other file is opened."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read_obj(data: memoryview) -> Geometry:
             triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
             require_room(len(vertices), len(triangles))
         elif words[0] in _COMMANDS:
-            raise elsewhere("the OBJ file asks for another file or a command to be run")
+            raise elsewhere("the OBJ file refers to another file or to a command")
         elif words[0] in _NOTED:
             left_out.add(_NOTED[words[0]])
     require_room(len(vertices), len(triangles))

@@ -22,7 +22,7 @@ DTYPES: dict[str, str] = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GlobalRef:
-    """A name the pickle asked for. Nothing is imported; the name alone decides what the reader does with it."""
+    """A name that occurs in the pickle. Nothing is imported; the name alone decides what the reader does with it."""
 
     module: str
     name: str
@@ -56,7 +56,7 @@ class StorageRef:
 class TensorRef:
     """A tensor that has not been read: a view of a storage. offset and strides count elements.
 
-    ``plain`` is false where the file asks for more than a view (e.g. a conjugate or negative bit).
+    ``plain`` is false where the tensor is more than a view (e.g. a conjugate or negative bit).
     """
 
     storage: StorageRef

@@ -1,4 +1,4 @@
-"""Tensors that a family needs, as float32 arrays: read from the map only after every claim about them was checked."""
+"""Tensors that a family needs, as float32 arrays: read from the file only after every claim about them was checked."""
 
 from __future__ import annotations
 

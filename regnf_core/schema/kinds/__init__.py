@@ -1,6 +1,6 @@
 """The kinds of field that the safe format holds: one module a kind, listed in ``KINDS``. Torch-free.
 
-docs/families.md tells how to add one.
+docs/families.md describes how to add one.
 """
 
 from __future__ import annotations

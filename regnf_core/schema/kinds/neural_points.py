@@ -22,7 +22,7 @@ class NeuralPointsDescription(FieldDescription):
     cell_size: Length
     """Edge of the cells that hold one point each."""
     buffer_size: Annotated[int, Ge(1), Le(1 << 40)]
-    """Cells are told apart by a number below this."""
+    """Cells have numbers below this."""
     reach: Annotated[float, Ge(1), Le(8)]
     """Points are looked for in cells less than this many cells away."""
     max_distance: Length
