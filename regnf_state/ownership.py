@@ -9,7 +9,6 @@ The fields of a service without tokens belong to ``ANONYMOUS`` and bear no name.
 from __future__ import annotations
 
 import re
-from typing import Any
 
 ANONYMOUS = "anonymous"
 CALLER_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
@@ -29,13 +28,3 @@ def sha256_of(reference: str) -> str:
 def owner_of(reference: str) -> str:
     """The caller whose field it is."""
     return reference[_SHA256_DIGITS + 1 :] or ANONYMOUS
-
-
-def owned_request(request: dict[str, Any], caller: str) -> dict[str, Any]:
-    """A canonical request whose SHA-256s have become the caller's references."""
-    named: dict[str, Any] = {
-        name: reference_of(caller, request[name]) for name in ("scene", "object") if request[name] is not None
-    }
-    if request["candidates"] is not None:
-        named["candidates"] = [reference_of(caller, sha256) for sha256 in request["candidates"]]
-    return request | named

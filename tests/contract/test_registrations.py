@@ -10,7 +10,9 @@ from typing import Any
 
 from redis import Redis
 
+from regnf_service.jobs.canonical import job_id_of
 from regnf_state.records import FieldRecord
+from regnf_state.registration_request import RegistrationRequest
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 
 
@@ -41,8 +43,20 @@ def test_the_record_holds_the_canonical_request(world: World) -> None:
     assert record.request["options"]["optimization"]["iterations"] == 200
     assert (record.request["seed"], record.request["ground_truth"]) == (0, None)
     assert set(record.request) == {
-        "scene", "object", "candidates", "detection", "options", "seed", "initial_transform", "ground_truth",
+        "scene", "object", "candidates", "detection", "options", "seed", "initial_transform", "ground_truth", "version",
     }  # fmt: skip
+
+
+def test_the_request_is_one_value_from_the_route_to_the_worker(world: World) -> None:
+    request = world.valid_request() | {"detection": BOX | {"label": "chair"}, "seed": 3}
+    told = world.client.post("/register", params={"dry_run": True}, json=request).json()
+    record = world.records.get_job(post(world, **request).json()["id"])
+    assert record is not None
+    read = RegistrationRequest.from_record(record.request)
+    assert read.to_record() == record.request
+    assert read.values() == told["request"]
+    assert job_id_of(read) == told["id"] == record.id
+    assert (read.seed, read.detection.label, read.options.preset) == (3, "chair", "robust")
 
 
 def test_two_spellings_of_one_request_are_one_job(world: World) -> None:

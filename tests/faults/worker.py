@@ -18,6 +18,7 @@ from regnf_state.logs import configure_logging
 from regnf_state.manifest import Manifest
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
+from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker import artifacts, registration
 from regnf_worker.context import Context
@@ -45,9 +46,9 @@ class HeldEngine(TinyEngine):
     """Succeeds, in its own time."""
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: dict[str, Any], report: Report, folder: Path
+        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Report, folder: Path
     ) -> list[str]:
-        held = request | {"options": {"do": "while_held"}}
+        held = replace(request, detection=replace(request.detection, label="while_held"))
         return super().register(scene, object_, model, held, report, folder)
 
     def while_held(self, report: Report) -> None:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ from regnf_service.http.strict_json import parse_json
 from regnf_service.jobs import canonical
 from regnf_service.jobs.canonical import digest, job_id_of
 from regnf_state.reasons import REASONS
+from tests.requests import registration_request
 
 
 @pytest.mark.parametrize(
@@ -150,23 +152,24 @@ def test_pointers_stop_at_names_that_are_not_ours() -> None:
     assert json_pointer(()) == ""
 
 
-def test_job_ids_depend_on_everything_and_on_nothing_else() -> None:
-    request = {"scene": "a", "seed": 0, "detection": {"center": [0.0, 1.0, 2.0], "label": "ä"}}
-    shuffled = dict(reversed(list(request.items())))
-    assert job_id_of(request) == job_id_of(shuffled)
-    assert len({job_id_of(request | {"seed": seed}) for seed in range(20)}) == 20
+def test_job_ids_depend_on_what_changes_a_result() -> None:
+    request = registration_request("a", "b", do="ä")
+    box = request.detection
     assert len(job_id_of(request)) == 32
-    noted = request["detection"] | {"label": "another", "score": 0.5}
-    assert job_id_of(request | {"detection": noted}) == job_id_of(request)
-    assert job_id_of(request | {"detection": noted | {"center": [0.0, 1.0, 3.0]}}) != job_id_of(request)
+    assert len({job_id_of(replace(request, seed=seed)) for seed in range(20)}) == 20
+    noted = replace(request, detection=replace(box, label="another", score=0.5), webhook="https://example.org/hook")
+    assert job_id_of(noted) == job_id_of(request)
+    assert job_id_of(replace(request, detection=replace(box, center=(0.0, 1.0, 3.0)))) != job_id_of(request)
+    assert job_id_of(request.owned_by("alice")) != job_id_of(request)
     # printf '{"a":[1.5,"x"]}' | sha256sum
     assert digest({"a": [1.5, "x"]}) == hashlib.sha256(b'{"a":[1.5,"x"]}').hexdigest()
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
 
 
 def test_another_revision_of_the_engine_gives_other_jobs_and_another_version_does_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    request = {"scene": "a", "seed": 0, "detection": {"center": [0.0, 1.0, 2.0]}}
+    request = registration_request("a", "b")
     known = job_id_of(request)
     monkeypatch.setattr(canonical, "__version__", "99.0", raising=False)
     assert job_id_of(request) == known

@@ -11,10 +11,9 @@ from regnf_service.jobs.submit import check_fields
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.records import FieldRecord
 from regnf_state.settings import Settings
+from tests.requests import registration_request
 from tests.round_trips import counted_round_trips
 from tests.stores import services_over
-
-BOX = {"center": [0.0, 0.0, 0.0], "size": [1.0, 1.0, 1.0], "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}
 
 
 @pytest.mark.parametrize("count", [1, 512])
@@ -28,5 +27,5 @@ def test_any_number_of_candidates_is_one_round_trip(
     scene, *candidates = names
     sent = counted_round_trips(monkeypatch)
     named = {"/scene": scene} | {f"/candidates/{place}": name for place, name in enumerate(candidates)}
-    check_fields(services, ANONYMOUS, {"scene": scene, "detection": BOX}, named)
+    check_fields(services, ANONYMOUS, registration_request(scene, None, candidates=tuple(candidates)), named)
     assert sent == ["pipeline"]

@@ -23,6 +23,7 @@ from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
 from tests.redis_server import private_redis
+from tests.requests import request_record
 from tests.worker.tiny_worker import FUNCTIONS
 
 SCENE, OBJECT = "a" * 64, "b" * 64
@@ -80,7 +81,7 @@ class Bench:
     def submit(self, do: str, job_id: str = "j1") -> JobRecord:
         """Record and queue a job whose engine shall do this."""
         now = self.context.records.now()
-        request = {"scene": SCENE, "object": OBJECT, "options": {"do": do}, "seed": 0}
+        request = request_record(SCENE, OBJECT, do)
         record, created = self.context.records.create_job(
             JobRecord(job_id, "registration", "accepted", request, {}, now, now), 100
         )

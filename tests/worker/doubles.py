@@ -7,6 +7,7 @@ from redis import Redis
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
+from tests.requests import request_record
 from tests.stores import HeldBlobs, ShiftedRecords, WatchedQueue
 
 SHA = "a" * 64
@@ -23,7 +24,7 @@ def accept(context: Context, do: str = "succeed") -> None:
     if context.records.get_field(SHA) is None:
         context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
         context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = {"scene": SHA, "object": SHA, "options": {"do": do}}
+    request = request_record(SHA, SHA, do)
     context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
 
 

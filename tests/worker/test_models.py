@@ -14,12 +14,14 @@ from redis import Redis
 from regnf_core.errors import FieldFormatError, NoSurfaceError
 from regnf_core.options import RegistrationOptions
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker import models
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate
 from regnf_worker.models import model_key
 from regnf_worker.registration import run_attempt
+from tests.requests import request_record
 from tests.worker.doubles import context_over
 
 SCENE, CHAIR, TABLE, AIR = ("a" * 64, "b" * 64, "c" * 64, "d" * 64)
@@ -39,21 +41,21 @@ class ModelEngine:
         return {"version": "models", "device": "none"}
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: dict[str, Any], report: Any, folder: Path
+        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Any, folder: Path
     ) -> list[str]:
         self.registered.append(model)
         (folder / "result.json").write_text("{}")
         return ["result.json"]
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Any, folder: Path
+        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Any, folder: Path
     ) -> list[str]:
         self.searched.append(candidates)
         opened = [one.open().read_bytes().decode() for one in candidates]
         (folder / "result.json").write_text(json.dumps(opened))
         return ["result.json"]
 
-    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+    def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
         data = field.read_bytes()
         self.made.append(data)
         if self.while_making is not None:
@@ -89,8 +91,13 @@ def add_field(context: Context, sha256: str, data: bytes) -> None:
 
 def run(context: Context, engine: ModelEngine, job_id: str, **request: Any) -> JobRecord:
     now = context.records.now()
-    options = request.pop("options", {})
-    asked = {"scene": SCENE, "object": None, "options": RegistrationOptions.from_dict(options).to_dict(), **request}
+    candidates = request.get("candidates")
+    asked = request_record(
+        SCENE,
+        request.get("object"),
+        options=RegistrationOptions.from_dict(request.get("options", {})),
+        candidates=None if candidates is None else tuple(candidates),
+    )
     context.records.create_job(JobRecord(job_id, "registration", "accepted", asked, {}, now, now), 10)
     run_attempt(context, job_id, 1, "w", lambda: engine)
     record = context.records.get_job(job_id)

@@ -17,6 +17,7 @@ from regnf_worker.process import RegnfWorker
 from regnf_worker.registration import run_attempt
 from regnf_worker.retry import MAX_WAIT_S, passes, retry_until_available
 from regnf_worker.scratch import Scratch
+from tests.requests import request_record
 from tests.worker.doubles import context_over
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis, refuse
 from tests.worker.tiny_engine import TinyEngine, tiny_importer
@@ -28,7 +29,7 @@ def accept(context: Context, do: str = "succeed") -> None:
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
     context.blobs.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = {"scene": SHA, "object": SHA, "options": {"do": do}}
+    request = request_record(SHA, SHA, do)
     context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
 
 

@@ -18,6 +18,7 @@ from regnf_worker.imports import run_import_attempt
 from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
+from tests.requests import request_record
 from tests.stores import HeldBlobs
 from tests.worker.doubles import context_over
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
@@ -51,7 +52,7 @@ def test_a_job_whose_result_cannot_be_stored_is_run_again(context: Context, stor
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
     store.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = {"scene": SHA, "object": SHA, "options": {"do": "succeed"}}
+    request = request_record(SHA, SHA)
     context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
     store.away = True
     with pytest.raises(StorageUnavailableError):
@@ -106,7 +107,7 @@ def test_a_job_whose_files_are_gone_is_run_again(context: Context, store: AwaySt
     now = context.records.now()
     context.records.create_field(FieldRecord(SHA, "ready", 1, now, now))
     store.put(f"fields/{SHA}/field.safetensors", b"f")
-    request = {"scene": SHA, "object": SHA, "options": {"do": "succeed"}}
+    request = request_record(SHA, SHA)
     context.records.create_job(JobRecord("j1", "registration", "accepted", request, {}, now, now), 10)
     with pytest.raises(FileNotFoundError):
         run_attempt(context, "j1", 1, "w", FileLosingEngine)

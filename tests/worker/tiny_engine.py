@@ -1,4 +1,4 @@
-"""An engine that does in milliseconds what a request's options name: succeed, refuse, hang, die ..."""
+"""An engine that does in milliseconds what the label of a request's detection names: succeed, refuse, hang, die ..."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.errors import NoSurfaceError
+from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker.jobs import delivery
 from regnf_worker.registration import run_attempt
@@ -20,17 +21,17 @@ Report = Callable[[str, float], None]
 
 
 class TinyEngine:
-    """``request["options"]`` is {"do": <a method's name>}."""
+    """The label is a method's name."""
 
     def describe(self) -> dict[str, Any]:
         return {"version": "tiny", "device": "none"}
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: dict[str, Any], report: Report, folder: Path
+        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Report, folder: Path
     ) -> list[str]:
         report("sampling", 0.1)
         (folder / "half-written").write_bytes(b".")
-        getattr(self, request["options"]["do"])(report)
+        getattr(self, request.detection.label or "")(report)
         report("exporting", 0.9)
         (folder / "result.json").write_text(json.dumps({"pid": os.getpid()}))
         (folder / "aligned.ply").write_bytes(scene.read_bytes() + object_.read_bytes())

@@ -11,6 +11,7 @@ from regnf_core import __version__
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.importing.gate.gate import ImportLimits, import_field
 from regnf_core.options import RegistrationOptions
+from regnf_state.registration_request import RegistrationRequest
 
 Report = Callable[[str, float], None]
 Importer = Callable[[Path, Path, dict[str, Any]], dict[str, Any]]
@@ -44,18 +45,24 @@ class RegistrationEngine(Protocol):
         ...
 
     def register(
-        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+        self,
+        scene: Path,
+        object_: Path,
+        model: Model | None,
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
     ) -> list[str]:
-        """Do what a canonical request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
+        """Do what a request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
         ...
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Report, folder: Path
     ) -> list[str]:
         """The same for a request with candidates."""
         ...
 
-    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+    def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
         """Write the model of a safe field as an object."""
         ...
 
@@ -85,7 +92,13 @@ class CoreEngine:
         return {"version": __version__, "revision": ENGINE_REVISION, "device": self.device}
 
     def register(
-        self, scene: Path, object_: Path, model: Model | None, request: dict[str, Any], report: Report, folder: Path
+        self,
+        scene: Path,
+        object_: Path,
+        model: Model | None,
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
     ) -> list[str]:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
@@ -93,23 +106,23 @@ class CoreEngine:
         from regnf_core.registration import WarmStart, register
         from regnf_core.viewing import write_artifacts
 
-        start, truth = request.get("initial_transform"), request.get("ground_truth")
+        start, truth = request.initial_transform, request.ground_truth
         result = register(
             open_field(scene, self.device),
             open_field(object_, self.device),
-            OrientedBox.from_quaternion(**request["detection"]),
-            RegistrationOptions.from_dict(request["options"]),
-            request["seed"],
+            OrientedBox.from_quaternion(**asdict(request.detection)),
+            request.options,
+            request.seed,
             report,
             WarmStart(Sim3.from_matrix(start) if start else None, model),
         )
         report("exporting", 0.95)
-        T_true = Sim3.from_matrix(truth["T_object_scene"]) if truth else None
-        names: list[str] = write_artifacts(result, folder, truth=T_true, object_name=request["object"])
+        T_true = Sim3.from_matrix(truth) if truth else None
+        names: list[str] = write_artifacts(result, folder, truth=T_true, object_name=request.object)
         return names
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: dict[str, Any], report: Report, folder: Path
+        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Report, folder: Path
     ) -> list[str]:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
@@ -122,10 +135,10 @@ class CoreEngine:
         unusable = {one.sha256: one.fault for one in candidates if one.fault is not None}
         found = search_library(
             open_field(scene, self.device),
-            OrientedBox.from_quaternion(**request["detection"]),
+            OrientedBox.from_quaternion(**asdict(request.detection)),
             [LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None],
-            RegistrationOptions.from_dict(request["options"]),
-            request["seed"],
+            request.options,
+            request.seed,
             report,
         )
         report("exporting", 0.95)
@@ -133,12 +146,11 @@ class CoreEngine:
         names: list[str] = write_artifacts(found.result, folder, object_name=winner, candidates=ranking)
         return names
 
-    def make_model(self, field: Path, options: dict[str, Any], target: Path) -> None:
+    def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
         from regnf_core.fields.build import open_field
         from regnf_core.library import model_object, write_object_model
 
-        robust = RegistrationOptions.from_dict(options).robust
-        write_object_model(target, model_object(open_field(field, self.device), robust))
+        write_object_model(target, model_object(open_field(field, self.device), options.robust))
 
     def read_model(self, path: Path) -> Model:
         from regnf_core.library import read_object_model

@@ -18,6 +18,8 @@ from regnf_worker.retry import retry_until_available
 
 STOP_WITHIN_S = 5.0
 _REPORT_EVERY_S = 0.25
+_LAST_WORD_S = 1.0
+"""A heartbeat that is on its way when the job ends has this long to arrive."""
 logger = logging.getLogger(__name__)
 
 
@@ -49,6 +51,7 @@ class Heartbeat:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._ended.set()
+        self._thread.join(_LAST_WORD_S)
 
     def report(self, phase: str, progress: float) -> None:
         """Note phase and overall progress 0..1: every change of phase, the rest a few times a second."""

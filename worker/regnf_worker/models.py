@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from redis.exceptions import RedisError
 
@@ -31,7 +30,9 @@ class ObjectModels:
     Only models by the default options are kept: others are made for the job alone, in ``folder``.
     """
 
-    def __init__(self, context: Context, engine: RegistrationEngine, options: dict[str, Any], folder: Path) -> None:
+    def __init__(
+        self, context: Context, engine: RegistrationEngine, options: RegistrationOptions, folder: Path
+    ) -> None:
         self._context = context
         self._engine = engine
         self._options = options
@@ -82,7 +83,6 @@ class ObjectModels:
             logger.warning("the symmetry of %s goes untold: %s", field.sha256, error)
 
 
-def kept_by_default(options: dict[str, Any]) -> bool:
+def kept_by_default(options: RegistrationOptions) -> bool:
     """Whether the options ask for the model that is kept: the number of its samples is all they have a say in."""
-    asked: int = options["robust"]["object_samples"]
-    return asked == RegistrationOptions().robust.object_samples
+    return options.robust.object_samples == RegistrationOptions().robust.object_samples

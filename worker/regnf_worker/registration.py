@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +19,7 @@ from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.ownership import sha256_of
 from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
+from regnf_state.registration_request import RegistrationRequest
 from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
@@ -107,11 +109,11 @@ def _work(
     context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine], heartbeat: Heartbeat
 ) -> Manifest:
     """The job's result, standing. Raises whatever kept it from standing."""
-    request = record.request
+    request = RegistrationRequest.from_record(record.request)
     with ExitStack() as stack:
         fields = Fields(context, heartbeat, stack)
-        scene = fields.ready(request["scene"])
-        objects = [fields.ready(sha256) for sha256 in request.get("candidates") or [request["object"]]]
+        scene = fields.ready(request.scene)
+        objects = [fields.ready(sha256) for sha256 in request.objects]
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
         engine = make_engine()
         _update(context, record.id, record.attempt, engine=engine.describe())
@@ -129,7 +131,7 @@ def _work(
 def _register(
     context: Context,
     engine: RegistrationEngine,
-    request: dict[str, Any],
+    request: RegistrationRequest,
     fields: Fields,
     scene: FieldRecord,
     objects: Sequence[FieldRecord],
@@ -137,8 +139,8 @@ def _register(
     folder: Path,
 ) -> list[str]:
     """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
-    options, scene_file = request["options"], fields.file(scene.sha256)
-    if request.get("candidates"):
+    options, scene_file = request.options, fields.file(scene.sha256)
+    if request.candidates is not None:
         models = ObjectModels(context, engine, options, folder)
         candidates = [_candidate(models, one, fields, heartbeat) for one in objects]
         if all(one.model is None for one in candidates):
@@ -146,10 +148,10 @@ def _register(
         return engine.search(scene_file, candidates, request, heartbeat.report, folder)
     (one,) = objects
     object_file, model = fields.file(one.sha256), None
-    if options.get("preset") == "robust":
+    if options.preset == "robust":
         model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
-    asked = request | {"object": sha256_of(one.sha256)}
-    return engine.register(scene_file, object_file, model, asked, heartbeat.report, folder)
+    named = replace(request, object=sha256_of(one.sha256))
+    return engine.register(scene_file, object_file, model, named, heartbeat.report, folder)
 
 
 def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, heartbeat: Heartbeat) -> Candidate:

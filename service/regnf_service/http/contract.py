@@ -14,7 +14,7 @@ from regnf_core import __version__
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.http.schemas.common import ProblemDocument
 from regnf_service.http.schemas.jobs import JobDocument
-from regnf_service.http.schemas.registrations import DryRunDocument, Question, RegisterRequest
+from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 
 _DESCRIPTION = """\
 Register neural signed distance fields: given the field of a scene, a detection box in it and the field of a library
@@ -30,7 +30,7 @@ A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any
 Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
 """
 _MODELS: tuple[Any, ...] = (
-    ProblemDocument, UploadDescription, RegisterRequest, Question, DryRunDocument, JobDocument,
+    ProblemDocument, UploadDescription, RegisterRequest, RegistrationSpec, DryRunDocument, JobDocument,
 )  # fmt: skip
 _UNUSED = ("HTTPValidationError", "ValidationError")
 

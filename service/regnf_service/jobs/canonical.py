@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from regnf_core.engine_revision import ENGINE_REVISION
-from regnf_service.http.schemas.registrations import Question
+from regnf_service.http.schemas.registrations import RegistrationSpec
 from regnf_service.http.schemas.transforms import rows_of
+from regnf_state.registration_request import RegistrationRequest, recorded_detection
 
 _ID_DIGITS = 32
 _WITHOUT_EFFECT = frozenset({"label", "score"})
@@ -20,26 +21,24 @@ _WITHOUT_EFFECT = frozenset({"label", "score"})
 
 
 def canonical_request(
-    question: Question, scene: str, object_: str | None, candidates: Sequence[str] | None = None
-) -> dict[str, Any]:
+    spec: RegistrationSpec, scene: str, object_: str | None, candidates: Sequence[str] | None = None
+) -> RegistrationRequest:
     """What a worker reads from the job record: every default filled in, every spelling of a value made one.
 
     The order of candidates says nothing, so they are sorted.
     """
-    start, truth, hook = question.initial_transform, question.ground_truth, question.webhook
-    told = (
-        {} if hook is None else {"webhook": {"url": hook.url}}
-    )  # none leaves a request as it was before there were any
-    return told | {
-        "scene": scene,
-        "object": object_,
-        "candidates": None if candidates is None else sorted(candidates),
-        "detection": question.detection.canonical(),
-        "options": question.options.to_dict(),
-        "seed": question.seed,
-        "initial_transform": None if start is None else rows_of(start),
-        "ground_truth": None if truth is None else {"T_object_scene": rows_of(truth.T_object_scene)},
-    }
+    start, truth, webhook = spec.initial_transform, spec.ground_truth, spec.webhook
+    return RegistrationRequest(
+        scene=scene,
+        object=object_,
+        candidates=None if candidates is None else tuple(sorted(candidates)),
+        detection=recorded_detection(spec.detection.canonical()),
+        options=spec.options,
+        seed=spec.seed,
+        initial_transform=None if start is None else rows_of(start),
+        ground_truth=None if truth is None else rows_of(truth.T_object_scene),
+        webhook=None if webhook is None else webhook.url,
+    )
 
 
 def digest(value: Any) -> str:
@@ -48,12 +47,13 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def job_id_of(request: dict[str, Any]) -> str:
+def job_id_of(request: RegistrationRequest) -> str:
     """The job's id: a digest of what the result depends on, the engine's revision included.
 
     The webhook and the detection's label and score change nothing in a result, so they do not enter. The record of a
     job that exists keeps the label and score of the request that made it, and gets the webhook of each later one.
     """
-    detection = {name: value for name, value in request["detection"].items() if name not in _WITHOUT_EFFECT}
-    asked = {name: value for name, value in request.items() if name != "webhook"} | {"detection": detection}
+    values = request.values()
+    detection = {name: value for name, value in values["detection"].items() if name not in _WITHOUT_EFFECT}
+    asked = {name: value for name, value in values.items() if name != "webhook"} | {"detection": detection}
     return digest({"kind": "registration", "engine": ENGINE_REVISION, "request": asked})[:_ID_DIGITS]

@@ -1,17 +1,18 @@
-"""From a checked question to a job: fields looked up, the box compared with the scene, the job recorded and queued."""
+"""From a checked request to a job: fields looked up, the box compared with the scene, the job recorded and queued."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from regnf_core.detections import Bounds, parse_detection, require_in_scene
+from regnf_core.detections import Bounds, require_in_scene
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.http.dependencies import Services
 from regnf_service.http.problems import Problem
 from regnf_service.jobs.canonical import digest, job_id_of
-from regnf_state.ownership import ANONYMOUS, owned_request, reference_of
+from regnf_state.ownership import ANONYMOUS, reference_of
 from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.registration_request import RegistrationRequest
 
 _KEY_LIFETIME_S = 24 * 3600
 _MAX_KEY_LENGTH = 255
@@ -23,14 +24,14 @@ def check_idempotency_key(key: str | None) -> None:
         raise Problem("INVALID_IDEMPOTENCY_KEY")
 
 
-def check_fields(services: Services, caller: str, request: dict[str, Any], named: Mapping[str, str]) -> None:
+def check_fields(services: Services, caller: str, request: RegistrationRequest, named: Mapping[str, str]) -> None:
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
     Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
     """
-    services.webhooks.check(caller, request)
-    asked = [request["scene"], *named.values()]
+    services.webhooks.check(caller, request.webhook)
+    asked = [request.scene, *named.values()]
     scene, *found = services.records.get_fields([reference_of(caller, sha256) for sha256 in asked])
     records = dict(zip(named, found, strict=True))
     _require_usable(records)
@@ -38,7 +39,7 @@ def check_fields(services: Services, caller: str, request: dict[str, Any], named
     if bounds is None:
         return
     try:
-        require_in_scene(parse_detection(request["detection"]), bounds, _bounds(records.get("/object")))
+        require_in_scene(request.detection, bounds, _bounds(records.get("/object")))
     except InvalidDetectionError as error:
         fault = {"pointer": "/detection", "detail": str(error)}
         raise Problem(error.reason, str(error), errors=[fault], hint=error.hint) from error
@@ -67,13 +68,13 @@ def _bounds(found: FieldRecord | None) -> Bounds | None:
     return None
 
 
-def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_key: str | None) -> JobRecord:
-    """The job for a caller's canonical request: a new one, or the one that exists, queued if it has not run.
+def submit(services: Services, caller: str, asked: RegistrationRequest, idempotency_key: str | None) -> JobRecord:
+    """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
     Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError.
     """
-    request = owned_request(asked, caller)
+    request = asked.owned_by(caller)
     job_id = job_id_of(request)
     if idempotency_key is not None:
         key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]
@@ -86,7 +87,7 @@ def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_k
             id=job_id,
             kind="registration",
             status="accepted",
-            request=request,
+            request=request.to_record(),
             inputs=_inputs(asked),
             created=now,
             updated=now,
@@ -100,9 +101,9 @@ def submit(services: Services, caller: str, asked: dict[str, Any], idempotency_k
     return record
 
 
-def _earlier_answer(services: Services, key: str, job_id: str, request: dict[str, Any]) -> JobRecord | None:
+def _earlier_answer(services: Services, key: str, job_id: str, request: RegistrationRequest) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
-    asked = digest(request)  # of all of it: another webhook is another request
+    asked = digest(request.values())  # of all of it: another webhook is another request
     mine = f"{asked} {services.records.now()!r}"
     bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
     bound_request, _, bound_at = bound.partition(" ")
@@ -112,16 +113,18 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: dict[str
     # a job that has not changed since the key came up is not that call's doing: the call never got so far
     if known is None or known.updated < float(bound_at):
         return None
-    return known if "webhook" not in request or request["webhook"]["url"] in known.webhooks else None
+    return known if request.webhook is None or request.webhook in known.webhooks else None
 
 
-def _inputs(request: dict[str, Any]) -> dict[str, Any]:
+def _inputs(request: RegistrationRequest) -> dict[str, Any]:
+    """What the job's document shows of the request."""
+    values = request.values()
     return {
-        "scene": request["scene"],
-        "object": request["object"],
-        "candidates": None if request["candidates"] is None else len(request["candidates"]),
-        "detection": request["detection"],
-        "seed": request["seed"],
-        "initial_transform": request["initial_transform"],
-        "options_sha256": digest(request["options"]),
+        "scene": request.scene,
+        "object": request.object,
+        "candidates": None if request.candidates is None else len(request.candidates),
+        "detection": values["detection"],
+        "seed": request.seed,
+        "initial_transform": request.initial_transform,
+        "options_sha256": digest(values["options"]),
     }

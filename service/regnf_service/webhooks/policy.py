@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from regnf_service.http.problems import Problem
 from regnf_service.webhooks.signing import Secrets
@@ -23,11 +21,11 @@ class Webhooks:
     secrets: Secrets
     outbox: RedisOutbox
 
-    def check(self, caller: str, request: Mapping[str, Any]) -> None:
-        """Raises Problem WEBHOOK_NOT_ALLOWED."""
-        if "webhook" not in request:
+    def check(self, caller: str, url: str | None) -> None:
+        """Whether this caller may name this address. Raises Problem WEBHOOK_NOT_ALLOWED."""
+        if url is None:
             return
-        if not self.allowed.allows(request["webhook"]["url"]):
+        if not self.allowed.allows(url):
             raise Problem("WEBHOOK_NOT_ALLOWED", errors=[{"pointer": _POINTER, "detail": "no host that is allowed"}])
         if caller not in self.secrets:
             fault = {"pointer": _POINTER, "detail": "the service has no secret of yours to sign with"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import AsyncExitStack
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
@@ -29,12 +29,12 @@ from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.reading import read_model
-from regnf_service.http.schemas.registrations import DryRunDocument, Question, RegisterRequest
+from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 from regnf_service.http.waiting import wait_for
 from regnf_service.jobs.canonical import canonical_request, job_id_of
 from regnf_service.jobs.submit import check_fields, check_idempotency_key, submit
-from regnf_state.ownership import owned_request
 from regnf_state.records import ACTIVE, FINISHED
+from regnf_state.registration_request import RegistrationRequest
 
 router = APIRouter(tags=["registrations"])
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
@@ -44,7 +44,7 @@ _ONE_SHOT = {
         "type": "object",
         "required": ["scene", "object", "request"],
         "additionalProperties": False,
-        "properties": {"scene": FILE, "object": FILE, "request": reference(Question)},
+        "properties": {"scene": FILE, "object": FILE, "request": reference(RegistrationSpec)},
     }
 }
 
@@ -135,7 +135,8 @@ async def register(
     else:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
     if dry_run:
-        return JSONResponse({"valid": True, "id": job_id_of(owned_request(asked, caller)), "request": asked})
+        job_id = job_id_of(asked.owned_by(caller))
+        return JSONResponse({"valid": True, "id": job_id, "request": asked.values()})
     record = await in_thread(submit, services, caller, asked, idempotency_key)
     wait = preferred_wait(prefer)
     if wait and record.status in ACTIVE:
@@ -152,21 +153,21 @@ async def register(
     return response
 
 
-async def _by_reference(request: Request, services: Services, caller: str) -> dict[str, Any]:
+async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     settings = services.settings
     text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
-    question = read_model(RegisterRequest, text)
-    asked = canonical_request(question, question.scene, question.object, question.candidates)
-    named = {"/scene": question.scene}
-    if question.object is not None:
-        named["/object"] = question.object
-    named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(question.candidates or ())}
+    spec = read_model(RegisterRequest, text)
+    asked = canonical_request(spec, spec.scene, spec.object, spec.candidates)
+    named = {"/scene": spec.scene}
+    if spec.object is not None:
+        named["/object"] = spec.object
+    named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(spec.candidates or ())}
     await in_thread(check_fields, services, caller, asked, named)
     return asked
 
 
-async def _one_shot(request: Request, services: Services, caller: str, keep: bool) -> dict[str, Any]:
-    """Both files and the question in one body. Nothing is kept before all of it has arrived and been checked."""
+async def _one_shot(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
+    """Both files and the request in one body. Nothing is kept before all of it has arrived and been checked."""
     body.refuse_encoding(request)
     settings = services.settings
     limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
@@ -177,9 +178,9 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
-        question = read_model(Question, parts["request"])
+        spec = read_model(RegistrationSpec, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
-        asked = canonical_request(question, received["scene"].sha256, received["object"].sha256)
+        asked = canonical_request(spec, received["scene"].sha256, received["object"].sha256)
         await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():

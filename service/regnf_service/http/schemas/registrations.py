@@ -68,8 +68,8 @@ class Webhook(Incoming):
     url: Annotated[str, StringConstraints(min_length=8, max_length=2000)]
 
 
-class Question(Incoming):
-    """What a registration asks, apart from the fields: the part `request` of a one-shot upload."""
+class RegistrationSpec(Incoming):
+    """What a registration asks for, apart from the fields: the part `request` of a one-shot upload."""
 
     detection: Detection = Field(description="Where in the scene the object is.")
     options: RegistrationOptions = Field(default_factory=RegistrationOptions)
@@ -99,7 +99,7 @@ def _one_of_both(schema: dict[str, Any]) -> None:
         schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
 
 
-class RegisterRequest(Question):
+class RegisterRequest(RegistrationSpec):
     """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
 
     model_config = ConfigDict(json_schema_extra=_one_of_both)

@@ -1,0 +1,110 @@
+"""What a registration job is asked to do: one typed value, from the HTTP route through the record to the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from regnf_core.detections import Detection
+from regnf_core.options import RegistrationOptions
+from regnf_state.ownership import reference_of
+
+Rows = list[list[float]]
+"""A row-major 4x4 matrix."""
+_VERSION = 1
+
+
+class UnknownRequestVersionError(ValueError):
+    """The record was written by another version of the program, which this one cannot read."""
+
+
+@dataclass(frozen=True)
+class RegistrationRequest:
+    """One registration, or one search among ``candidates``: every default filled in, every value in its one form.
+
+    Fields are named by SHA-256 towards callers, and by their owner's references in records: ``owned_by``.
+    """
+
+    scene: str
+    object: str | None
+    candidates: tuple[str, ...] | None
+    detection: Detection
+    options: RegistrationOptions
+    seed: int = 0
+    initial_transform: Rows | None = None
+    """T_object_scene to try first."""
+    ground_truth: Rows | None = None
+    """T_object_scene that the metrics compare with."""
+    webhook: str | None = None
+    """Address of the message about the job's end."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The fields to be found in the scene: one, or all candidates."""
+        if self.candidates is not None:
+            return self.candidates
+        return () if self.object is None else (self.object,)
+
+    def owned_by(self, caller: str) -> RegistrationRequest:
+        """The same request over the caller's own fields."""
+        return replace(
+            self,
+            scene=reference_of(caller, self.scene),
+            object=None if self.object is None else reference_of(caller, self.object),
+            candidates=None if self.candidates is None else tuple(reference_of(caller, one) for one in self.candidates),
+        )
+
+    def values(self) -> dict[str, Any]:
+        """Plain (JSON) values; equal requests have equal ones."""
+        box = self.detection
+        values = {
+            "scene": self.scene,
+            "object": self.object,
+            "candidates": None if self.candidates is None else list(self.candidates),
+            "detection": {
+                "center": list(box.center),
+                "size": list(box.size),
+                "rotation_quaternion_xyzw": list(box.rotation_quaternion_xyzw),
+                "label": box.label,
+                "score": box.score,
+            },
+            "options": self.options.to_dict(),
+            "seed": self.seed,
+            "initial_transform": self.initial_transform,
+            "ground_truth": None if self.ground_truth is None else {"T_object_scene": self.ground_truth},
+        }
+        return values if self.webhook is None else values | {"webhook": {"url": self.webhook}}
+
+    def to_record(self) -> dict[str, Any]:
+        """The values as a job's record keeps them, with the version of their form."""
+        return self.values() | {"version": _VERSION}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> RegistrationRequest:
+        """The request that ``to_record`` wrote. Raises UnknownRequestVersionError, InvalidOptionsError."""
+        if record.get("version") != _VERSION:
+            raise UnknownRequestVersionError(f"the request has version {record.get('version')}, not {_VERSION}")
+        candidates, truth, webhook = record["candidates"], record["ground_truth"], record.get("webhook")
+        return cls(
+            scene=record["scene"],
+            object=record["object"],
+            candidates=None if candidates is None else tuple(candidates),
+            detection=recorded_detection(record["detection"]),
+            options=RegistrationOptions.from_dict(record["options"]),
+            seed=record["seed"],
+            initial_transform=record["initial_transform"],
+            ground_truth=None if truth is None else truth["T_object_scene"],
+            webhook=None if webhook is None else webhook["url"],
+        )
+
+
+def recorded_detection(record: Mapping[str, Any]) -> Detection:
+    """The box of canonical values, as they are: to normalize the quaternion again might change its last bits."""
+    return Detection(
+        center=tuple(record["center"]),
+        size=tuple(record["size"]),
+        rotation_quaternion_xyzw=tuple(record["rotation_quaternion_xyzw"]),
+        label=record["label"],
+        score=record["score"],
+    )
