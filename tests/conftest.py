@@ -14,10 +14,11 @@ from regnf_state.records import RecordStore
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.grouping import pytest_collection_modifyitems
+from tests.live_stack import demo_fields, live_client, live_stack
 from tests.object_store import ObjectServer, object_server
 from tests.redis_server import default_server, installed_servers, private_redis
 
-__all__ = ["pytest_collection_modifyitems"]
+__all__ = ["demo_fields", "live_client", "live_stack", "pytest_collection_modifyitems"]
 
 # Threads of several processes that spin while they wait slow a shared machine tenfold. Set before torch loads.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
