@@ -28,7 +28,8 @@ QUICK = {
 @pytest.fixture(scope="session")
 def live_stack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """The service; what a test uploads and asks for stays, so it uses bytes and seeds of its own."""
-    with live_service(tmp_path_factory.mktemp("live"), heartbeat_s=0.5, workers=1, threads=1) as started:
+    settings = {"heartbeat_s": 0.5, "workers": 1, "threads": 1, "preload": True}
+    with live_service(tmp_path_factory.mktemp("live"), **settings) as started:
         yield started
         assert "Traceback" not in started.log()
 

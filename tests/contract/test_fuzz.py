@@ -15,7 +15,7 @@ REDUCED = ["--phases", "examples,fuzzing,stateful", "--max-examples", "4", "--se
 @pytest.mark.slow
 def test_no_request_is_answered_against_the_contract(tmp_path: Path) -> None:
     (tmp_path / "state").mkdir()
-    with live_service(tmp_path / "state", **fuzz_contract.SETTINGS) as live:
+    with live_service(tmp_path / "state", **fuzz_contract.SETTINGS, preload=True) as live:
         outcome = fuzz_contract.run(live, tmp_path, REDUCED)
     assert outcome.failures == []
     assert outcome.requests >= 100
