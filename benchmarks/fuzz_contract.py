@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 
 from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_small_pair
 from regnf_cli.remote import RemoteService
@@ -37,7 +38,6 @@ from tests.worker.bench import children_of
 _ROOT = Path(__file__).resolve().parents[1]
 _HERE = Path(__file__).resolve().parent
 _ENDLESS = {"preset": "paper", "optimization": {"iterations": 10_000, "stop_residual": 0.0}}
-_SPARE_FIELDS = 4
 SETTINGS: dict[str, object] = {
     "threads": 1,
     "max_queued_jobs": 1_000_000,
@@ -61,7 +61,7 @@ class Outcome:
     report: dict[str, Any] = field(repr=False)
 
 
-def prepare(live: Live, folder: Path) -> dict[str, Any]:
+def prepare(live: Live, folder: Path, spare_fields: int) -> dict[str, Any]:
     """Fields in every state, jobs of every end; what the hooks are told of them."""
     pair = write_small_pair(folder)
     with RemoteService(live.address) as service:
@@ -75,7 +75,7 @@ def prepare(live: Live, folder: Path) -> dict[str, Any]:
         kept = [request["scene"], request["object"]]
         rejected = client.post("/fields", content=_broken(pair)).json()["sha256"]
         client.get(f"/fields/{rejected}", params={"wait": 30})
-        spare_files = _spare_files(folder)
+        spare_files = _spare_files(folder, spare_fields)
         spare = [client.post("/fields", content=path.read_bytes()).json()["sha256"] for path in spare_files]
         running = [client.post("/register", json={**request, "options": _ENDLESS, "seed": n}).json() for n in range(20)]
         client.post(f"/jobs/{running[-1]['id']}/cancel")
@@ -95,7 +95,7 @@ def prepare(live: Live, folder: Path) -> dict[str, Any]:
 def _halt(live: Live, client: httpx.Client, job_id: str) -> None:
     """Stop the process of the job that runs, so that it goes on running, and all others waiting, at no cost."""
     assert live.worker is not None
-    eventually(lambda: client.get(f"/jobs/{job_id}").json()["status"] == "running", "a job that runs")
+    eventually(lambda: client.get(f"/jobs/{job_id}").json()["status"] == "running", "a job that runs", 180.0)
     for child in children_of(live.worker.pid):
         os.kill(child, signal.SIGSTOP)
 
@@ -105,23 +105,20 @@ def _broken(pair: SmallPair) -> bytes:
     return data[: len(data) // 2]
 
 
-def _spare_files(folder: Path) -> list[Path]:
-    """Small meshes, each with bytes of its own."""
-    paths = []
-    for index in range(_SPARE_FIELDS):
-        low, high = -0.5, 0.5 + 0.01 * index
-        corners = [(x, y, z) for x in (low, high) for y in (low, high) for z in (low, high)]
-        faces = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
-        lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f " + " ".join(map(str, face)) for face in faces]
-        paths.append(folder / f"box-{index}.obj")
-        paths[-1].write_text("\n".join(lines) + "\n")
+def _spare_files(folder: Path, count: int) -> list[Path]:
+    """Balls as small grids, each with bytes of its own: of what can be uploaded, nothing is imported in less time."""
+    axis = np.linspace(-1.0, 1.0, 17, dtype=np.float32)
+    distance = np.sqrt(sum(np.square(part) for part in np.meshgrid(axis, axis, axis, indexing="ij")))
+    paths = [folder / f"ball-{index}.npz" for index in range(count)]
+    for index, path in enumerate(paths):
+        np.savez(path, sdf=distance - np.float32(0.5 + 0.01 * index), bounds=np.array([[-1.0] * 3, [1.0] * 3]))
     return paths
 
 
-def run(live: Live, folder: Path, arguments: Sequence[str]) -> Outcome:
-    """Prepare the service and let schemathesis at it."""
+def run(live: Live, folder: Path, arguments: Sequence[str], spare_fields: int = 4) -> Outcome:
+    """Prepare the service, with so many fields that may be deleted, and let schemathesis at it."""
     world, report = folder / "world.json", folder / "report.json"
-    world.write_text(json.dumps(prepare(live, folder)), encoding="utf-8")
+    world.write_text(json.dumps(prepare(live, folder, spare_fields)), encoding="utf-8")
     command = [
         *(sys.executable, "-m", "schemathesis.cli", "--config-file", str(_HERE / "fuzz_contract.toml"), "run"),
         *(str(_ROOT / "openapi.yaml"), "--url", live.address, "--checks", "all", "--continue-on-failure"),
