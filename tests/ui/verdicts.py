@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from regnf_core.hints import HINTS
 from tests.ui.synthetic import Synthetic, rotation, sim3_document, similarity
 
 SIGMAS = [math.radians(0.4), math.radians(0.8), math.radians(0.2), 0.003, 0.001, 0.002, 0.005]
@@ -22,6 +23,7 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
         "verdict": "ambiguous",
         "verdict_reason": "SEVERAL_POSES_AGREE",
         "verdict_detail": DETAIL,
+        "verdict_hint": HINTS["SEVERAL_POSES_AGREE"],
         "alternatives": [
             _alternative(data, [0, 0, 1], 3.0, 0.043, "172 degrees about z"),
             _alternative(data, [1, 0, 0], math.pi, 0.071, "180 degrees about x"),
