@@ -73,9 +73,11 @@ demo() {
     "${buildah[@]}" copy --quiet "$container" constraints.txt /constraints.txt >/dev/null
     in_container=("${buildah[@]}" run "${volumes[@]}" "$container" --)
     "${in_container[@]}" python -m venv /regnf
-    "${in_container[@]}" /regnf/bin/pip install --quiet --constraint /constraints.txt torch
-    "${in_container[@]}" sh -c '/regnf/bin/pip install --quiet "$(echo /wheels/regnf-*.whl)[all]"'
-    alone sh -c 'ip link set lo up && exec "$@"' sh "${buildah[@]}" run "$container" -- /regnf/bin/regnf demo
+    # torch by its pinned version: a package index may offer builds for GPUs first. All else as a stranger gets it.
+    "${in_container[@]}" /regnf/bin/pip install -qq --constraint /constraints.txt torch
+    "${in_container[@]}" sh -c '/regnf/bin/pip install -qq "$(echo /wheels/regnf-*.whl)[all]"'
+    alone sh -c 'ip link set lo up && exec "$@"' sh "${buildah[@]}" run "$container" -- \
+        sh -c '/regnf/bin/regnf demo --state-dir /demo || { tail -n 40 /demo/serve.log; exit 1; }'
 }
 
 clean() {
