@@ -7,7 +7,7 @@ import ipaddress
 import socket
 
 from regnf_cli.start_errors import StartError
-from regnf_service.http.tokens import TokensError, read_callers
+from regnf_service.tokens import TokensError, read_callers
 from regnf_service.webhooks.signing import read_secrets
 from regnf_service.webhooks.targets import AllowList
 from regnf_state.settings import Settings

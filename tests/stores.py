@@ -12,7 +12,7 @@ from typing import Any
 
 from redis import Redis
 
-from regnf_service.http.dependencies import Services
+from regnf_service.services import Services
 from regnf_service.webhooks.service import webhooks_of
 from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore

@@ -13,14 +13,14 @@ from starlette.staticfiles import StaticFiles
 from regnf_core import __version__
 from regnf_service.http import problems
 from regnf_service.http.contract import build_contract
-from regnf_service.http.dependencies import Services
 from regnf_service.http.middleware import RequestContext, TokenGate
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
-from regnf_service.http.routes import fields, jobs, meta, pages, registrations, results, uploads
-from regnf_service.http.tokens import Callers, read_callers
+from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics
+from regnf_service.services import Services
+from regnf_service.tokens import Callers, read_callers
 from regnf_service.webhooks.service import webhooks_of
 from regnf_state.redis.client import RETRIES
 from regnf_state.settings import Settings
@@ -28,9 +28,6 @@ from regnf_state.stores import Stores, open_stores
 
 _STORAGE_WAIT_S = 10.0
 _STRICT = [Depends(refuse_unknown_parameters)]
-_ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
-# links that people pass on and probes gather parameters that nobody meant
-_LENIENT_ROUTERS = (pages.router, meta.router)
 
 
 def create_app(
@@ -83,7 +80,7 @@ def _middleware(
 
 
 def _include_routers(app: FastAPI, **how: Any) -> None:
-    for router in _ROUTERS:
+    for router in ROUTERS:
         app.include_router(router, dependencies=_STRICT, **how)
-    for router in _LENIENT_ROUTERS:
+    for router in LENIENT_ROUTERS:
         app.include_router(router, **how)

@@ -10,9 +10,9 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from fastapi import FastAPI
 from redis.exceptions import RedisError
 
-from regnf_service.http.concurrency import pause
-from regnf_service.http.dependencies import Services, in_thread
+from regnf_service.concurrency import in_thread, pause
 from regnf_service.metrics import Metrics, served
+from regnf_service.services import Services
 from regnf_service.shutdown import stopping_on_signals
 from regnf_service.upkeep.housekeeping import Housekeeper
 from regnf_service.upkeep.reaper import Reaper
@@ -31,7 +31,9 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.openapi()  # takes a while, so not while somebody waits for an answer
         reaping = asyncio.create_task(_reap(services))
-        delivering = asyncio.create_task(deliver_until_stopped(services))
+        delivering = asyncio.create_task(
+            deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
+        )
         at = services.settings
         with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
             yield

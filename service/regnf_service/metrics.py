@@ -14,8 +14,8 @@ from prometheus_client.registry import Collector
 from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from regnf_service.http.dependencies import Services
 from regnf_service.http.middleware import route_of
+from regnf_service.services import Services
 from regnf_state.redis.counters import Counters
 from regnf_state.redis.webhook_outbox import RedisOutbox
 

@@ -16,7 +16,7 @@ from redis.exceptions import RedisError
 
 from regnf_service import lifespan
 from regnf_service.app import create_app
-from regnf_service.http.concurrency import Waiters
+from regnf_service.concurrency import Waiters
 from regnf_service.http.waiting import pause, wait_for
 from regnf_service.shutdown import stopping_on_signals
 from regnf_state.settings import Settings

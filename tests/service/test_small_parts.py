@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.problems import Problem, json_pointer
 from regnf_service.http.ranges import ByteRange, parse_range
 from regnf_service.http.routes.registrations import preferred_wait
 from regnf_service.http.strict_json import parse_json
-from regnf_service.jobs import canonical
-from regnf_service.jobs.canonical import digest, job_id_of
+from regnf_service.jobs import identity
+from regnf_service.jobs.identity import digest, job_id_of
+from regnf_service.problem import Problem, json_pointer
 from regnf_state.reasons import REASONS
 from tests.requests import registration_request
 
@@ -171,9 +171,9 @@ def test_another_revision_of_the_engine_gives_other_jobs_and_another_version_doe
 ) -> None:
     request = registration_request("a", "b")
     known = job_id_of(request)
-    monkeypatch.setattr(canonical, "__version__", "99.0", raising=False)
+    monkeypatch.setattr(identity, "__version__", "99.0", raising=False)
     assert job_id_of(request) == known
-    monkeypatch.setattr(canonical, "ENGINE_REVISION", canonical.ENGINE_REVISION + 1)
+    monkeypatch.setattr(identity, "ENGINE_REVISION", identity.ENGINE_REVISION + 1)
     assert job_id_of(request) != known
 
 

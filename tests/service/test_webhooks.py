@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from redis import Redis
 
-from regnf_service.http.tokens import TokensError
+from regnf_service.tokens import TokensError
 from regnf_service.webhooks.deliverer import Deliverer
 from regnf_service.webhooks.sender import HttpSender
 from regnf_service.webhooks.signing import read_secrets, signed_headers

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from regnf_core.errors import InvalidInputError
-from regnf_service.http.problems import Problem
 from regnf_service.http.schemas.common import whole_problem
+from regnf_service.problem import Problem
 from regnf_state.manifest import ARTIFACTS, Artifact
 from regnf_state.problems import problem_document
 from regnf_state.reasons import REASONS

@@ -6,13 +6,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, Upload
-from regnf_service.http.body import CLOSE
-from regnf_service.http.dependencies import Services, in_thread
-from regnf_service.http.problems import Problem
-from regnf_service.http.schemas.fields import function_of
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord, QuotaError
+
+
+def function_of(description: UploadDescription) -> dict[str, Any]:
+    """What the import needs of a description: everything that was said but the label."""
+    return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
 def check_room(services: Services, caller: str, sha256: str, size: int | None) -> None:

@@ -16,8 +16,8 @@ import anyio
 from anyio import CapacityLimiter, to_thread
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-from regnf_service.http.body import CLOSE
-from regnf_service.http.problems import Problem
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
 
 _BLOCK_BYTES = 1 << 20
@@ -88,7 +88,15 @@ class Upload:
 
 
 @asynccontextmanager
-async def open_upload(blobs: BlobStore, limit: int, limiter: CapacityLimiter) -> AsyncIterator[Upload]:
+async def open_upload(services: Services, caller: str) -> AsyncIterator[Upload]:
+    """A new upload of a caller into the blob store, within the settings' limits. Raises Problem TOO_MANY_UPLOADS."""
+    with services.uploads.held(caller):
+        async with _writing(services.blobs, services.settings.max_upload_bytes, services.upload_limiter) as upload:
+            yield upload
+
+
+@asynccontextmanager
+async def _writing(blobs: BlobStore, limit: int, limiter: CapacityLimiter) -> AsyncIterator[Upload]:
     """An upload of at most ``limit`` bytes; ``limiter`` caps the threads that all uploads together may hold."""
     writer = blobs.writer()
     opened = await to_thread.run_sync(writer.__enter__, limiter=limiter)

@@ -7,10 +7,7 @@ from collections.abc import AsyncIterator
 
 from starlette.requests import Request
 
-from regnf_service.http.problems import Problem
-
-# the connection cannot be used again when the body was not read to its end
-CLOSE = {"Connection": "close"}
+from regnf_service.problem import CLOSE, Problem
 
 
 def declared_length(request: Request) -> int | None:

@@ -11,10 +11,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import TypeAdapter
 
 from regnf_core import __version__
-from regnf_core.importing.upload_description import UploadDescription
-from regnf_service.http.schemas.common import ProblemDocument
-from regnf_service.http.schemas.jobs import JobDocument
-from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
+from regnf_service.http.schemas.references import REFERENCED
 
 _DESCRIPTION = """\
 Register neural signed distance fields: given the field of a scene, a detection box in it and the field of a library
@@ -29,9 +26,6 @@ A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any
 
 Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
 """
-_MODELS: tuple[Any, ...] = (
-    ProblemDocument, UploadDescription, RegisterRequest, RegistrationSpec, DryRunDocument, JobDocument,
-)  # fmt: skip
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
 
@@ -47,7 +41,7 @@ def build_contract(app: FastAPI) -> dict[str, Any]:
     )
     components = contract.setdefault("components", {})
     inputs: list[tuple[Any, Literal["validation"], TypeAdapter[Any]]] = [
-        (model.__name__, "validation", TypeAdapter(model)) for model in _MODELS
+        (name, "validation", TypeAdapter(model)) for name, model in REFERENCED.items()
     ]
     _, extra = TypeAdapter.json_schemas(inputs, ref_template="#/components/schemas/{model}")
     components["schemas"] = dict(sorted((extra["$defs"] | components.get("schemas", {})).items()))

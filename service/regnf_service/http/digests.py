@@ -6,8 +6,7 @@ import base64
 import binascii
 import re
 
-from regnf_service.http.body import CLOSE
-from regnf_service.http.problems import Problem
+from regnf_service.problem import CLOSE, Problem
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _MEMBER = re.compile(r"\s*([a-z0-9*_.-]{1,32})=:([A-Za-z0-9+/=]{0,128}):\s*")

@@ -11,8 +11,9 @@ import uuid
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from regnf_service.http.problems import Problem, problem_response
-from regnf_service.http.tokens import Callers, caller_of
+from regnf_service.http.problems import problem_response
+from regnf_service.problem import Problem
+from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
 

@@ -13,8 +13,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
 
-from regnf_service.http.body import CLOSE
-from regnf_service.http.problems import Problem
+from regnf_service.problem import CLOSE, Problem
 
 _MAX_HEADER_BYTES = 4096
 _MAX_HEADERS = 8

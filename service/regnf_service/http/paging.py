@@ -7,7 +7,7 @@ import binascii
 import json
 import math
 
-from regnf_service.http.problems import Problem
+from regnf_service.problem import Problem
 
 
 def encode_token(created: float, name: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from fastapi import FastAPI
@@ -19,63 +19,14 @@ from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
 from regnf_service.http.contract import allowed_methods
+from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
-from regnf_state.problems import problem_document
 from regnf_state.reasons import REASONS
 from regnf_state.records import QueueFullError, QuotaError, RecordError
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
-RETRY_LATER = {"Retry-After": "5"}
-_MAX_ERRORS = 32
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: "REQUEST_TOO_LARGE"}
-
-
-class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
-    """An answer that refuses. ``reason`` must be in REASONS; it gives status and title."""
-
-    def __init__(
-        self,
-        reason: str,
-        detail: str | None = None,
-        *,
-        errors: Sequence[Mapping[str, str]] = (),
-        headers: Mapping[str, str] | None = None,
-        hint: str | None = None,
-        extra: Mapping[str, Any] | None = None,
-    ) -> None:
-        entry = REASONS[reason]
-        super().__init__(detail or entry.title)
-        self.reason = reason
-        self.status = entry.status
-        self.detail = detail or entry.meaning
-        self.errors = list(errors)[:_MAX_ERRORS]
-        self.headers = dict(headers or {})
-        self.hint = hint
-        self.extra = dict(extra or {})
-
-    def document(self, instance: str | None = None, request_id: str | None = None) -> dict[str, Any]:
-        """The problem object as it travels."""
-        document = problem_document(self.reason, self.detail, hint=self.hint)
-        if instance is not None:
-            document["instance"] = instance
-        if request_id is not None:
-            document["request_id"] = request_id
-        if self.errors:
-            document["errors"] = self.errors
-        return document | self.extra
-
-
-def json_pointer(location: Sequence[str | int]) -> str:
-    """The JSON Pointer (RFC 6901) of a place in the request; a member with an odd name is pointed at by its parent."""
-    pointer = ""
-    for part in location:
-        text = str(part)
-        if not _PLAIN_NAME.fullmatch(text):
-            break
-        pointer += f"/{text}"
-    return pointer
 
 
 def problem_of(error: Exception) -> Problem:

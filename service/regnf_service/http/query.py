@@ -7,8 +7,7 @@ from collections import Counter
 from fastapi.routing import APIRoute
 from starlette.requests import Request
 
-from regnf_service.http.body import CLOSE
-from regnf_service.http.problems import Problem, json_pointer
+from regnf_service.problem import CLOSE, Problem, json_pointer
 
 
 async def refuse_unknown_parameters(request: Request) -> None:

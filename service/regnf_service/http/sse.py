@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from regnf_service.http.concurrency import Slots
-from regnf_service.http.dependencies import Services
+from regnf_service.concurrency import Slots
+from regnf_service.services import Services
 from regnf_state.records import FINISHED, JobEvent
 
 MEDIA_TYPE = "text/event-stream"

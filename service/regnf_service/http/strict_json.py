@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from regnf_core.json_faults import json_fault
-from regnf_service.http.problems import Problem
+from regnf_service.problem import Problem
 
 _MAX_DEPTH = 32
 _LARGEST_EXACT = 2**53

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from anyio import to_thread
 
-from regnf_service.http.concurrency import pause
-from regnf_service.http.dependencies import Services, in_thread
+from regnf_service.concurrency import in_thread, pause
+from regnf_service.services import Services
 
 _FIRST_PAUSE_S = 0.02
 _MAX_PAUSE_S = 0.25

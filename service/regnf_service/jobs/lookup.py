@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from regnf_service.http.dependencies import Services
-from regnf_service.http.problems import Problem
+from regnf_service.problem import Problem
+from regnf_service.services import Services
 from regnf_state.records import JobRecord
 
 _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")

@@ -7,9 +7,9 @@ from typing import Any
 
 from regnf_core.detections import Bounds, require_in_scene
 from regnf_core.errors import InvalidDetectionError
-from regnf_service.http.dependencies import Services
-from regnf_service.http.problems import Problem
-from regnf_service.jobs.canonical import digest, job_id_of
+from regnf_service.jobs.identity import digest, job_id_of
+from regnf_service.problem import Problem
+from regnf_service.services import Services
 from regnf_state.ownership import ANONYMOUS, reference_of
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.registration_request import RegistrationRequest

@@ -6,7 +6,7 @@ import json
 import logging
 from dataclasses import replace
 
-from regnf_service.http.schemas.common import rfc3339
+from regnf_service.times import rfc3339
 from regnf_service.webhooks.sender import Sender, SendError
 from regnf_service.webhooks.signing import Secrets, signed_headers
 from regnf_service.webhooks.targets import AllowList

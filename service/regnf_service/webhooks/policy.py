@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from regnf_service.http.problems import Problem
+from regnf_service.problem import Problem
 from regnf_service.webhooks.signing import Secrets
 from regnf_service.webhooks.targets import AllowList
 from regnf_state.records import JobRecord

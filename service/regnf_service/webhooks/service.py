@@ -9,13 +9,13 @@ from anyio import CapacityLimiter, to_thread
 from redis import Redis
 from redis.exceptions import RedisError
 
-from regnf_service.http.concurrency import pause
-from regnf_service.http.dependencies import Services
+from regnf_service.concurrency import pause
 from regnf_service.webhooks.deliverer import Deliverer
 from regnf_service.webhooks.policy import Webhooks
 from regnf_service.webhooks.sender import HttpSender
 from regnf_service.webhooks.signing import read_secrets
 from regnf_service.webhooks.targets import AllowList
+from regnf_state.records import RecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from regnf_state.settings import Settings
 
@@ -31,15 +31,16 @@ def webhooks_of(settings: Settings, redis: Redis) -> Webhooks:
     return Webhooks(AllowList(settings.webhook_hosts), secrets, RedisOutbox(redis))
 
 
-async def deliver_until_stopped(services: Services) -> None:
+async def deliver_until_stopped(
+    webhooks: Webhooks, records: RecordStore, redis: Redis, stopping: asyncio.Event
+) -> None:
     """Send what is due, a few at once, until the service stops; nothing where no host is allowed."""
-    webhooks = services.webhooks
     if not webhooks.allowed:
         return
     sender = HttpSender(webhooks.allowed.permits)
-    deliverer = Deliverer(services.records, RedisOutbox(services.redis), sender, webhooks.allowed, webhooks.secrets)
+    deliverer = Deliverer(records, RedisOutbox(redis), sender, webhooks.allowed, webhooks.secrets)
     threads = CapacityLimiter(_AT_ONCE)
-    await asyncio.gather(*(_deliver(deliverer, services.stopping, threads) for _ in range(_AT_ONCE)))
+    await asyncio.gather(*(_deliver(deliverer, stopping, threads) for _ in range(_AT_ONCE)))
 
 
 async def _deliver(deliverer: Deliverer, stopping: asyncio.Event, threads: CapacityLimiter) -> None:

@@ -9,7 +9,7 @@ import hmac
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from regnf_service.http.tokens import TokensError, read_lines
+from regnf_service.tokens import TokensError, read_lines
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 
 _PREFIX = "whsec_"

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from regnf_service.http.tokens import TokensError
+from regnf_service.tokens import TokensError
 
 _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000

@@ -1,1 +1,8 @@
-"""The routes, a module a resource."""
+"""The routes, a module a resource. A new module enters one of the two lists below; nothing else needs to know it."""
+
+from regnf_service.http.routes import fields, jobs, meta, pages, registrations, results, uploads
+
+ROUTERS = (uploads.router, fields.router, registrations.router, jobs.router, results.router)
+"""Query parameters that an address does not know are refused."""
+LENIENT_ROUTERS = (pages.router, meta.router)
+"""Such parameters are ignored: people and probes add them to links."""

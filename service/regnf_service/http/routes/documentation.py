@@ -9,9 +9,11 @@ from typing import Any, TypeVar
 from fastapi import APIRouter
 
 from regnf_service.http.problems import MEDIA_TYPE
+from regnf_service.http.schemas.common import ProblemDocument
+from regnf_service.http.schemas.references import reference
 from regnf_state.reasons import REASONS
 
-_PROBLEM = {"$ref": "#/components/schemas/ProblemDocument"}
+_PROBLEM = reference(ProblemDocument)
 JSON = "application/json"
 _Endpoint = TypeVar("_Endpoint", bound=Callable[..., Any])
 
@@ -40,11 +42,6 @@ def refusals(*reasons: str) -> dict[int | str, dict[str, Any]]:
         }
         for status, names in sorted(by_status.items())
     }
-
-
-def reference(model: type) -> dict[str, Any]:
-    """A reference to a model's schema; the contract lists the schema itself."""
-    return {"$ref": f"#/components/schemas/{model.__name__}"}
 
 
 def header(description: str) -> dict[str, Any]:

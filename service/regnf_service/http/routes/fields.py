@@ -8,24 +8,17 @@ from fastapi import APIRouter, Query
 from starlette.responses import JSONResponse, Response
 
 from regnf_core.importing.gate.picture import PICTURE_NAME
-from regnf_service.http.dependencies import (
-    CallerDep,
-    LimitQuery,
-    PageTokenQuery,
-    PrefixDep,
-    Services,
-    ServicesDep,
-    WaitQuery,
-    in_thread,
-)
+from regnf_service.concurrency import in_thread
+from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.problems import Problem
 from regnf_service.http.routes.documentation import BINARY, NOT_MODIFIED, get_and_head, header, refusals
 from regnf_service.http.routes.uploads import field_etag
 from regnf_service.http.schemas.fields import FieldDocument, FieldPage, field_document
 from regnf_service.http.waiting import wait_for
+from regnf_service.problem import Problem
+from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord
 

@@ -8,25 +8,18 @@ from typing import Annotated, Any, NamedTuple
 from fastapi import APIRouter, Header, Query
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
+from regnf_service.concurrency import in_thread
 from regnf_service.http import sse
-from regnf_service.http.dependencies import (
-    CallerDep,
-    LimitQuery,
-    PageTokenQuery,
-    PrefixDep,
-    Services,
-    ServicesDep,
-    WaitQuery,
-    in_thread,
-)
+from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.problems import Problem
 from regnf_service.http.routes.documentation import NOT_MODIFIED, header, refusals
 from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document
 from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.canonical import digest
+from regnf_service.jobs.identity import digest
 from regnf_service.jobs.lookup import find_job
+from regnf_service.problem import Problem
+from regnf_service.services import Services
 from regnf_state.records import ACTIVE, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 

@@ -14,11 +14,12 @@ from starlette.responses import HTMLResponse, Response
 
 from regnf_core import __version__
 from regnf_service.http.contract import contract_yaml
-from regnf_service.http.dependencies import PrefixDep, Services, ServicesDep
+from regnf_service.http.dependencies import PrefixDep, ServicesDep
 from regnf_service.http.docs_page import STYLE_POLICY, render_docs
-from regnf_service.http.problems import RETRY_LATER, Problem
 from regnf_service.http.routes.documentation import get_and_head, refusals
 from regnf_service.http.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
+from regnf_service.problem import RETRY_LATER, Problem
+from regnf_service.services import Services
 
 router = APIRouter(tags=["service"])
 logger = logging.getLogger(__name__)

@@ -10,11 +10,12 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
+from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import store_upload
+from regnf_service.fields.uploads import open_upload
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
+from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
-from regnf_service.http.problems import Problem
 from regnf_service.http.routes.documentation import (
     FILE,
     JOB_LINKS,
@@ -22,17 +23,19 @@ from regnf_service.http.routes.documentation import (
     MULTIPART_REFUSALS,
     UPLOAD_REFUSALS,
     header,
-    reference,
     refusals,
 )
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.reading import read_model
+from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.canonical import canonical_request, job_id_of
+from regnf_service.jobs.identity import job_id_of
 from regnf_service.jobs.submit import check_fields, check_idempotency_key, submit
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
 from regnf_state.records import ACTIVE, FINISHED
 from regnf_state.registration_request import RegistrationRequest
 
@@ -127,13 +130,7 @@ async def register(
     Requests that differ in the label, the score or the webhook alone are the same. Every webhook is told of the end.
     """
     check_idempotency_key(idempotency_key)
-    kind = body.media_type(request)
-    if kind == JSON:
-        asked = await _by_reference(request, services, caller)
-    elif kind == "multipart/form-data":
-        asked = await _one_shot(request, services, caller, keep=not dry_run)
-    else:
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=body.CLOSE)
+    asked = await _read(request, services, caller, keep=not dry_run)
     if dry_run:
         job_id = job_id_of(asked.owned_by(caller))
         return JSONResponse({"valid": True, "id": job_id, "request": asked.values()})
@@ -153,11 +150,21 @@ async def register(
     return response
 
 
+async def _read(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
+    """What is asked for, checked; files that come along are kept if ``keep``."""
+    match body.media_type(request):
+        case "application/json":
+            return await _by_reference(request, services, caller)
+        case "multipart/form-data":
+            return await _one_shot(request, services, caller, keep)
+    raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json or multipart/form-data.", headers=CLOSE)
+
+
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     settings = services.settings
     text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
     spec = read_model(RegisterRequest, text)
-    asked = canonical_request(spec, spec.scene, spec.object, spec.candidates)
+    asked = spec.to_request(spec.scene, spec.object, spec.candidates)
     named = {"/scene": spec.scene}
     if spec.object is not None:
         named["/object"] = spec.object
@@ -172,7 +179,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     settings = services.settings
     limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
     async with AsyncExitStack() as stack:
-        files = {name: await stack.enter_async_context(services.open_upload(caller)) for name in ("scene", "object")}
+        files = {name: await stack.enter_async_context(open_upload(services, caller)) for name in ("scene", "object")}
         data = body.chunks(request, limit, settings.upload_stall_s)
         parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
         missing = [name for name in ("scene", "object", "request") if name not in parts]
@@ -180,7 +187,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
         spec = read_model(RegistrationSpec, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
-        asked = canonical_request(spec, received["scene"].sha256, received["object"].sha256)
+        asked = spec.to_request(received["scene"].sha256, received["object"].sha256)
         await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():

@@ -9,14 +9,16 @@ from fastapi import APIRouter, Header
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
+from regnf_service.concurrency import in_thread
+from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.etags import IfNoneMatchDep
-from regnf_service.http.problems import Problem
 from regnf_service.http.ranges import ByteRange, parse_range
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
 from regnf_service.http.schemas.common import whole_problem
 from regnf_service.http.schemas.results import ResultDocument
 from regnf_service.jobs.lookup import find_job
+from regnf_service.problem import Problem
+from regnf_service.services import Services
 from regnf_state.manifest import ARTIFACTS, Manifest, read_manifest, read_result
 from regnf_state.records import ACTIVE, JobRecord
 

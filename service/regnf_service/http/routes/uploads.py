@@ -11,24 +11,26 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import StoredUpload, check_room, store_upload
-from regnf_service.fields.uploads import Received, Upload
+from regnf_service.fields.uploads import Received, Upload, open_upload
 from regnf_service.http import body
-from regnf_service.http.dependencies import CallerDep, PrefixDep, Services, ServicesDep, in_thread
+from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.multipart import boundary_of, read_parts
-from regnf_service.http.problems import Problem
 from regnf_service.http.routes.documentation import (
     FIELD_LINKS,
     FILE,
     MULTIPART_REFUSALS,
     UPLOAD_REFUSALS,
     header,
-    reference,
     refusals,
 )
 from regnf_service.http.schemas.fields import FieldDocument, field_document
 from regnf_service.http.schemas.reading import read_model
+from regnf_service.http.schemas.references import reference
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
 from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
@@ -77,12 +79,12 @@ async def put_field(
 ) -> JSONResponse:
     """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held."""
     if not is_sha256(sha256):
-        raise Problem("INVALID_DIGEST", headers=body.CLOSE)
+        raise Problem("INVALID_DIGEST", headers=CLOSE)
     if body.media_type(request).startswith("multipart/"):
-        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=body.CLOSE)
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
     digest = announced_digest(content_digest)
     await in_thread(check_room, services, caller, sha256, body.declared_length(request))
-    async with services.open_upload(caller) as upload:
+    async with open_upload(services, caller) as upload:
         received = await _receive_raw(request, services, upload)
         if received.sha256 != sha256 or digest not in (None, received.sha256):
             raise Problem("DIGEST_MISMATCH")
@@ -119,7 +121,7 @@ async def post_field(
 ) -> JSONResponse:
     """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
     digest = announced_digest(content_digest)
-    async with services.open_upload(caller) as upload:
+    async with open_upload(services, caller) as upload:
         if body.media_type(request) == "multipart/form-data":
             received, description = await _receive_parts(request, services, upload, digest)
         else:

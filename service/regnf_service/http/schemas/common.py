@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
@@ -49,13 +48,6 @@ class ProblemDocument(Outgoing):
     request_id: str | None = None
     errors: list[ProblemEntry] = []
     error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the job's own problem.")
-
-
-def rfc3339(seconds: float | None) -> str | None:
-    """A time of the record store, seconds since the epoch, as RFC 3339 in UTC."""
-    if seconds is None:
-        return None
-    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:

@@ -6,16 +6,11 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from regnf_core.importing.upload_description import UploadDescription
-from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem, rfc3339
+from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem
 from regnf_service.http.schemas.results import SymmetryDocument
+from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
 from regnf_state.records import FieldRecord
-
-
-def function_of(description: UploadDescription) -> dict[str, Any]:
-    """What the import needs of a description: everything that was said but the label."""
-    return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
 class FieldDocument(Outgoing):

@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem, rfc3339
+from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem
+from regnf_service.times import rfc3339
 from regnf_state.records import ACTIVE, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 

@@ -10,12 +10,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.hints import suggestion
 from regnf_core.options import UNKNOWN_OPTION, did_you_mean
-from regnf_service.http.problems import Problem, json_pointer
 from regnf_service.http.schemas.detections import DETECTION_FAULT
 from regnf_service.http.schemas.members import members_at
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
 from regnf_service.http.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
 from regnf_service.http.strict_json import parse_json
+from regnf_service.problem import Problem, json_pointer
 
 _REASONS = {
     "detection": "INVALID_DETECTION",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from pydantic import (
@@ -19,7 +20,8 @@ from pydantic_core import PydanticCustomError
 from regnf_core.options import RegistrationOptions
 from regnf_service.http.schemas.common import Incoming, Outgoing, Sha256
 from regnf_service.http.schemas.detections import Detection
-from regnf_service.http.schemas.transforms import Similarity
+from regnf_service.http.schemas.transforms import Similarity, rows_of
+from regnf_state.registration_request import RegistrationRequest, recorded_detection
 
 START_UNSUPPORTED = "initial_transform_unsupported"
 SEARCH_UNSUPPORTED = "library_search_unsupported"
@@ -91,6 +93,26 @@ class RegistrationSpec(Incoming):
         if start is not None and options is not None and options.preset != "robust":
             raise PydanticCustomError(START_UNSUPPORTED, "only the preset `robust` starts from a given transform")
         return start
+
+    def to_request(
+        self, scene: str, object_: str | None, candidates: Sequence[str] | None = None
+    ) -> RegistrationRequest:
+        """The job's request: every default filled in, every spelling of a value made one.
+
+        The order of candidates says nothing, so they are sorted.
+        """
+        start, truth, webhook = self.initial_transform, self.ground_truth, self.webhook
+        return RegistrationRequest(
+            scene=scene,
+            object=object_,
+            candidates=None if candidates is None else tuple(sorted(candidates)),
+            detection=recorded_detection(self.detection.canonical()),
+            options=self.options,
+            seed=self.seed,
+            initial_transform=None if start is None else rows_of(start),
+            ground_truth=None if truth is None else rows_of(truth.T_object_scene),
+            webhook=None if webhook is None else webhook.url,
+        )
 
 
 def _one_of_both(schema: dict[str, Any]) -> None:

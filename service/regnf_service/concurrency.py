@@ -6,13 +6,21 @@ import asyncio
 import random
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
-from regnf_service.http.body import CLOSE
-from regnf_service.http.problems import RETRY_LATER, Problem
+from anyio import to_thread
+
+from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 
 _LOOK_EVERY_S = 0.02
+_Result = TypeVar("_Result")
+
+
+async def in_thread(work: Callable[..., _Result], *arguments: Any) -> _Result:
+    """Run blocking work, a call of a store, in a thread."""
+    return await to_thread.run_sync(work, *arguments)
 
 
 async def pause(seconds: float, stopping: asyncio.Event) -> bool:

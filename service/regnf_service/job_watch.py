@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from anyio import CapacityLimiter, to_thread
 
-from regnf_service.http.concurrency import pause
+from regnf_service.concurrency import pause
 from regnf_state.records import JobNews
 
 Position = tuple[str, str | None]

@@ -1,0 +1,60 @@
+"""What every part of the service is given: settings, stores, and the limits that hold across requests."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from anyio import CapacityLimiter
+from redis import Redis
+
+from regnf_service.concurrency import Slots, Waiters
+from regnf_service.job_watch import JobWatch
+from regnf_service.webhooks.policy import Webhooks
+from regnf_state.blobs.base import BlobStore
+from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.queue import JobQueue
+from regnf_state.records import Quota
+from regnf_state.settings import Settings
+
+_UPLOAD_THREADS = 4
+_LOOK_THREADS = 2
+
+
+@dataclass(frozen=True)
+class Services:
+    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
+
+    settings: Settings
+    redis: Redis
+    records: JournaledRecordStore
+    blobs: BlobStore
+    queue: JobQueue
+    webhooks: Webhooks
+    stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    waiters: Waiters = field(default_factory=Waiters)
+    # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
+    upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
+    look_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_LOOK_THREADS))
+
+    @cached_property
+    def quota(self) -> Quota:
+        """What each caller may have."""
+        chosen = self.settings
+        return Quota(chosen.quota_active_jobs, chosen.quota_fields, chosen.quota_stored_bytes)
+
+    @cached_property
+    def uploads(self) -> Slots:
+        """Uploads that are under way."""
+        return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")
+
+    @cached_property
+    def streams(self) -> Slots:
+        """Event streams that are being read."""
+        return Slots(self.settings.max_streams_per_caller, "TOO_MANY_STREAMS")
+
+    @cached_property
+    def job_watch(self) -> JobWatch:
+        """What all event streams look through."""
+        return JobWatch(self.records.news, self.stopping)
