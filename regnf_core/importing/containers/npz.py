@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
 from regnf_core.importing.containers.npy_header import NpyHeader, read_npy_header
 from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
 from regnf_core.importing.containers.zip_records import malformed
-from regnf_core.importing.pickle.tensors import Float32Array, finite_float32, require_possible, tensor_error
 
 MAX_UNPACKED_BYTES = 2 << 30
 """All requested arrays together, as they are stored."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.pickle.tensors import Float32Array, tensor_error
+from regnf_core.importing.arrays import Float32Array, tensor_error
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]

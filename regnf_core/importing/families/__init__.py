@@ -21,7 +21,7 @@ from regnf_core.importing.families import (
 )
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
-from regnf_core.importing.pickle.tensors import TensorSource
+from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
 Family = Callable[[dict[Any, Any], TensorSource, UploadDescription], ConvertedField | None]

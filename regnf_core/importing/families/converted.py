@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from regnf_core.importing.pickle.tensors import StoredArray
+from regnf_core.importing.arrays import StoredArray
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import require_shape, tensor_error
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.tensors import require_shape, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "dense_sdf_grid"

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
+from regnf_core.importing.arrays import Float32Array
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.families.grid_search import grid_name
-from regnf_core.importing.pickle.tensors import Float32Array
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 

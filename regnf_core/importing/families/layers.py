@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
+from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.schema.layers import MAX_LAYERS
 
 _NORMALIZED = (("weight_v", "weight_g"), ("parametrizations.weight.original1", "parametrizations.weight.original0"))

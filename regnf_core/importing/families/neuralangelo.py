@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import grid_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape
+from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
 

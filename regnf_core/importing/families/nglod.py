@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nglod"

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
 from regnf_core.importing.containers.sqlite_source import TableSource
 from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray, fill_unseen, seen_extent
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.tensors import Float32Array, StoredArray, finite_float32, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nvblox"

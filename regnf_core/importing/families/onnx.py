@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.onnx.model import Attribute, Model, Node, Port, read_model, unsupported
 from regnf_core.importing.onnx.tensor import Array
-from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
 from regnf_core.schema.onnx_operators import OPERATORS

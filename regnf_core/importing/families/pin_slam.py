@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.pickle_values import Placeholder
-from regnf_core.importing.pickle.tensors import Float32Array, TensorSource, lookup, require_shape, tensor_error
+from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "pin_slam"

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family
-from regnf_core.importing.pickle.tensors import StoredArray
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import read_description
 

@@ -12,13 +12,14 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import require_shape
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_field import grid_readings
 from regnf_core.importing.families.grid_search import GridHabits, find_grids
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
 from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
-from regnf_core.importing.pickle.tensors import TensorSource, as_tensor, lookup, require_shape
+from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.kinds.neus_facto import SKIP_LAYER

@@ -9,6 +9,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from regnf_core.importing.arrays import Float32Array, StoredArray, tensor_error
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.voxel_maps import (
     BoolArray,
@@ -20,7 +21,6 @@ from regnf_core.importing.containers.voxel_maps import (
 )
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
-from regnf_core.importing.pickle.tensors import Float32Array, StoredArray, tensor_error
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "open3d_voxel_block_grid"

@@ -98,7 +98,7 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     from regnf_core.importing.families.arrays import convert_arrays
     from regnf_core.importing.families.safe_field import convert_safe_field
     from regnf_core.importing.pickle.pickle_reader import read_pickle
-    from regnf_core.importing.pickle.tensors import TensorSource
+    from regnf_core.importing.tensor_source import TensorSource
     from regnf_core.importing.upload_description import UploadDescription
 
     overrides = UploadDescription.from_dict(description)

@@ -25,7 +25,7 @@ from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.pickle.pickle_machine import PickleLimits
 from regnf_core.importing.pickle.pickle_reader import read_pickle
-from regnf_core.importing.pickle.tensors import TensorSource
+from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import torch_zip
 from tests.core.importing.checkpoints import checkpoint

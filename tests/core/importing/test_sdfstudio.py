@@ -13,7 +13,7 @@ from regnf_core.importing.containers.container import read_archive
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.pickle.pickle_reader import read_pickle
-from regnf_core.importing.pickle.tensors import TensorSource
+from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused
 from tests.core.importing.checkpoints import checkpoint

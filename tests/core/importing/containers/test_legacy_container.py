@@ -15,7 +15,7 @@ import torch
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.legacy_container import LegacyArchive, read_legacy
 from regnf_core.importing.pickle.pickle_values import Placeholder, TensorRef
-from regnf_core.importing.pickle.tensors import TensorSource
+from regnf_core.importing.tensor_source import TensorSource
 from tests.core.importing.archives import assert_refused, integer, numbers, text
 
 MAGIC = pickle.dumps(0x1950A86A20F9469CFC6C, 2)

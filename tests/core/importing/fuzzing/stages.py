@@ -14,7 +14,7 @@ from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
 from regnf_core.importing.pickle.pickle_reader import read_pickle
-from regnf_core.importing.pickle.tensors import TensorSource
+from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import write_safe_field
 

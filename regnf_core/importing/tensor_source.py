@@ -10,13 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import Float32Array, finite_float32, require_possible, tensor_error
 from regnf_core.importing.containers.container import Entry
 from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder, StorageRef, TensorRef
-
-Float32Array = npt.NDArray[np.float32]
-StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.int32]
-"""What a safe field holds."""
 
 _STORED: dict[str, np.dtype[Any]] = {
     "float32": np.dtype("<f4"),
@@ -26,15 +22,7 @@ _STORED: dict[str, np.dtype[Any]] = {
 }
 _STORED_WHOLE: dict[str, np.dtype[Any]] = {"int64": np.dtype("<i8"), "int32": np.dtype("<i4")}
 _DEVICE = re.compile(r"(cpu|cuda|mps|xpu|hpu|npu|xla)(:\d{1,3})?")
-_FINITE_CHUNK = 1 << 20
 _ALIGNMENT = 16
-_MAX_ELEMENTS = 1 << 60
-"""What numpy can address at eight bytes each. It counts empty axes as ones: even an array of nothing has a limit."""
-
-
-def tensor_error(message: str, reason: str) -> FieldFormatError:
-    """The error for a tensor that is not what it must be."""
-    return FieldFormatError(message, reason=reason)
 
 
 class Archive(Protocol):
@@ -109,33 +97,6 @@ def as_tensor(name: str, value: object) -> TensorRef:
         message = f"{name} can only be made by running {value.full_name}, which is not allowed"
         raise tensor_error(message, "UNSAFE_GLOBAL_IN_WEIGHTS")
     raise tensor_error(f"{name} is a {type(value).__name__}, not a tensor", "TENSOR_EXPECTED")
-
-
-def require_shape(name: str, array: Float32Array, shape: tuple[int | None, ...]) -> None:
-    """Raise FieldFormatError (TENSOR_SHAPE) unless the shapes agree; None stands for any extent above zero."""
-    fits = array.ndim == len(shape) and all(
-        have == want or (want is None and have > 0) for have, want in zip(array.shape, shape, strict=True)
-    )
-    if not fits:
-        wanted = tuple("any" if extent is None else extent for extent in shape)
-        raise tensor_error(f"{name} has shape {array.shape}, expected {wanted}", "TENSOR_SHAPE")
-
-
-def finite_float32(name: str, values: npt.NDArray[Any]) -> Float32Array:
-    """The array ``name`` as contiguous float32 in its own shape. Raises FieldFormatError (TENSOR_NOT_FINITE)."""
-    with np.errstate(over="ignore"):  # a number too large for float32 becomes inf, which the check refuses
-        array = np.ascontiguousarray(values, dtype=np.float32).reshape(values.shape)
-    flat = array.reshape(-1)
-    for start in range(0, flat.size, _FINITE_CHUNK):
-        if not np.isfinite(flat[start : start + _FINITE_CHUNK]).all():
-            raise tensor_error(f"{name} holds a number that is not finite", "TENSOR_NOT_FINITE")
-    return array
-
-
-def require_possible(name: str, shape: tuple[int, ...]) -> None:
-    """Raise FieldFormatError (TENSOR_SHAPE) for a shape that no array has, even one of nothing."""
-    if math.prod(max(extent, 1) for extent in shape) > _MAX_ELEMENTS:
-        raise tensor_error(f"{name} has a shape that no array has: {shape}", "TENSOR_SHAPE")
 
 
 def lookup(values: Mapping[Any, Any], name: str) -> object:
