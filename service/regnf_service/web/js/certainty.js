@@ -1,4 +1,4 @@
-// How sure the pose is: one standard deviation each, the covariance they come from, and the object's own symmetry.
+// The uncertainty of the pose: standard deviations, the covariance they come from, and the object's own symmetry.
 
 import { byId, el, fillFacts, show } from './dom.js';
 import { number } from './format.js';
@@ -21,11 +21,11 @@ export function showCertainty(result) {
   show(byId('certainty'), Boolean(uncertainty || symmetry));
 }
 
-/** { order, axis, continuous } as people say it. */
+/** { order, axis, continuous } in words. */
 export function symmetryInWords({ order, axis, continuous }) {
   const about = axis ? ` about (${axis.map((value) => (Math.round(value * 100) / 100 + 0).toFixed(2)).join(', ')})` : '';
-  if (continuous) return `any turn${about}${order > 1 ? ', and either end up' : ''}`;
-  return order === 1 ? 'none found' : `${order} turns${about} look alike`;
+  if (continuous) return `any rotation${about}${order > 1 ? ', and upside down' : ''}`;
+  return order === 1 ? 'none found' : `${order} rotations${about} look the same`;
 }
 
 function group(name, unit, labels, values = []) {

@@ -1,4 +1,4 @@
-// The numbers beside the view: verdict, transform, agreement, times, downloads, the job itself.
+// The results beside the view: verdict, transform, agreement, times, downloads, the job itself.
 
 import { secondsByPhase } from './documents.js';
 import { byId, copyText, el, fillFacts, show } from './dom.js';

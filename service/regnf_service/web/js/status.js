@@ -19,7 +19,7 @@ export function showBadge(word, jobId = '') {
 }
 
 export function showLoading(text) {
-  card({ eyebrow: 'One moment', title: text, tone: 'wait' });
+  card({ eyebrow: 'Loading', title: text, tone: 'wait' });
 }
 
 /** An accepted or running job: its phase, its place in the queue, how far it is. */
@@ -40,7 +40,7 @@ export function showActive(job) {
 }
 
 export function showTrouble(error) {
-  if (error) byId('message-text').textContent = 'The service cannot be reached at the moment; trying again.';
+  if (error) byId('message-text').textContent = 'The service does not answer. Trying again.';
 }
 
 /** A failed job's own problem object. */
@@ -53,7 +53,7 @@ export function showFailed(job) {
 
 export function showDismissed(job) {
   showBadge('dismissed', job.id);
-  card({ eyebrow: 'No result', title: 'The job was dismissed', text: 'Posting the same request starts it anew.', tone: 'still' });
+  card({ eyebrow: 'No result', title: 'The job was dismissed', text: 'Post the same request to start it again.', tone: 'still' });
 }
 
 /** A refusal of the service, or a broken connection. onRetry is offered where trying again makes sense. */
@@ -64,7 +64,7 @@ export function showError(error, onRetry) {
   byId('status').dataset.tone = 'bad';
   card({
     eyebrow: error.status ? `The service answered ${error.status}` : 'No connection',
-    title: titles[error.status] ?? problem.title ?? 'This page could not be filled',
+    title: titles[error.status] ?? problem.title ?? 'The job could not be loaded',
     text: error.message,
     tone: error.status === 401 ? 'wait' : 'bad',
   });
@@ -74,14 +74,14 @@ export function showError(error, onRetry) {
   byId('retry').onclick = onRetry;
 }
 
-/** The numbers stand, but there is no picture. */
+/** The results are there, but the 3D view cannot be shown. */
 export function showNoView(error) {
-  card({ eyebrow: 'The numbers are complete', title: 'The 3D view cannot be shown', text: error.message, tone: 'warn' });
+  card({ eyebrow: 'The results are complete', title: 'The 3D view cannot be shown', text: error.message, tone: 'warn' });
 }
 
 /** A job of a kind that has no pose to look at. */
 export function showFilesOnly() {
-  card({ eyebrow: 'Finished', title: 'The job left files', text: 'There is no registration to draw.', tone: 'good' });
+  card({ eyebrow: 'Finished', title: 'The job wrote files', text: 'This kind of job has no pose to show.', tone: 'good' });
 }
 
 export function hideCard() {
@@ -116,12 +116,12 @@ function showPhases(current) {
   }));
 }
 
-// A problem without a title of its own bears its reason as one.
+// A problem without a title of its own has its reason as title.
 const titleOf = ({ title, reason }) => (title && title !== reason ? title : words(reason ?? 'failed'));
 
 const runningText = (attempt) => (attempt > 1 ? `Running, attempt ${attempt}` : 'Running');
 
 function queueText(ahead) {
   if (!Number.isFinite(ahead)) return 'The next free worker takes it.';
-  return ahead <= 0 ? 'It is next.' : `${ahead} ${ahead === 1 ? 'job' : 'jobs'} before it.`;
+  return ahead <= 0 ? 'It is next.' : `${ahead} ${ahead === 1 ? 'job is' : 'jobs are'} before it.`;
 }
