@@ -25,17 +25,28 @@ def service(tmp_path: Path) -> Iterator[Service]:
         eventually(started.all_gone, "the end of every process", DEADLINE_S)
 
 
-def test_it_comes_up_with_nothing_configured(service: Service) -> None:
-    service.await_ready()
-    assert httpx.get(f"{service.address}/healthz").json() == {"status": "ok"}
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """One for the tests that leave it as they found it."""
+    started = start(tmp_path_factory.mktemp("shared") / "state")
+    try:
+        yield started
+    finally:
+        started.end()
+        eventually(started.all_gone, "the end of every process", DEADLINE_S)
+
+
+def test_it_comes_up_with_nothing_configured(shared: Service) -> None:
+    shared.await_ready()
+    assert httpx.get(f"{shared.address}/healthz").json() == {"status": "ok"}
     parts = ("unixsocket:", "regnf_worker.main", "regnf_cli.api_process")
-    assert {service.part(part) for part in parts} == service.look(), [command_line(pid) for pid in service.look()]
-    assert service.address.startswith("http://127.0.0.1:")
-    assert oct(service.socket_dir().stat().st_mode & 0o777) == "0o700"
-    assert oct(service.state_dir.stat().st_mode & 0o777) == "0o700"
-    redis = service.part("unixsocket:")
+    assert {shared.part(part) for part in parts} == shared.look(), [command_line(pid) for pid in shared.look()]
+    assert shared.address.startswith("http://127.0.0.1:")
+    assert oct(shared.socket_dir().stat().st_mode & 0o777) == "0o700"
+    assert oct(shared.state_dir.stat().st_mode & 0o777) == "0o700"
+    redis = shared.part("unixsocket:")
     assert not listening_sockets(redis), "Redis has no TCP port"
-    assert listening_sockets(service.part("regnf_cli.api_process")), "or this test cannot tell"
+    assert listening_sockets(shared.part("regnf_cli.api_process")), "or this test cannot tell"
 
 
 def listening_sockets(pid: int) -> set[str]:
@@ -61,15 +72,11 @@ def test_a_signal_ends_everything_in_order(service: Service, number: signal.Sign
     assert "Traceback" not in service.log()
 
 
-def test_ctrl_c_reaches_the_supervisor_alone(tmp_path: Path) -> None:
+def test_ctrl_c_reaches_the_supervisor_alone(shared: Service) -> None:
     """A terminal sends SIGINT to its whole foreground group: Redis must not go before the jobs are given back."""
-    service = start(tmp_path / "state")
-    try:
-        group = os.getpgid(service.process.pid)
-        assert all(os.getpgid(pid) != group for pid in service.look())
-    finally:
-        service.end()
-    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+    group = os.getpgid(shared.process.pid)
+    assert len(shared.look()) == 3
+    assert all(os.getpgid(pid) != group for pid in shared.look())
 
 
 def test_a_killed_supervisor_takes_everything_along(service: Service, tmp_path: Path) -> None:
@@ -99,14 +106,14 @@ def test_a_supervisor_killed_while_it_starts_leaves_nothing(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("part", ["regnf_worker.main", "regnf_cli.api_process", "unixsocket:"])
-def test_a_part_that_dies_is_started_anew(service: Service, part: str) -> None:
-    service.await_ready()
-    before = service.part(part)
+def test_a_part_that_dies_is_started_anew(shared: Service, part: str) -> None:
+    shared.await_ready()
+    before = shared.part(part)
     os.kill(before, signal.SIGKILL)
     eventually(lambda: not alive(before), "its end")
-    eventually(lambda: service.part(part) != before, "its successor", DEADLINE_S)
-    service.await_ready()
-    assert service.process.poll() is None
+    eventually(lambda: shared.part(part) != before, "its successor", DEADLINE_S)
+    shared.await_ready()
+    assert shared.process.poll() is None
 
 
 def test_state_survives_a_restart(tmp_path: Path) -> None:
@@ -138,9 +145,10 @@ def refused(*arguments: str, state_dir: Path, **settings: object) -> str:
     return done.stderr
 
 
-def test_one_service_to_a_state_folder(service: Service) -> None:
-    assert "STATE_DIR_IN_USE" in refused(state_dir=service.state_dir)
-    assert service.is_ready()
+def test_one_service_to_a_state_folder(shared: Service) -> None:
+    shared.await_ready()
+    assert "STATE_DIR_IN_USE" in refused(state_dir=shared.state_dir)
+    assert shared.is_ready()
 
 
 def test_an_unusable_state_folder(tmp_path: Path) -> None:

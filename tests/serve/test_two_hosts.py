@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import socket
 import subprocess
@@ -16,12 +15,10 @@ from typing import Any
 import httpx
 import pytest
 
-from tests.devdata import ROOT
+from benchmarks.service_load.small_fields import write_small_pair
 from tests.object_store import ObjectServer
 from tests.redis_server import private_redis
 from tests.worker.bench import eventually
-
-DATA = ROOT / "examples" / "data"
 
 
 @contextmanager
@@ -68,8 +65,8 @@ def logs(folder: Path) -> str:
     return "\n".join(path.read_text() for path in folder.glob("*.log"))
 
 
-def upload(client: httpx.Client, name: str) -> str:
-    content = (DATA / name).read_bytes()
+def upload(client: httpx.Client, path: Path) -> str:
+    content = path.read_bytes()
     sha256 = hashlib.sha256(content).hexdigest()
     client.put(f"/fields/{sha256}", content=content).raise_for_status()
     return sha256
@@ -84,9 +81,9 @@ def finished(client: httpx.Client, job_id: str) -> dict[str, Any]:
 
 
 def test_a_registration_between_two_machines(client: httpx.Client, tmp_path: Path) -> None:
-    scene, object_ = upload(client, "mix-room.safetensors"), upload(client, "armchair.safetensors")
-    request = {"scene": scene, "object": object_, "detection": json.loads((DATA / "detection.json").read_text())}
-    answer = client.post("/register", json=request)
+    pair = write_small_pair(tmp_path)
+    scene, object_ = upload(client, pair.scene), upload(client, pair.object)
+    answer = client.post("/register", json={"scene": scene, "object": object_, "detection": pair.detection})
     assert answer.status_code == 202, answer.text
     job_id = answer.json()["id"]
     assert finished(client, job_id)["status"] == "successful", logs(tmp_path)

@@ -77,9 +77,6 @@ class TinyEngine:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
         ctypes.CDLL(None).sleep(600)
 
-    def die(self, report: Report) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
-
     def segfault(self, report: Report) -> None:
         signal.signal(signal.SIGSEGV, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGSEGV)
