@@ -9,7 +9,8 @@ import pytest
 from redis import Redis
 
 from tests.contract.bad_input import nothing_of_a_request_stays, nothing_of_an_upload_stays
-from tests.contract.world import World, make_world
+from tests.contract.live import Live, eventually, live_service
+from tests.contract.world import World, field_bytes, make_world, sha256
 
 __all__ = ["nothing_of_a_request_stays", "nothing_of_an_upload_stays", "world"]
 
@@ -20,3 +21,23 @@ def world(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
     made = make_world(tmp_path, any_redis)
     with made.client:
         yield made
+
+
+@pytest.fixture(scope="session")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """A real API without a worker, so that what was uploaded lies still. Its users are the group `live api`."""
+    with live_service(tmp_path_factory.mktemp("live-api"), with_worker=False, upload_stall_s=1.0) as started:
+        yield started
+
+
+@pytest.fixture
+def nothing_stays_live(live: Live) -> Iterator[None]:
+    """The test ends with the store as empty as it began, and with the next good upload taken."""
+    yield
+    with live.client() as client:
+        for field in client.get("/fields").json()["fields"]:
+            client.delete(f"/fields/{field['sha256']}")
+        eventually(lambda: live.files() == set(), "an empty store")
+        good = field_bytes("the next good one")
+        assert client.put(f"/fields/{sha256(good)}", content=good).status_code == 201
+        assert client.delete(f"/fields/{sha256(good)}").status_code == 204

@@ -175,19 +175,6 @@ def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any,
     slow.client.close()
 
 
-def test_aborted_uploads_leave_nothing(tmp_path: Any, any_redis: Any) -> None:
-    world = make_world(tmp_path, any_redis)
-    messages: list[dict[str, Any]] = [
-        {"type": "http.request", "body": GOOD[:300], "more_body": True},
-        {"type": "http.disconnect"},
-    ]
-    for _ in range(50):
-        status, problem = raw_call(world.app, messages)
-        assert (status, problem["reason"]) == (400, "UPLOAD_INCOMPLETE")
-    assert {path.name for path in (tmp_path / "blobs").rglob("*") if path.is_file()} == {"storage-id"}
-    world.client.close()
-
-
 @pytest.mark.parametrize(
     ("error", "status", "reason"),
     [

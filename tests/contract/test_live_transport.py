@@ -17,28 +17,7 @@ from tests.contract.live import MAX_UPLOAD, Live, eventually, live_service
 from tests.contract.world import assert_refused, field_bytes, sha256
 
 MIB = 1 << 20
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    """Without a worker, so that what was uploaded lies still."""
-    with live_service(tmp_path_factory.mktemp("live"), with_worker=False, upload_stall_s=1.0) as started:
-        yield started
-
-
-@pytest.fixture(autouse=True)
-def _nothing_stays(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Each test ends with the store as empty as it began, and with the next good upload taken."""
-    yield
-    if "live" in request.fixturenames:
-        live: Live = request.getfixturevalue("live")
-        with live.client() as client:
-            for field in client.get("/fields").json()["fields"]:
-                client.delete(f"/fields/{field['sha256']}")
-            eventually(lambda: live.files() == set(), "an empty store")
-            good = field_bytes("the next good one")
-            assert client.put(f"/fields/{sha256(good)}", content=good).status_code == 201
-            assert client.delete(f"/fields/{sha256(good)}").status_code == 204
+pytestmark = [pytest.mark.usefixtures("nothing_stays_live"), pytest.mark.xdist_group("live api")]
 
 
 def head_of(method: str, path: str, **headers: object) -> bytes:

@@ -9,45 +9,28 @@ from concurrent.futures import ThreadPoolExecutor
 import httpx
 import pytest
 
-from tests.contract.live import Live, eventually, live_service
+from tests.contract.live import MAX_UPLOAD, Live, eventually
 from tests.contract.test_live_transport import answer_of, head_of
 from tests.contract.world import assert_refused, field_bytes, sha256
 
-LIMIT = 1 << 20
-
-
-@pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
-    """Without a worker, so that what was uploaded lies still."""
-    folder = tmp_path_factory.mktemp("live")
-    with live_service(folder, with_worker=False, upload_stall_s=1.0, max_upload_bytes=LIMIT) as started:
-        yield started
+pytestmark = [pytest.mark.usefixtures("nothing_stays_live"), pytest.mark.xdist_group("live api")]
 
 
 @pytest.fixture
 def client(live: Live) -> Iterator[httpx.Client]:
     with live.client() as made:
         yield made
-        eventually(lambda: live.files() == set(), "an empty store")
-        good = field_bytes("good")
-        assert made.put(f"/fields/{sha256(good)}", content=good).status_code == 201
-        assert made.delete(f"/fields/{sha256(good)}").status_code == 204
 
 
-@pytest.mark.parametrize("length", [LIMIT + 1, 10**12, 10**18])
-def test_too_large_by_its_header(live: Live, client: httpx.Client, length: int) -> None:
+@pytest.mark.parametrize("length", [MAX_UPLOAD + 1, 10**12, 10**18])
+def test_too_large_by_its_header(live: Live, length: int) -> None:
     with live.connect() as connection:
         connection.sendall(head_of("POST", "/fields", Content_Length=length))
         status, text = answer_of(connection)
     assert (status, b"UPLOAD_TOO_LARGE" in text) == (413, True)
 
 
-def test_too_large_in_chunks(client: httpx.Client) -> None:
-    pieces = (field_bytes("large", 1 << 16) for _ in range(17))
-    assert_refused(client.post("/fields", content=pieces), 413, "UPLOAD_TOO_LARGE")
-
-
-def test_a_chunk_whose_length_is_no_number(live: Live, client: httpx.Client) -> None:
+def test_a_chunk_whose_length_is_no_number(live: Live) -> None:
     with live.connect() as connection:
         connection.sendall(head_of("POST", "/fields", Transfer_Encoding="chunked") + b"zz\r\n" + b"x" * 600)
         assert connection.recv(65536).split(b" ")[1] == b"400"
