@@ -95,7 +95,7 @@ def test_without_extras_the_command_line_answers(base: Path, tmp_path: Path) -> 
 def test_without_extras_a_command_names_the_extra_it_needs(
     base: Path, tmp_path: Path, command: list[str], extra: str
 ) -> None:
-    (tmp_path / "x.ckpt").touch()
+    (tmp_path / "x.ckpt").write_bytes(b"PK\x03\x04 not a whole archive")
     done = run([base / "regnf", *command], tmp_path)
     assert done.returncode == 3
     assert "EXTRA_MISSING" in done.stderr
