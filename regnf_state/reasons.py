@@ -29,19 +29,21 @@ REASONS: dict[str, Reason] = {
     ),
     "INVALID_PAGE_TOKEN": Reason(400, "Invalid page token", "Use `next_page_token` of the page before, unchanged."),
     "INVALID_HEADER": Reason(400, "Invalid header", "A request header does not follow its grammar or its limits."),
-    "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is no id of an event of this service."),
-    "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a token that holds."),
+    "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is not the id of an event of this service."),
+    "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a valid token."),
     "NOT_FOUND": Reason(404, "Not found", "There is nothing under this address. `GET /` names every address."),
     "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
-    "RATE_LIMITED": Reason(429, "Too many calls", "Calls come faster than the service takes. See `Retry-After`."),
-    "CONFLICT": Reason(409, "Conflict", "Somebody else changed the same thing at the same time. Look again, repeat."),
+    "RATE_LIMITED": Reason(
+        429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
+    ),
+    "CONFLICT": Reason(409, "Conflict", "Another client changed it at the same time. Read it again, then repeat."),
     "REQUEST_TOO_LARGE": Reason(413, "Request too large", "The JSON or a text part exceeds the service's limit."),
     "UNSUPPORTED_MEDIA_TYPE": Reason(
         415, "Unsupported media type", "The `Content-Type` or `Content-Encoding` is not one this address takes."
     ),
     "INVALID_REQUEST": Reason(422, "Invalid request", "`errors` points at the members that are wrong."),
     # multipart
-    "MALFORMED_MULTIPART": Reason(400, "Malformed multipart body", "The parts or their headers cannot be told apart."),
+    "MALFORMED_MULTIPART": Reason(400, "Malformed multipart body", "The parts or their headers cannot be read."),
     "MISSING_PART": Reason(400, "Missing part", "A part that this address needs is not there."),
     "UNKNOWN_PART": Reason(400, "Unknown part", "The body has a part that this address does not know."),
     "DUPLICATE_PART": Reason(400, "Duplicate part", "Two parts bear the same name."),
@@ -53,22 +55,26 @@ REASONS: dict[str, Reason] = {
     "UPLOAD_STALLED": Reason(408, "Upload stalled", "The body sent nothing for too long. Nothing was kept."),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
     "FIELD_NOT_RECOGNIZED": Reason(
-        415, "Not a field file", "By its first bytes, or inside, the file is none of the fields that the service knows."
+        415, "Not a field file", "The file is not a field in any format that the service reads."
     ),
-    "TOO_MANY_UPLOADS": Reason(429, "Too many uploads at once", "Let one of yours end, then repeat."),
+    "TOO_MANY_UPLOADS": Reason(
+        429, "Too many uploads at once", "Wait until one of your uploads has ended, then repeat."
+    ),
     "QUOTA_STORED_BYTES": Reason(
-        403, "Quota of bytes used up", "Your fields are as large as they may be. Delete some."
+        403, "Quota of bytes used up", "Your fields use all the bytes that you may store. Delete some."
     ),
-    "QUOTA_FIELDS": Reason(403, "Quota of fields used up", "You have as many fields as you may. Delete some."),
+    "QUOTA_FIELDS": Reason(403, "Quota of fields used up", "You have the maximum number of fields. Delete some."),
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
     "FIELD_PREVIEW_NOT_FOUND": Reason(
-        404, "No picture", "Only fields that are `ready` have one, and not all: `links.preview` is tried, not promised."
+        404, "No picture", "Only fields that are `ready` have a picture, and not all of them do."
     ),
     "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
     "FIELD_DESCRIPTION_DIFFERS": Reason(
-        409, "Field held with another description", "The same bytes are held as another function. Delete them first."
+        409,
+        "Field stored with another description",
+        "The same bytes are stored with another description. Delete the field first.",
     ),
     "FIELD_REJECTED": Reason(
         422, "Field was rejected", "The import refused the file; `GET /fields/{sha256}` says why in `error`."
@@ -105,29 +111,37 @@ REASONS: dict[str, Reason] = {
     ),
     "INVALID_WEBHOOK": Reason(422, "Invalid webhook", 'Send `{"url": ...}`, a URL of 8 to 2000 characters.'),
     "WEBHOOK_NOT_ALLOWED": Reason(
-        422, "Webhook not allowed", "Its host is none that the service allows, or the service has no secret of yours."
+        422, "Webhook not allowed", "The service does not allow its host, or has no secret of yours to sign with."
     ),
-    "QUEUE_FULL": Reason(503, "Queue full", "As many jobs are active as the service takes. Retry after `Retry-After`."),
-    "QUOTA_ACTIVE_JOBS": Reason(429, "Quota of jobs used up", "As many of your jobs are active as may be."),
+    "QUEUE_FULL": Reason(
+        503, "Queue full", "The service has the maximum number of active jobs. Retry after `Retry-After`."
+    ),
+    "QUOTA_ACTIVE_JOBS": Reason(
+        429, "Quota of jobs used up", "You have the maximum number of active jobs. Wait for one to end."
+    ),
     "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks already. Ask for its state."),
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
-    "TOO_MANY_STREAMS": Reason(429, "Too many streams at once", "You read as many streams as you may. Close one."),
+    "TOO_MANY_STREAMS": Reason(
+        429, "Too many streams at once", "You have the maximum number of open streams. Close one."
+    ),
     "JOB_NOT_READY": Reason(409, "Job not finished", "The job has no result yet. Retry after `Retry-After`."),
     "JOB_DISMISSED": Reason(409, "Job was dismissed", "The job was cancelled. Post the request again to run it."),
     "JOB_FAILED": Reason(409, "Job has failed", "The job ended without a result. `error` is its own problem."),
     "JOB_FINISHED": Reason(409, "Job has finished", "A job that succeeded or failed can no longer be cancelled."),
     "JOB_ACTIVE": Reason(409, "Job is active", "Cancel the job before you delete it."),
-    "JOB_EXPIRED": Reason(410, "Job has expired", "The job outlived its retention. Post the request again."),
+    "JOB_EXPIRED": Reason(
+        410, "Job has expired", "The job was deleted after its retention time. Post the request again."
+    ),
     "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
     # what a job can end with
     "NO_SURFACE_IN_DETECTION": Reason(
         422, "No surface in the detection", "Too few surface points were found in the box. Check the box, or the scene."
     ),
-    "NO_SURFACE_IN_OBJECT": Reason(422, "No surface in the object", "The object's field has no zero level to be seen."),
+    "NO_SURFACE_IN_OBJECT": Reason(422, "No surface in the object", "The object's field has no zero level."),
     "NO_INITIAL_TRANSFORM": Reason(
-        422, "No initial transform", "No first guess was found. The surfaces may have nothing in common."
+        422, "No initial transform", "No initial transform was found. Object and scene may have no shape in common."
     ),
     "CANCELLED": Reason(409, "Cancelled", "The job stopped because it was cancelled."),
     "FIELD_IMPORT_TIMEOUT": Reason(422, "Import took too long", "The field could not be converted in time."),

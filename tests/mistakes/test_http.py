@@ -101,10 +101,10 @@ def test_a_field_that_is_still_validating_is_waited_for(world: World) -> None:
     assert world.client.post("/register", json=request | {"scene": sha256(data)}).status_code == 202
 
 
-def test_a_missing_token(world: World, tmp_path: Any) -> None:
+def test_a_missing_token(tmp_path: Any, any_redis: Any) -> None:
     from tests.contract.world import make_world
 
-    guarded = make_world(tmp_path / "guarded", api_tokens=frozenset({"robot:open-sesame-open-sesame-1234"}))
+    guarded = make_world(tmp_path / "guarded", any_redis, api_tokens=frozenset({"robot:open-sesame-open-sesame-1234"}))
     with guarded.client as client:
         for headers in ({}, {"Authorization": "Bearer wrong"}, {"Authorization": "open-sesame-open-sesame-1234"}):
             problem = assert_refused(client.get("/jobs", headers=headers), 401, "UNAUTHENTICATED")
