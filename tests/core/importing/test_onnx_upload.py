@@ -24,6 +24,7 @@ from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.parsing import parse_description
 from regnf_core.schema.safe_format import write_safe_field
 from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.in_process import convert
 from tests.core.importing.onnx_models import model, nodes, sphere
 
 BUDGET = 1 << 20
@@ -54,8 +55,8 @@ def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_p
     """Its field file holds no tensor; and may be uploaded again."""
     report = import_field(saved(tmp_path, sphere().SerializeToString()), tmp_path / "out")
     assert (report.family, report.parameters) == ("onnx", 0)
-    again = import_field(tmp_path / "out" / "field.safetensors", tmp_path / "again")
-    assert again.plausibility == report.plausibility
+    again = convert(tmp_path / "out" / "field.safetensors", tmp_path / "again")
+    assert again["plausibility"] == report.plausibility
 
 
 @pytest.mark.parametrize("exporter", ["of today", "of before"])
@@ -72,11 +73,11 @@ def test_a_network_exported_by_torch_is_that_network(exporter: str, tmp_path: Pa
         else:
             names = {"input_names": ["points"], "dynamic_axes": {"points": {0: "n"}}}
             torch.onnx.export(network, (torch.zeros(8, 3),), str(tmp_path / "net.onnx"), dynamo=False, **names)
-    report = import_field(
-        tmp_path / "net.onnx", tmp_path / "out", {"bounds": [[-1, -1, -1], [1, 1, 1]], "label": "ball"}
-    )
-    assert (report.family, report.label, report.warnings) == ("onnx", "ball", ())
-    assert report.parameters in range(27 * 32 + 32 + 32, 27 * 32 + 32 + 32 + 20)  # a few constants of the encoding too
+    report = convert(tmp_path / "net.onnx", tmp_path / "out", {"bounds": [[-1, -1, -1], [1, 1, 1]], "label": "ball"})
+    assert (report["family"], report["label"], report["warnings"]) == ("onnx", "ball", [])
+    assert report["parameters"] in range(
+        27 * 32 + 32 + 32, 27 * 32 + 32 + 32 + 20
+    )  # a few constants of the encoding too
     at = (2 * torch.rand(3000, 3) - 1).requires_grad_()
     expected = network(at)[:, 0]
     (slope,) = torch.autograd.grad(expected.sum(), at)
@@ -102,16 +103,14 @@ def test_a_field_that_mixes_its_points_is_none(tmp_path: Path) -> None:
     proto = model(
         "r = ReduceL2 x axes keepdims:1; m = ReduceMean r zero keepdims:1; y = Sub r m", HALF | {"zero": np.array([0])}
     )
-    assert_refused(
-        lambda: import_field(saved(tmp_path, proto.SerializeToString()), tmp_path / "out"), "FIELD_NOT_A_FUNCTION"
-    )
+    upload = saved(tmp_path, proto.SerializeToString())
+    assert_refused(lambda: convert(upload, tmp_path / "out"), "FIELD_NOT_A_FUNCTION")
 
 
 def test_a_graph_of_another_size_than_it_says(tmp_path: Path) -> None:
     proto = model("f = Reshape x one; r = ReduceL2 f axes keepdims:1; y = Sub r half", HALF | {"one": np.array([1, 3])})
-    assert_refused(
-        lambda: import_field(saved(tmp_path, proto.SerializeToString()), tmp_path / "out"), "ONNX_GRAPH_INVALID"
-    )
+    upload = saved(tmp_path, proto.SerializeToString())
+    assert_refused(lambda: convert(upload, tmp_path / "out"), "ONNX_GRAPH_INVALID")
 
 
 def external(proto: onnx.ModelProto) -> None:

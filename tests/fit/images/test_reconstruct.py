@@ -6,12 +6,12 @@ import torch
 
 from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
 from regnf_core.fields.build import open_field
-from regnf_core.importing.gate.gate import import_field
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.options import LossWeights, ReconstructionOptions
+from tests.core.importing.in_process import convert
 from tests.fit.images import scenes
 
 SMALL = ReconstructionOptions(
@@ -120,13 +120,13 @@ def test_a_fit_that_diverges_says_so_and_writes_no_field(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_exported_layout_reads_back_through_the_gate(tmp_path):
+def test_the_exported_layout_reads_back(tmp_path):
     path, exported = tmp_path / "field.safetensors", tmp_path / "step.ckpt"
     options = replace(SMALL, iterations=40, half_table=False)
     files = FitFiles(path, sdfstudio=exported)
     reconstruct(scenes.images(count=4), files, options, device="cpu")
-    report = import_field(exported, tmp_path / "imported")
-    assert report.family == "sdfstudio_neus_facto", report
+    report = convert(exported, tmp_path / "imported")
+    assert report["family"] == "sdfstudio_neus_facto", report
     imported = open_field(next((tmp_path / "imported").glob("*.safetensors")))
     points = torch.from_numpy(np.random.default_rng(0).uniform(*scenes.BOUNDS, size=(500, 3))).float()
     told, gradient = open_field(path).signed_distance_and_gradient(points)

@@ -12,10 +12,10 @@ import pytest
 
 from regnf_core.importing.containers.sniff import sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
-from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import geometry
 from regnf_core.importing.upload_description import UploadDescription
 from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.in_process import convert
 from tests.core.importing.meshes.mesh_files import PLY_TRIANGLE, converted, exported
 
 
@@ -166,4 +166,4 @@ def test_more_triangles_than_anybody_needs(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_sheet_has_no_inside(tmp_path: Path) -> None:
     upload = saved(tmp_path, PLY_TRIANGLE.encode())
-    assert_refused(lambda: import_field(upload, tmp_path / "out"), "NO_ZERO_LEVEL")
+    assert_refused(lambda: convert(upload, tmp_path / "out"), "NO_ZERO_LEVEL")
