@@ -33,7 +33,7 @@ def test_a_mesh_becomes_a_safe_field_and_a_grid(run: Run, tmp_path: Path) -> Non
     assert outcome.stdout.startswith(f"{safe}: mesh, ")
     assert (read_description(safe)["kind"], read_description(safe)["label"]) == ("mesh", "ball")
     assert open_field(safe).signed_distance(torch.zeros(1, 3)).item() == pytest.approx(-0.5, abs=0.01)
-    assert run("convert", tmp_path / "ball.glb", grid, "--resolution", 8).code == 0
+    assert run("convert", safe, grid, "--resolution", 8).code == 0
     assert np.load(grid)["sdf"].shape == (9, 9, 9)
     assert {path.name for path in tmp_path.glob("ball*")} == {"ball.glb", safe.name, grid.name}
 
@@ -68,7 +68,6 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=BALL_RADIUS).apply_translation(BALL_CENTER)
     box = trimesh.creation.box(extents=2.0 * BOX_HALF).apply_translation(BOX_CENTER)
     trimesh.util.concatenate([ball, box]).export(tmp_path / "scene.glb")
-    box.export(tmp_path / "other.glb")
     seen = images()
     write_dataset(seen, tmp_path / "images")
     safe = tmp_path / "scene.safetensors"
@@ -78,8 +77,9 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
     assert kept is not None
     assert made is not None
     assert (kept.states == made.states).float().mean() > 0.999  # depths are stored in steps
-    refused = run("convert", tmp_path / "other.glb", tmp_path / "other.safetensors", "--images", tmp_path / "images")
+    other = DATA / "armchair.safetensors"
+    refused = run("convert", other, tmp_path / "other.safetensors", "--images", tmp_path / "images")
     assert (refused.code, "DATASET_OF_ANOTHER_FRAME" in refused.stderr) == (2, True)
     unsafe = run("convert", tmp_path / "scene.glb", tmp_path / "scene.ply", "--images", tmp_path / "images")
     assert (unsafe.code, "INVALID_OPTIONS" in unsafe.stderr) == (2, True)
-    assert {path.name for path in tmp_path.iterdir()} <= {"scene.glb", "other.glb", "images", safe.name, "cache"}
+    assert {path.name for path in tmp_path.iterdir()} <= {"scene.glb", "images", safe.name, "cache"}
