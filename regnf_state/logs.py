@@ -19,7 +19,7 @@ _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime
 
 @contextmanager
 def log_context(**members: Any) -> Iterator[None]:
-    """Entries written meanwhile, in threads started meanwhile too, bear these members: request_id, job_id, caller."""
+    """Entries written in this block, also by threads started in it, have these members: request_id, job_id, caller."""
     token = _context.set(_context.get({}) | members)
     try:
         yield

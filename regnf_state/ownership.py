@@ -1,9 +1,9 @@
-"""Who owns what. A caller's fields and jobs are its own: nobody else can see, use, count or delete them.
+"""Who owns what. A caller's fields and jobs are its own: no other caller can see, use, count or delete them.
 
 Inside the service a field goes by a reference: the SHA-256 of its bytes and, behind an underscore, its owner's name.
 Two callers who send the same bytes therefore have two fields, each with an import, a label and bytes of its own.
 Neither can tell, not by an answer and not by how long it takes, what the other has. Outside, a field is its SHA-256.
-The fields of a service without tokens belong to ``ANONYMOUS`` and bear no name.
+The fields of a service without tokens belong to ``ANONYMOUS`` and have no owner's name.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ class JobRecord:
 
     @property
     def owner(self) -> str:
-        """The caller whose job it is: whoever owns the scene."""
+        """The caller whose job it is: the owner of the scene."""
         return owner_of(self.request["scene"]) if "scene" in self.request else ANONYMOUS
 
 
@@ -179,7 +179,7 @@ class RecordStore(Protocol):
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
         """Compare-and-set: applies ``changes`` if ``attempt`` is current and the state machine allows it.
 
-        A change of status must be a move: whoever sets ``running`` second loses, so it serves as a claim.
+        A change of status must be a move: the second attempt to set ``running`` fails, so it serves as a claim.
         Raises StaleAttemptError. Publishes an event whenever status, phase or progress changes.
         """
         ...
@@ -208,7 +208,7 @@ class RecordStore(Protocol):
         ...
 
     def expire_jobs(self) -> list[str]:
-        """Drop what is left of finished jobs that have outlived their retention; their ids, for whoever holds more."""
+        """Delete what is left of finished jobs after their retention; their ids, so that their files go too."""
         ...
 
     def queue_position(self, job_id: str) -> int | None:

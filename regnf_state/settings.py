@@ -85,13 +85,13 @@ class Settings(BaseSettings):
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
     heartbeat_s: float = Field(default=5.0, gt=0)
     lost_after_s: float = Field(default=90.0, gt=0)
-    """A running job whose heartbeat is older than this is taken for lost."""
+    """A running job whose heartbeat is older than this is lost."""
     shutdown_grace_s: float = Field(default=5.0, ge=0)
     """How long a worker that is told to stop lets its job go on before it gives the job back to the queue."""
     retention_s: int = Field(default=7 * 24 * 3600, ge=60)
     """How long finished jobs and their artifacts are kept."""
     unused_field_retention_s: int | None = Field(default=None, ge=60)
-    """How long a field is kept that no job has used since. Unset: until somebody deletes it."""
+    """How long a field is kept after its last use by a job. Unset: until it is deleted."""
     storage_cap_bytes: int | None = Field(default=None, ge=1)
     """Beyond this the oldest finished jobs and unused fields go, before their time."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")

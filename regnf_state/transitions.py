@@ -97,7 +97,7 @@ def requeued_job(record: JobRecord, attempt: int, now: float, lost: bool) -> Job
 
 
 def restarted_job(record: JobRecord, new: JobRecord, now: float) -> JobRecord | None:
-    """A failed or dismissed job, asked for again by ``new``, as its next attempt; None for a job that stands.
+    """A failed or dismissed job, asked for again by ``new``, as its next attempt; None for any other job.
 
     Both requests have the same result; the record holds the later one. Raises QuotaError as ``joined_job`` does.
     """
@@ -109,7 +109,7 @@ def restarted_job(record: JobRecord, new: JobRecord, now: float) -> JobRecord | 
 
 
 def joined_job(record: JobRecord, new: JobRecord) -> JobRecord:
-    """A job that stands after ``new`` has asked for the same: its webhook is told as well.
+    """A job that is not started anew, after ``new`` has asked for the same: it gets that webhook too.
 
     The job itself is returned when it has that webhook, or none was named. Its times stay: they are of its progress.
     Raises QuotaError (QUOTA_WEBHOOKS).
@@ -138,7 +138,7 @@ def changed_field(record: FieldRecord, attempt: int | None, changes: dict[str, A
 
 
 def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldRecord | None:
-    """A rejected field, uploaded again, as its next attempt; None for a field that stands."""
+    """A rejected field, uploaded again, as its next attempt; None for any other field."""
     if record.state != "rejected":
         return None
     return replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)

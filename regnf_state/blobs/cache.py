@@ -1,7 +1,7 @@
 """Copies of remote files on this machine, shared by its processes and kept below a size.
 
-A file that is held is locked, shared, by its holder; whoever makes room takes only files that nobody has locked, the
-least recently used first. Files come under their name by a link, whole, so that readers never see half of one.
+A process that uses a file holds a shared lock on it. To make room, only files without a lock are deleted, the least
+recently used first. A file gets its name by a link when it is complete, so readers never see a part of one.
 """
 
 from __future__ import annotations

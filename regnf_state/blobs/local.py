@@ -31,7 +31,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 class LocalBlobWriter(AbstractContextManager["LocalBlobWriter"]):
-    """A temporary file on the store's volume, locked while its writer lives: a sweep takes what nobody has locked."""
+    """A temporary file on the store's volume, locked while its writer lives. A sweep deletes files without a lock."""
 
     def __init__(self, store: LocalBlobStore) -> None:
         self._store = store
@@ -225,7 +225,7 @@ class LocalBlobStore:
             try:
                 folder.rmdir()
             except OSError:
-                break  # not empty, or somebody else removed it
+                break  # not empty, or another process removed it
 
     def delete_prefix(self, prefix: str) -> None:
         for key in self.list(prefix):

@@ -27,7 +27,7 @@ def object_client(url: str, wait_s: float, timeout_s: float) -> S3Store:
         client_options={
             "timeout": timedelta(seconds=timeout_s),
             "connect_timeout": timedelta(seconds=_CONNECT_TIMEOUT_S),
-            # whoever names an endpoint without TLS means it
+            # an endpoint without TLS is used only when it is named so
             "allow_http": any(os.environ.get(name, "").startswith("http://") for name in _ENDPOINTS),
         },
         retry_config={

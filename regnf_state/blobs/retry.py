@@ -14,7 +14,7 @@ _Value = TypeVar("_Value")
 
 
 def until_available(do: Callable[[], _Value], wait_s: float) -> _Value:
-    """What ``do`` returns, which bears being repeated. Raises StorageUnavailableError after ``wait_s`` seconds."""
+    """What ``do`` returns; it may be called several times. Raises StorageUnavailableError after ``wait_s`` seconds."""
     end = time.monotonic() + wait_s
     pause_s = _FIRST_WAIT_S
     while True:

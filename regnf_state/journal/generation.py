@@ -41,11 +41,11 @@ class Generation:
         return held is not None and text(held) == self._name()
 
     def begin(self) -> str:
-        """Say that the journal is about to be read; returns what ``end`` must be given."""
+        """Note that the journal will be read now; returns the token for ``end``."""
         token = f"reading:{uuid4().hex}"
         self._redis.set(_KEY, token)
         return token
 
     def end(self, token: str) -> bool:
-        """Say that all of it is in Redis. False when Redis was emptied, or somebody else began, meanwhile."""
+        """Note that all of it is in Redis. False when Redis was emptied or another process began in between."""
         return bool(self._mark(keys=[_KEY], args=[token, self._name()]))

@@ -1,8 +1,8 @@
-"""What was accepted and what became of it, in the blob store: enough to make the records anew when Redis has lost them.
+"""What was accepted and what became of it, in the blob store: enough to rebuild the records when Redis has lost them.
 
 One folder a job, objects in it that are written once and never changed:
     journal/jobs/{id}/{attempt}-accepted    the record as it was accepted; written before the caller is told
-    journal/jobs/{id}/{attempt}-begun       a later attempt is about to be claimed: whoever counts attempts counts it
+    journal/jobs/{id}/{attempt}-begun       a later attempt will be claimed now; it counts as an attempt
     journal/jobs/{id}/{attempt}-ended       the record as it ended
     journal/jobs/{id}/{attempt}-webhooks{n} the record with n webhooks of later requests, before those are answered
 One object a field, the record as it was last written: journal/fields/{reference}.
@@ -40,7 +40,7 @@ class Journal:
         self._blobs = blobs
 
     def storage_id(self) -> str:
-        """What tells this store from every other; made by whoever asks first."""
+        """An id that no other store has, made by the first call."""
         self._blobs.put_if_absent(_STORAGE_ID, uuid4().hex.encode())
         with self._blobs.open(_STORAGE_ID) as file:
             return file.read().decode()
@@ -75,7 +75,7 @@ class Journal:
         return (job_id for job_id, _ in groupby(parts[0] for parts in keys))
 
     def recall(self, job_id: str, now: float) -> JobRecord | None:
-        """The job as it is to go on: ended as it did, or to be run as an attempt that nobody has had yet."""
+        """The job as it continues: ended as it did, or to be run as an attempt that did not exist before."""
         try:
             return self._recall(job_id, now)
         except (ValueError, TypeError) as error:
@@ -119,7 +119,7 @@ class Journal:
         return (key.removeprefix(f"{_FIELDS}/") for key in self._blobs.list(_FIELDS))
 
     def recall_field(self, reference: str) -> FieldRecord | None:
-        """The field as it is to go on; None when there is none, or its bytes are gone."""
+        """The field as it continues; None when there is none, or its bytes are gone."""
         try:
             with self._blobs.open(f"{_FIELDS}/{reference}") as file:
                 field = replace(_as_record(FieldRecord, json.load(file)), version=1)

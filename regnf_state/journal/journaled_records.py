@@ -1,7 +1,7 @@
-"""Records in Redis that the journal could make anew: what is accepted is journaled before anybody is told.
+"""Records in Redis that can be rebuilt from the journal: an accepted job is journaled before the caller gets an answer.
 
-That something has ended is journaled afterwards, if it can be: should both the word of it and Redis be lost, it is done
-once more, and a result that stands is found.
+The end of a job is journaled afterwards, if possible. If this entry and Redis are both lost, the job is run once more,
+and finds the published result.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class JournaledRecordStore(RedisRecordStore):
         if created and (names := fields_of(job)):
             self._redis.zadd(_USED, dict.fromkeys(names, job.updated))
         if job.status == "accepted":
-            self.journal.accept(job)  # also one known before: whoever recorded it may have died right there
+            self.journal.accept(job)  # also one known before: its first writer may have died before this line
         if job.more_webhooks and not created:
             self.journal.join(job)  # also those known before, for the same reason
         return job, created
@@ -66,7 +66,7 @@ class JournaledRecordStore(RedisRecordStore):
         return super().news(positions)
 
     def recall_job(self, job_id: str) -> JobRecord | None:
-        """Make a lost record anew. The job as it is to go on, None when nothing was to be made."""
+        """Rebuild a lost record. The job as it continues; None when there was nothing to rebuild."""
         now = self.now()
         job = self.journal.recall(job_id, now)
         if job is None or self.has_expired(job, now):
@@ -137,7 +137,7 @@ class JournaledRecordStore(RedisRecordStore):
         return super().get_fields(references)
 
     def recall_field(self, sha256: str) -> FieldRecord | None:
-        """Make a lost record anew. The field as it is to go on, None when nothing was to be made."""
+        """Rebuild a lost record. The field as it continues; None when there was nothing to rebuild."""
         field = self.journal.recall_field(sha256)
         return field if field is not None and self.restore_field(field) else None
 

@@ -1,4 +1,4 @@
-"""Making the records anew from the journal, once Redis has lost them."""
+"""Rebuilding the records from the journal after Redis has lost them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """Which records were made anew, and how many jobs were found past their time and dropped."""
+    """Which records were rebuilt, and how many jobs were found past their time and dropped."""
 
     jobs: tuple[str, ...] = ()
     fields: tuple[str, ...] = ()
@@ -62,7 +62,7 @@ class Rebuilder:
         )
 
     def _recall_job(self, job_id: str) -> JobRecord | str | None:
-        """A record that was made anew; the id of a job that was dropped; None where nothing was to be done."""
+        """A record that was rebuilt; the id of a job that was dropped; None where nothing was to be done."""
         now = self._records.now()
         job = self._records.journal.recall(job_id, now)
         if job is None:

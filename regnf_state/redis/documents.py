@@ -1,4 +1,4 @@
-"""Documents in Redis that change by compare-and-set: the ground under the record store."""
+"""Documents in Redis that change by compare-and-set: the base of the record store."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ Cap = tuple[str, str, int, int, str]
 
 
 class RedisDocuments:
-    """Reads documents together with the server's clock, writes them with whatever indexes hang on them, atomically."""
+    """Reads documents together with the server's clock, writes them together with their indexes, atomically."""
 
     def __init__(self, redis: Redis) -> None:
         self._redis = redis
@@ -81,7 +81,7 @@ class RedisDocuments:
             yield from self._read_many(key_of(name) for score, name in page if before is None or (score, name) < before)
             if len(page) < _PAGE:
                 return
-            # go on from the last score rather than by offset: what is created meanwhile would shift the offsets
+            # continue from the last score, not by offset: records created in between would shift the offsets
             lowest = page[-1][0]
             seen_at_highest = sum(score == lowest for score, _ in page) + (seen_at_highest if lowest == highest else 0)
             highest = lowest

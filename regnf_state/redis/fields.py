@@ -15,7 +15,7 @@ from regnf_state.redis.documents import PREFIX, Cap, Command, RedisDocuments, te
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
 _ATTEMPTS_KEPT_S = str(48 * 3600)
-"""How long a deleted field's count of attempts is kept: longer than any word about them lives elsewhere."""
+"""How long a deleted field's count of attempts is kept: longer than anything else that names them."""
 
 
 def _key(sha256: str) -> str:

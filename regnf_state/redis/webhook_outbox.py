@@ -36,7 +36,7 @@ DeliveryState = Literal["waiting", "pending", "delivered", "failed"]
 
 @dataclass(frozen=True)
 class Delivery:
-    """How the message about a job's end fares. Times are the store's, seconds since the epoch."""
+    """The state of the message about a job's end. Times are the store's, seconds since the epoch."""
 
     state: DeliveryState = "waiting"
     """waiting for the job's end; to be sent; received; given up."""
@@ -121,7 +121,7 @@ class RedisOutbox:
         count(self._redis, "webhook_sends", outcome)
 
     def deliveries(self, record: JobRecord) -> list[Delivery]:
-        """How the message to each of the job's webhooks fares."""
+        """The state of the message to each of the job's webhooks."""
         if not record.webhooks:
             return []
         with self._redis.pipeline(transaction=False) as pipeline:

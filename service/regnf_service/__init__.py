@@ -1,4 +1,4 @@
-"""The HTTP front end of regnf: contract, routes, job and field records, blob storage, queue client, web page.
+"""The HTTP front end of regnf: contract and routes, uploads, submission of jobs, upkeep, webhooks and the web page.
 
-Nothing in this package imports torch, open3d or ``worker``.
+Nothing in this package imports torch, open3d or ``regnf_worker``.
 """

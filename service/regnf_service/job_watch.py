@@ -36,7 +36,7 @@ class JobWatch:
         return await answer
 
     async def _run(self) -> None:
-        """Rounds for as long as somebody asks."""
+        """Rounds for as long as a stream asks."""
         while self._asked:
             await pause(self._next_round - time.monotonic(), self._stopping)
             asked, self._asked = self._asked, {}

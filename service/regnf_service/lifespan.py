@@ -1,4 +1,4 @@
-"""What the application does beside answering: looks after lost jobs, sends webhooks, shows metrics, ends in order."""
+"""What the application does beside requests: it finds lost jobs, sends webhooks, serves metrics, and stops in order."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _CLEARING_UP_S = 5.0
 
 
 def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
-    """The lifespan of an application over these services: begins what goes on beside requests, and ends it in order."""
+    """The lifespan of an application over these services: starts its background tasks, and stops them in order."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        app.openapi()  # takes a while, so not while somebody waits for an answer
+        app.openapi()  # takes a while, so not during the first request
         reaping = asyncio.create_task(_reap(services))
         delivering = asyncio.create_task(
             deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
@@ -38,7 +38,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
-        # the server has broken off what was still arriving, and does not wait for it to be cleared away
+        # the server has interrupted the uploads that were running, and does not wait until they are cleaned up
         await services.uploads.emptied(_CLEARING_UP_S)
         await delivering
         await reaping
@@ -57,7 +57,7 @@ async def _reap(services: Services) -> None:
         try:
             await in_thread(reaper.run_once)
         except (RedisError, OSError) as error:
-            logger.warning("the reaper found a store away: %s", type(error).__name__)
+            logger.warning("the reaper: a store does not answer: %s", type(error).__name__)
         except Exception:
             logger.exception("an internal error ended this round of the reaper; the next round follows")
         await pause(_REAP_EVERY_S, services.stopping)

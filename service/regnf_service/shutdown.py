@@ -19,7 +19,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stopping_on_signals(stopping: asyncio.Event) -> Iterator[None]:
-    """Set ``stopping`` when SIGINT or SIGTERM arrives, before whoever handled it until now hears of it."""
+    """Set ``stopping`` when SIGINT or SIGTERM arrives, before the earlier handler is called."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -54,9 +54,9 @@ def split_entry(entry: str) -> tuple[str | None, str]:
 
 
 def caller_of(callers: Callers, authorization: str) -> str | None:
-    """The caller whose token an Authorization header bears. Takes as long for a wrong token as for a right one."""
+    """The caller whose token is in an Authorization header. Takes as long for a wrong token as for a right one."""
     scheme, _, token = authorization.partition(" ")
-    # digests have one length, so that a comparison tells nothing about a token's
+    # all digests have the same length, so a comparison reveals nothing about the length of a token
     digest = _digest(token.strip())
     found = [name for known, name in callers.items() if hmac.compare_digest(digest, known)]
     return found[0] if found and scheme.lower() == "bearer" else None

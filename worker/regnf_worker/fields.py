@@ -17,7 +17,7 @@ _WAIT_BEFORE_GIVING_BACK_S = 20.0
 
 
 class FieldsNotReadyError(Exception):
-    """A field is still being imported; whoever waits longer should let somebody else use the worker."""
+    """A field is still being imported; the job goes back to the queue, so that the worker is free for others."""
 
 
 class Fields:

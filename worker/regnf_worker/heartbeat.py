@@ -1,4 +1,4 @@
-"""A job's heartbeat, and the ear through which it hears that it shall stop."""
+"""A job's heartbeat, which also tells the job when it must stop."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Heartbeat:
 
     Use as a context manager. ``report`` is the registration's progress callback: it raises CancelledError once the job
     was cancelled or another attempt has taken over (``superseded``). A job that does not come back to ``report`` within
-    five seconds of that is killed: native code hears no exception.
+    five seconds of that is killed: native code receives no exception.
     """
 
     def __init__(self, records: RecordStore, job_id: str, attempt: int, beat_s: float) -> None:
@@ -89,7 +89,7 @@ class Heartbeat:
         try:
             self._note(change)
         except RedisError as error:
-            logger.warning("job %s attempt %d: no word from Redis: %s", self._job_id, self._attempt, error)
+            logger.warning("job %s attempt %d: Redis does not answer: %s", self._job_id, self._attempt, error)
 
     def _note(self, change: Any, *arguments: Any) -> None:
         try:

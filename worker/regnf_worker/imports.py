@@ -33,8 +33,8 @@ def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bo
 def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
     """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
 
-    The original is deleted before the record says so: whoever uploads the same bytes again finds either a validating
-    record, or one that has ended and an original of their own. Writes that Redis refuses for a while are waited for,
+    The original is deleted before the record changes: a new upload of the same bytes finds either a validating record,
+    or one that has ended, and then stores its own original. Writes that Redis refuses for a while are waited for,
     until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down, and
     OSError when a volume is away.
     """
@@ -45,10 +45,10 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     if not retry_until_available(
         f"the record of import {sha256}", lambda: claim_import(context, sha256, attempt, worker)
     ):
-        logger.info("import %s attempt %d is somebody else's", sha256, attempt)
+        logger.info("import %s attempt %d belongs to another worker", sha256, attempt)
         return
     try:
-        report = _standing_report(context, field) or _work(context, field, importer)
+        report = _earlier_report(context, field) or _work(context, field, importer)
     except (RedisError, StorageUnavailableError):
         raise
     except RegnfError as error:
@@ -96,20 +96,20 @@ def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
 
 
 def _retire(context: Context, sha256: str, attempt: int, error: StaleAttemptError) -> None:
-    logger.info("import %s attempt %d has no say any more: %s", sha256, attempt, error)
+    logger.info("import %s attempt %d is no longer current: %s", sha256, attempt, error)
     if context.records.get_field(sha256) is None:
         context.blobs.delete_prefix(f"fields/{sha256}")  # deleted while it was being imported
 
 
-def _standing_report(context: Context, field: FieldRecord) -> dict[str, Any] | None:
-    """What an earlier attempt found that died before it could say so, if it took the file for the same function."""
+def _earlier_report(context: Context, field: FieldRecord) -> dict[str, Any] | None:
+    """The report of an earlier attempt that died before it wrote the record, if its description was the same."""
     try:
         with context.blobs.open(_report(field.sha256)) as file:
-            standing: dict[str, Any] = json.load(file)
+            stored: dict[str, Any] = json.load(file)
     except FileNotFoundError:
         return None
-    report: dict[str, Any] = standing["report"]
-    return report if standing["description"] == field.description else None
+    report: dict[str, Any] = stored["report"]
+    return report if stored["description"] == field.description else None
 
 
 def _report(sha256: str) -> str:
@@ -117,7 +117,7 @@ def _report(sha256: str) -> str:
 
 
 def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str, Any]:
-    """Import the upload. Raises StaleAttemptError, nothing stored, when the field was deleted meanwhile."""
+    """Import the upload. Raises StaleAttemptError, nothing stored, when the field was deleted in between."""
     sha256, description = field.sha256, field.description
     with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(_original(sha256)) as upload:
         folder = Path(temporary)

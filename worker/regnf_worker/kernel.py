@@ -1,4 +1,4 @@
-"""What the worker asks of the operating system: dying with one's parent, sharing cores, who ran out of memory."""
+"""What the worker asks of the operating system: to end with its parent, to share cores, to report kills for memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 _PR_SET_PDEATHSIG = 1
-_FIRST_TO_GO = "500"
+_OOM_SCORE = "500"
 _EXIT_POLL_S = 0.005
 _COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -28,12 +28,12 @@ def die_with_parent(parent_pid: int) -> None:
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent_pid:  # it died before the kernel was told
+    if os.getppid() != parent_pid:  # the parent died before this call
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Exit(NamedTuple):
-    """The end of a child. ``status`` as waitpid has it; None when somebody else has waited for the child."""
+    """The end of a child. ``status`` as waitpid has it; None when other code has waited for the child."""
 
     status: int | None
 
@@ -72,10 +72,10 @@ def in_child(work: Callable[[], None]) -> bool:
     return os.waitpid(child, 0)[1] == 0
 
 
-def offer_to_the_oom_killer() -> None:
-    """When memory runs out, this process goes first, not the worker or Redis beside it."""
+def prefer_as_oom_victim() -> None:
+    """When memory runs out, the kernel kills this process first, not the worker or Redis."""
     with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
+        Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE)
 
 
 def oom_kills() -> int:

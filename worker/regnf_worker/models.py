@@ -1,4 +1,4 @@
-"""What registrations know of an object beforehand: its model, made by the first of them and kept beside its field."""
+"""The model of an object, made by the first registration that uses it and kept beside its field."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ObjectModels:
         if model is None:
             model = self._make(field, open_field())
         if self._kept and field.symmetry is None:
-            self._tell_symmetry(field, model)
+            self._store_symmetry(field, model)
         return model
 
     def _read(self, field: FieldRecord) -> Model | None:
@@ -70,17 +70,17 @@ class ObjectModels:
     def _keep(self, field: FieldRecord, data: bytes) -> None:
         now = self._context.records.get_field(field.sha256)
         if now is None or now.attempt != field.attempt:
-            return  # deleted while the job was at it, and perhaps uploaded as another function
+            return  # deleted during the job, and perhaps uploaded with another description
         self._context.blobs.put_if_absent(model_key(field.sha256), data)
 
-    def _tell_symmetry(self, field: FieldRecord, model: Model) -> None:
+    def _store_symmetry(self, field: FieldRecord, model: Model) -> None:
         symmetry = self._engine.symmetry(model)
         try:
             self._context.records.update_field(field.sha256, attempt=field.attempt, symmetry=symmetry)
         except StaleAttemptError:
-            logger.info("field %s is gone: nobody to tell its symmetry", field.sha256)
+            logger.info("field %s was deleted: its symmetry is not stored", field.sha256)
         except RedisError as error:
-            logger.warning("the symmetry of %s goes untold: %s", field.sha256, error)
+            logger.warning("the symmetry of %s is not stored: %s", field.sha256, error)
 
 
 def kept_by_default(options: RegistrationOptions) -> bool:

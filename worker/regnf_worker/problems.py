@@ -17,7 +17,7 @@ _AWAY = {errno.ENOENT, errno.EIO, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, err
 
 
 def fault(error: Exception, incident: str) -> dict[str, Any]:
-    """The problem that an exception stands for which is no refusal of regnf's own; ``incident`` finds it in the log."""
+    """The problem of an exception that is not one of regnf's own refusals; ``incident`` finds it in the log."""
     if isinstance(error, JobTimeoutException):
         return problem_document("JOB_TIMEOUT")
     if is_out_of_memory(error):
@@ -28,7 +28,7 @@ def fault(error: Exception, incident: str) -> dict[str, Any]:
 
 
 def are_files_away(error: Exception) -> bool:
-    """Whether files of ours fail or are gone: the volume is away, as a rule, and it is worth another attempt."""
+    """Whether stored files fail or are missing: usually the volume is away, and another attempt may succeed."""
     return isinstance(error, OSError) and error.errno in _AWAY
 
 

@@ -1,8 +1,8 @@
-"""The worker process: takes ids from the queue and forks a child for each, which it outlives, limits and settles.
+"""The worker process: takes ids from the queue, forks a child for each, limits it, and settles the job's record.
 
-RQ's forking worker, with what it lacks: children die with it, time limits hold against native code, a Redis that is
-full or away does not end it, and a child's death never leaves a record that says it runs. It never loads torch itself:
-a parent that has run a torch operation hangs its forked children.
+It is RQ's forking worker with these additions: children end with the worker, time limits also stop native code, a Redis
+that is full or away does not end the worker, and after a child's death no record says that the job still runs. The
+worker never loads torch itself: the forked children of a process that has run a torch operation hang.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _IMPORT_MARGIN_S = 30
 
 
 class RegnfWorker(ResilientWorker):
-    """One worker of the service. ``monitor_s`` is how often it looks after the child it runs."""
+    """One worker of the service. ``monitor_s`` is how often it checks the child that it runs."""
 
     def __init__(self, context: Context, scratch: Scratch, monitor_s: int = 1) -> None:
         assert context.settings.redis_url is not None
@@ -100,14 +100,14 @@ class RegnfWorker(ResilientWorker):
         if child == 0:
             os.setpgrp()
             kernel.die_with_parent(parent)
-            kernel.offer_to_the_oom_killer()
+            kernel.prefer_as_oom_victim()
             self._scratch.use()
             self.main_work_horse(job, queue)
             os._exit(0)
         os.close(held_by_child)
         self._horse_pid = child
         job.started_at = now()
-        job.timeout = -1  # the limit is kept here, by a clock that nobody sets: RQ counts by the wall clock
+        job.timeout = -1  # the limit is kept here, by the monotonic clock: RQ uses the wall clock
         try:
             while (exit_ := kernel.wait_for_exit(child, ended, self.job_monitoring_interval)) is None:
                 self._limit_child()

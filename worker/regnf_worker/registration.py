@@ -86,7 +86,7 @@ def _end(context: Context, job_id: str, attempt: int, **changes: Any) -> None:
     try:
         _update(context, job_id, attempt, **changes)
     except StaleAttemptError as error:
-        logger.info("job %s attempt %d has no say any more: %s", job_id, attempt, error)
+        logger.info("job %s attempt %d is no longer current: %s", job_id, attempt, error)
     else:
         logger.info("job %s attempt %d ended: %s", job_id, attempt, changes["status"])
 
@@ -108,7 +108,7 @@ def _give_back(context: Context, job_id: str, attempt: int) -> None:
 def _work(
     context: Context, record: JobRecord, make_engine: Callable[[], RegistrationEngine], heartbeat: Heartbeat
 ) -> Manifest:
-    """The job's result, standing. Raises whatever kept it from standing."""
+    """Do the job and publish its result. Returns the manifest that counts, of this attempt or an earlier one."""
     request = RegistrationRequest.from_record(record.request)
     with ExitStack() as stack:
         fields = Fields(context, heartbeat, stack)
@@ -123,9 +123,9 @@ def _work(
     heartbeat.confirm()
     if publish(context.blobs, manifest):
         return manifest
-    standing = read_manifest(context.blobs, record.id)
-    assert standing is not None, "a manifest is never taken back while its job runs"
-    return standing
+    published = read_manifest(context.blobs, record.id)
+    assert published is not None, "a manifest is never deleted while its job runs"
+    return published
 
 
 def _register(

@@ -1,7 +1,7 @@
 """RQ's worker, made to survive a Redis that refuses commands: RQ's own loop ends at the first one.
 
 There are three kinds of calls:
-- What must succeed before the worker goes on, such as its sign of life, is repeated until Redis accepts it. A worker
+- What must succeed before the worker continues, such as its sign of life, is repeated until Redis accepts it. A worker
   that cannot write takes nothing from the queue.
 - What only keeps RQ's own entries tidy is skipped: job records are the truth, and RQ's entries expire or are swept.
 - What is written while a child runs is never repeated: the child has time limits, which the worker must keep.

@@ -1,4 +1,4 @@
-"""Waiting out a Redis that is full, away or not to be written to."""
+"""Waiting for a Redis that is full, away or read-only."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ logger = logging.getLogger(__name__)
 
 
 def passes(error: RedisError) -> bool:
-    """Whether the same command may succeed later. Anything else is a fault that waiting does not mend."""
+    """Whether the same command may succeed later. Waiting does not help with any other error."""
     return isinstance(error, _PASSING) or any(word in str(error) for word in _PASSING_WORDS)
 
 
 def retry_until_available(what: str, do: Callable[[], _Value], stopped: Callable[[], bool] = lambda: False) -> _Value:
-    """What ``do`` returns once Redis lets it, however long that takes; ``do`` must bear being repeated.
+    """What ``do`` returns once Redis accepts it, however long that takes; ``do`` may be called several times.
 
     Raises StopRequested when ``stopped`` by then, and any error that does not pass.
     """

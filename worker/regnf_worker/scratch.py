@@ -20,7 +20,7 @@ class Scratch:
     def __init__(self, parent: Path) -> None:
         parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with (parent / _LOCK).open("a") as gate:
-            fcntl.flock(gate, fcntl.LOCK_EX)  # nobody sweeps while a folder is made but not yet locked
+            fcntl.flock(gate, fcntl.LOCK_EX)  # no other process sweeps while a folder exists that is not yet locked
             for left in parent.iterdir():
                 if left.is_dir():
                     _remove_if_dead(left)

@@ -1,4 +1,4 @@
-"""What becomes of a record whose process has ended without writing down how: decided by the worker that outlived it."""
+"""How the worker settles a record whose process ended without writing its outcome."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from regnf_worker.imports import claim_import, reject
 
 logger = logging.getLogger(__name__)
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
-"""What a process does not do to itself; other signals, a segmentation fault say, would come again."""
+"""Signals from outside. Others, for example of a segmentation fault, would come again in the next attempt."""
 _DETAILS = {
     "WORKER_LOST": "The process that did the work was killed. Send the request again.",
     "INTERNAL": "Internal error: the process of the job ended without a report. The log has more under its id.",
@@ -25,17 +25,17 @@ _DETAILS = {
 
 @dataclass(frozen=True)
 class ChildExit:
-    """How a job's process ended: by which signal, if by one, and what the worker knows about why."""
+    """How a job's process ended: the signal, if any, and what the worker knows about the cause."""
 
     signal: int | None = None
     late: bool = False
     out_of_memory: bool = False
     given_back: bool = False
-    """The worker itself was told to stop and took its job down with it."""
+    """The worker itself was told to stop and ended its job."""
 
     @property
     def worth_another_try(self) -> bool:
-        """It ended for want of Redis or storage, as a rule, or was killed from outside; not too slow, not too large."""
+        """Usually Redis or storage was away, or somebody killed it; it was neither too slow nor too large."""
         return not self.late and (self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory))
 
     def reason(self) -> str:
@@ -47,11 +47,11 @@ class ChildExit:
 
 
 def settle_registration(context: Context, job_id: str, attempt: int, worker: str, end: ChildExit) -> None:
-    """See that the record of a job whose process is gone does not go on saying it runs.
+    """Settle the record of a job whose process is gone, so that it no longer says that the job runs.
 
-    A result that stands makes it successful; a wish to cancel, dismissed; a worker that stops gives it back; a process
-    that was killed, or ended by itself for want of Redis or storage, is granted one more attempt; everything else has
-    failed.
+    With a published result the job is successful; with a request to cancel, dismissed. A worker that stops gives the
+    job back to the queue. A process that was killed, or that ended because Redis or storage was away, gets one more
+    attempt. In all other cases the job has failed.
     """
     record = context.records.get_job(job_id)
     if record is None or record.attempt != attempt or record.status not in ACTIVE:
@@ -63,7 +63,7 @@ def settle_registration(context: Context, job_id: str, attempt: int, worker: str
             return  # handed out twice, and the other one has it
         _settle(context, record, end)
     except StaleAttemptError as error:
-        logger.info("job %s attempt %d: somebody else has settled it: %s", job_id, attempt, error)
+        logger.info("job %s attempt %d: another process has settled it: %s", job_id, attempt, error)
 
 
 def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:

@@ -1,6 +1,6 @@
 """One upload on its way into the blob store: counted, hashed and looked at while it streams.
 
-Nothing is spooled elsewhere and nothing bears a name before ``commit``: an upload that breaks off leaves nothing.
+Nothing is stored elsewhere, and the bytes have no name before ``commit``: an interrupted upload leaves nothing.
 Hashing and writing happen in a thread, a mebibyte at a time, so that the event loop keeps answering others.
 """
 

@@ -20,7 +20,7 @@ class IfNoneMatch:
 
     given: bool = False
     tags: frozenset[str] | None = frozenset()
-    """The opaque tags, with their quotes; None stands for `*`, any tag."""
+    """The opaque tags, with their quotes; None means `*`, any tag."""
 
     def matches(self, etag: str) -> bool:
         """Whether the client holds this version. The comparison is weak: proxies may put `W/` before a tag."""

@@ -1,4 +1,4 @@
-"""What every request passes on its way in: a request id, the token check, and headers that every answer bears."""
+"""What every request passes first: a request id, the token check, and headers that every answer has."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ _STATUS_REASONS = {401: "UNAUTHENTICATED", 404: "NOT_FOUND", 405: "METHOD_NOT_AL
 
 
 def problem_of(error: Exception) -> Problem:
-    """The problem that an exception stands for. What nobody foresaw is INTERNAL."""
+    """The problem of an exception. Any other exception is INTERNAL."""
     match error:
         case Problem():
             return error

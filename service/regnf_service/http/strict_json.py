@@ -16,7 +16,7 @@ _LARGEST_EXACT = 2**53
 def parse_json(body: bytes) -> Any:
     """The value in ``body``; a number without a fraction is an int, as JSON Schema has it, however it is spelled.
 
-    NaN and Infinity pass, for the schema to refuse them where they stand.
+    NaN and Infinity are accepted here; the schema refuses them with their place.
 
     Raises Problem MALFORMED_JSON.
     """

@@ -12,7 +12,7 @@ _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def find_job(services: Services, job_id: str, caller: str) -> JobRecord:
-    """The caller's job; of another's it tells nothing. Raises Problem JOB_NOT_FOUND, JOB_EXPIRED."""
+    """The caller's own job. Raises Problem JOB_NOT_FOUND, JOB_EXPIRED."""
     if not _JOB_ID.fullmatch(job_id):
         raise Problem("JOB_NOT_FOUND")
     record = services.records.get_job(job_id)

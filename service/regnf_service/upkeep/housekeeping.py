@@ -1,7 +1,7 @@
-"""What the store holds that nobody needs any more: unused fields, what is beyond the cap, what crashes left behind.
+"""Deletes what is no longer needed: unused fields, results beyond the storage cap, and files that crashes left behind.
 
-Nothing here is urgent, so it is done once an hour, by the leader. What a live job needs is never touched: the record of
-a field goes first, and comes back if a job has asked for the field meanwhile; only then go the bytes.
+Nothing here is urgent, so the leader does it once an hour. What a live job needs is never deleted: the record of a
+field is deleted first, and restored if a job has asked for the field in between; only then the bytes are deleted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _DONE_KEY = f"{PREFIX}housekeeping"
 _EVERY_S = 3600
 _ORPHANED_AFTER_S = 24 * 3600.0
 _UNTOUCHED_FOR_S = 3600.0
-"""The cap takes nothing that is younger: its owner may be about to use it."""
+"""Nothing younger is deleted for the cap: its owner may want to use it now."""
 _PAGE = 200
 logger = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Housekeeper:
     def run(self, term: Term) -> Removed:
         """One round. Raises LeaseLostError, RedisError, OSError."""
         if not self._records.generation.is_current():
-            return Removed()  # what Redis has lost must not pass for what nobody needs
+            return Removed()  # records that Redis has lost must not look unused
         temporary = self._blobs.sweep(_ORPHANED_AFTER_S)
         folders = self._folders()
         self._forget_expired(term)
@@ -99,7 +99,7 @@ class Housekeeper:
         return found
 
     def _forget_expired(self, term: Term) -> None:
-        """What the journal still says of jobs whose records went while somebody died."""
+        """Delete journal entries of jobs whose records expired while a process died."""
         for job_id in self._records.journal.jobs():
             if self._records.get_job(job_id) is not None:
                 continue
@@ -142,7 +142,7 @@ class Housekeeper:
             before = page[-1].created, page[-1].id
 
     def _drop_field(self, term: Term, field: FieldRecord) -> bool:
-        """Forget a field unless a job has asked for it meanwhile."""
+        """Delete a field unless a job has asked for it in between."""
         term.confirm()
         self._records.delete_field(field.sha256)
         if next(iter(self._records.jobs_using_field(field.sha256)), None) is not None:
@@ -150,7 +150,7 @@ class Housekeeper:
             self._records.journal.keep_field(field)
             return False
         self._blobs.delete_prefix(f"fields/{field.sha256}")
-        logger.info("field %s is dropped: nobody has used it for long", field.sha256)
+        logger.info("field %s is deleted: it was not used for a long time", field.sha256)
         return True
 
     def _drop_beyond_cap(

@@ -11,7 +11,7 @@ from redis.lock import Lock
 
 
 class LeaseLostError(Exception):
-    """Somebody else leads, or may: whoever gets this stops."""
+    """Another process leads, or may lead: stop."""
 
 
 class Term:
@@ -39,7 +39,7 @@ class Lease:
 
     @contextmanager
     def held(self) -> Iterator[Term | None]:
-        """A term, if nobody else has one; it ends with the block."""
+        """A term, if no other process has one; it ends with the block."""
         lock = self._redis.lock(self._key, timeout=self._seconds, blocking=False, thread_local=False)
         if not lock.acquire():
             yield None

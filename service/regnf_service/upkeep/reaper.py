@@ -1,7 +1,7 @@
-"""Finds what died without a word: jobs without a heartbeat, work that no queue holds, results past their time.
+"""Finds what has failed silently: jobs without a heartbeat, work that is in no queue, results past their retention.
 
-Every change of a record is fenced off by its attempt, whoever makes it; what cannot be undone is done only by a leader
-that has made sure that it still leads.
+Every change of a record is fenced by its attempt. What cannot be undone is done only by a leader that has just
+confirmed that it still leads.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from regnf_state.settings import Settings
 
 _LEADER_KEY = f"{PREFIX}reaper"
 _LEADS_FOR_S = 30
-"""A leader that is killed during a round keeps the others waiting for so long."""
+"""If a leader is killed during a round, the others wait for this long."""
 _UNHELD_FOR_S = 15.0
-"""Work that has been in no queue for so long was lost on its way, or with its worker."""
+"""Work that has been in no queue for this long was lost on its way, or with its worker."""
 _MIN_UNBROKEN_S = 30.0
-"""Rounds that are twice as far apart as usual still follow on one another, however early a job is taken for lost."""
+"""Rounds up to twice the usual interval apart count as consecutive, however small ``lost_after_s`` is."""
 _IMPORT_RETRIES = 2
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ class Reaper:
         self._lease = Lease(redis, _LEADER_KEY, _LEADS_FOR_S)
 
     def run_once(self) -> Reaped:
-        """One round; nothing when another process is at it. Raises RedisError when Redis cannot be reached."""
+        """One round; nothing when another process leads. Raises RedisError when Redis cannot be reached."""
         recalled = self._rebuild()
         with self._lease.held() as term:
             if term is None:
@@ -91,7 +91,7 @@ class Reaper:
             )
 
     def _rebuild(self) -> tuple[str, ...]:
-        """Whoever finds Redis emptied mends it, leader or not: reading the journal takes longer than a term."""
+        """Any process that finds Redis emptied rebuilds it: reading the journal takes longer than a term."""
         if self._rebuilder is None:
             return ()
         rebuilt = self._rebuilder.run_if_needed()
@@ -132,13 +132,13 @@ class Reaper:
         return "failed"
 
     def _is_unheld(self, name: str, attempt: int) -> bool:
-        """Whether work that no queue holds now has been seen in none for a while: somebody may be about to queue it."""
+        """Whether work has been in no queue for a while; before that, another process may be adding it."""
         return self._staleness.of(f"{name}:unheld", attempt) >= _UNHELD_FOR_S
 
     def _is_lost(self, job: JobRecord, now: float) -> bool:
-        """Whether the job's heartbeat is so old, and has been seen to stand still for so long, that its worker is gone.
+        """Whether the worker is gone: the heartbeat is old, and was seen unchanged for long enough.
 
-        How old it is Redis' clock tells, which may be stepped; and nobody could beat while Redis was away.
+        Its age alone proves nothing: Redis' clock may be stepped, and no worker can write while Redis is away.
         """
         beaten = job.heartbeat or job.updated
         still = self._staleness.of(job.id, (job.attempt, beaten))
@@ -175,7 +175,7 @@ def _note(
     try:
         action = look(record, now)
     except StaleAttemptError:
-        return  # it moved on by itself meanwhile
+        return  # it has changed in between
     if action is not None:
         actions[action].append(name)
         logger.warning("%s: %s", name, action)

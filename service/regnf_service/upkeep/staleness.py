@@ -1,4 +1,4 @@
-"""How long records have stood still, by this process' own clock: no step of a clock and no outage fakes that."""
+"""How long records have been unchanged, by this process' monotonic clock, which no step of a clock affects."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 
 class Staleness:
-    """Told of every record in every round. When rounds were more than ``unbroken_s`` apart, everything begins anew.
+    """Sees every record in every round. When two rounds are more than ``unbroken_s`` apart, all counting begins anew.
 
-    Whoever could not look, because Redis was away or the machine slept, does not know who was silent meanwhile.
+    A process that could not look, because Redis was away or the machine slept, does not know what changed.
     """
 
     def __init__(self, unbroken_s: float, clock: Callable[[], float] = time.monotonic) -> None:

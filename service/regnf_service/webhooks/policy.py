@@ -32,5 +32,5 @@ class Webhooks:
             raise Problem("WEBHOOK_NOT_ALLOWED", errors=[fault])
 
     def deliveries(self, record: JobRecord) -> list[Delivery]:
-        """How the message to each of the job's webhooks fares."""
+        """The state of the message to each of the job's webhooks."""
         return self.outbox.deliveries(record)

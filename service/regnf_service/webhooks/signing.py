@@ -16,7 +16,7 @@ _PREFIX = "whsec_"
 _MIN_KEY_BYTES, _MAX_KEY_BYTES = 24, 64
 
 Secrets = Mapping[str, Sequence[bytes]]
-"""Each caller's keys. Several: each message bears a signature with every one, while one replaces another."""
+"""Each caller's keys. With several keys each message has a signature of each, while one key replaces another."""
 
 
 def read_secrets(entries: Iterable[str], file: Path | None) -> Secrets:
