@@ -5,14 +5,16 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
-processes=${REGNF_TEST_PROCESSES:-$(($(nproc) + 1))}
+cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
 checks=$(mktemp)
-trap 'rm -f "$checks"' EXIT
+scripts/lint.sh >"$checks" 2>&1 &
+linter=$!
+trap 'kill $linter 2>/dev/null; rm -f "$checks"' EXIT
 
-make --no-print-directory lint >"$checks" 2>&1 &
-.venv/bin/python -m pytest --numprocesses "$processes" --dist loadgroup --no-loadscope-reorder "$@"
+.venv/bin/python -m pytest --numprocesses "${REGNF_TEST_PROCESSES:-$((cores + 1))}" \
+    --dist loadgroup --no-loadscope-reorder "$@"
 tests=$?
-wait $!
+wait $linter
 lint=$?
 cat "$checks"
 if [[ $tests -ne 0 || $lint -ne 0 ]]; then
