@@ -22,9 +22,9 @@ _OPTIONS = {"up_axis": "z"}
 
 
 def comparable(result: dict[str, Any]) -> dict[str, Any]:
-    """What of a result follows from the question: all but the seconds and where its files lie."""
+    """What of a result follows from the question: all but the seconds, the options and where its files lie."""
     metrics = {name: value for name, value in result["metrics"].items() if not name.startswith("seconds_")}
-    kept = {name: value for name, value in result.items() if name not in ("artifacts", "metrics")}
+    kept = {name: value for name, value in result.items() if name not in ("artifacts", "metrics", "options")}
     return kept | {"metrics": metrics, "artifacts": sorted(entry["name"] for entry in result["artifacts"])}
 
 
@@ -48,10 +48,14 @@ class Expected:
         return cls(request, results)
 
     def question(self, number: int) -> tuple[str, dict[str, Any]]:
-        """The kind of the n-th job and its request. Its label makes it a job of its own, and changes nothing else."""
+        """The kind of the n-th job and its request.
+
+        An option of the other preset makes it a job of its own, and changes nothing else.
+        """
         kind = "cancelled" if number % 10 == 8 else "no surface" if number % 2 else "registration"
         box = EMPTY_BOX if kind == "no surface" else self.request["detection"]
-        return kind, {**self.request, "detection": {**box, "label": f"job {number}"}, "seed": self._place(number)}
+        options = {**_OPTIONS, "optimization": {"iterations": 1 + number}}
+        return kind, {**self.request, "detection": box, "options": options, "seed": self._place(number)}
 
     def result(self, number: int) -> dict[str, Any]:
         """What the n-th job's result has to be, where it has one."""

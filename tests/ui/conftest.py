@@ -47,7 +47,7 @@ class Visit:
         return self.page
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")  # its loop of events must not outlive these tests
 def browser() -> Iterator[Browser]:
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
@@ -81,7 +81,7 @@ def context_options() -> dict[str, Any]:
 Open = Callable[[dict[str, Any]], Page]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def open_window(browser: Browser) -> Open:
     """``open_window(options)``: a page in a window of its own, which takes the browser longer than a test."""
 
@@ -93,7 +93,7 @@ def open_window(browser: Browser) -> Open:
     return open_it
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def kept_window() -> dict[str, Page]:
     """The window that tests share, by its options; at most one."""
     return {}
