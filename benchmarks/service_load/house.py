@@ -31,6 +31,8 @@ class House:
     settings: dict[str, object]
     api: subprocess.Popen[bytes] | None = None
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    token: str | None = None
+    """Of the caller that asks whether the service is ready, where it needs one."""
 
     @property
     def address(self) -> str:
@@ -38,12 +40,23 @@ class House:
 
     def start(self, workers: int) -> None:
         """The API, and so many workers; returns once it is ready."""
-        self.api = self._launch("api", ["regnf_cli.api_process", str(self.listener.fileno())])
+        self.launch_api()
         self.workers = [self._worker(index) for index in range(workers)]
         eventually(self._ready if workers else self._answers, self.log)
 
+    def launch_api(self) -> None:
+        """The API's process, however far it gets."""
+        self.api = self._launch("api", ["regnf_cli.api_process", str(self.listener.fileno())])
+
+    def kill_api(self) -> None:
+        """Kill the API's process, and start another."""
+        assert self.api is not None
+        self.api.kill()
+        self.api.wait()
+        self.launch_api()
+
     def kill_worker(self, index: int) -> None:
-        """Kill a worker (its child dies with it), and start another."""
+        """Kill a worker (its child dies with it), unless it has ended, and start another."""
         self.workers[index].kill()
         self.workers[index].wait()
         self.workers[index] = self._worker(index)
@@ -136,8 +149,9 @@ class House:
     def _status(self, path: str) -> int:
         assert self.api is not None
         assert self.api.poll() is None, self.log()
+        headers = {"Authorization": f"Bearer {self.token}"} if self.token else {}
         try:
-            return httpx.get(self.address + path, timeout=5).status_code
+            return httpx.get(self.address + path, headers=headers, timeout=5).status_code
         except httpx.TransportError:
             return 0
 
@@ -148,11 +162,11 @@ def _entry(pid: int, entry: str) -> int:
 
 
 @contextmanager
-def running_house(folder: Path, workers: int, **settings: object) -> Iterator[House]:
+def running_house(folder: Path, workers: int, token: str | None = None, **settings: object) -> Iterator[House]:
     """Start everything below ``folder``; ready once this yields."""
     (folder / "state").mkdir(parents=True, exist_ok=True)
     with restartable_redis(folder / "redis") as redis, socket.create_server(("127.0.0.1", 0)) as listener:
-        house = House(folder, redis, listener, dict(settings))
+        house = House(folder, redis, listener, dict(settings), token=token)
         try:
             house.start(workers)
             yield house
