@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_state.blobs.base import BlobStore
+from regnf_state.record_format import FORMAT, check_json_format
+from regnf_state.records import UnreadableRecordError
 
 _BINARY = "application/octet-stream"
 ARTIFACTS: dict[str, str] = {
@@ -67,7 +69,7 @@ class Manifest:
             {"name": one.name, "bytes": one.bytes, "media_type": one.media_type, "sha256": one.sha256}
             for one in self.artifacts
         ]
-        return json.dumps({"attempt": self.attempt, "artifacts": listed}, indent=1).encode()
+        return json.dumps({"format": FORMAT, "attempt": self.attempt, "artifacts": listed}, indent=1).encode()
 
 
 def manifest_key(job_id: str) -> str:
@@ -79,18 +81,32 @@ def artifact_key(job_id: str, attempt: int, name: str) -> str:
 
 
 def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
-    """The manifest of a job's result; None while there is none."""
+    """The manifest of a job's result; None while there is none. Raises UnreadableRecordError."""
     try:
         with blobs.open(manifest_key(job_id)) as file:
-            document = json.load(file)
+            document = check_json_format(job_id, json.load(file))
+        attempt = document["attempt"]
+        listed = [Artifact(one["name"], one["bytes"], one["sha256"]) for one in document["artifacts"]]
     except FileNotFoundError:
         return None
-    listed = (Artifact(one["name"], one["bytes"], one["sha256"]) for one in document["artifacts"])
-    return Manifest(job_id, document["attempt"], tuple(listed))
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnreadableRecordError(job_id, "its manifest is damaged") from error
+    if not (isinstance(attempt, int) and all(_is_sound(one) for one in listed)):
+        raise UnreadableRecordError(job_id, "its manifest is damaged")
+    return Manifest(job_id, attempt, tuple(listed))
+
+
+def _is_sound(one: Artifact) -> bool:
+    return isinstance(one.name, str) and isinstance(one.bytes, int) and isinstance(one.sha256, str) and one.bytes >= 0
 
 
 def read_result(blobs: BlobStore, manifest: Manifest) -> dict[str, Any]:
-    """The result document. Raises FileNotFoundError."""
+    """The result document. Raises FileNotFoundError, UnreadableRecordError."""
     with blobs.open(manifest.key("result.json")) as file:
-        document: dict[str, Any] = json.load(file)
+        try:
+            document = json.load(file)
+        except ValueError as error:
+            raise UnreadableRecordError(manifest.job_id, "its result is damaged") from error
+    if not isinstance(document, dict):
+        raise UnreadableRecordError(manifest.job_id, "its result is damaged")
     return document

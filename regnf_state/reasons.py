@@ -150,6 +150,11 @@ REASONS: dict[str, Reason] = {
     "OUT_OF_MEMORY": Reason(500, "Out of memory", "The job needed more memory than the worker has."),
     # the service itself
     "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
+    "RECORD_UNREADABLE": Reason(
+        503,
+        "Record unreadable",
+        "The record is damaged, or of a later release. The operator knows; a damaged job may be asked for anew.",
+    ),
     "STORE_UNAVAILABLE": Reason(503, "Records unavailable", "The record store does not answer. Retry later."),
     "STORAGE_UNAVAILABLE": Reason(503, "Storage unavailable", "The blob storage does not answer. Retry later."),
     "INTERNAL": Reason(500, "Internal error", "The service failed. Its log has the error under the request id."),

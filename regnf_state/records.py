@@ -39,6 +39,18 @@ class StaleAttemptError(RecordError):
     """The change came from an attempt that is no longer the current one, or from a state that forbids it."""
 
 
+class UnreadableRecordError(RecordError):
+    """What is held under ``name`` cannot be read. ``newer``: a later release has written it, and may read it again."""
+
+    reason = "RECORD_UNREADABLE"
+
+    def __init__(self, name: str, why: str, *, newer: bool = False) -> None:
+        super().__init__(f"the record of {name} cannot be read: {why}")
+        self.name = name
+        self.why = why
+        self.newer = newer
+
+
 @dataclass(frozen=True)
 class Quota:
     """The most that one owner may have; None: any number."""
@@ -81,6 +93,8 @@ class JobRecord:
     """Of a successful job: what its result says."""
     more_webhooks: list[str] = field(default_factory=list)
     """Addresses named by later requests for this job, which are told of its end as well."""
+    unknown_members: dict[str, Any] = field(default_factory=dict)
+    """What another release has written and this one does not know: it is written back as it is."""
 
     @property
     def webhooks(self) -> list[str]:
@@ -116,6 +130,8 @@ class FieldRecord:
     """How often this upload was handed out again because its worker vanished."""
     symmetry: dict[str, Any] | None = None
     """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
+    unknown_members: dict[str, Any] = field(default_factory=dict)
+    """As in JobRecord."""
 
     @property
     def owner(self) -> str:

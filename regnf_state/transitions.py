@@ -85,6 +85,7 @@ def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
         attempt=record.attempt + 1,
         requeues=requeues,
         more_webhooks=record.more_webhooks,
+        unknown_members=record.unknown_members,
     )
 
 
@@ -141,7 +142,8 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
     """A rejected field, uploaded again, as its next attempt; None for any other field."""
     if record.state != "rejected":
         return None
-    return replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
+    again = replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
+    return replace(again, unknown_members=record.unknown_members)
 
 
 def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> FieldRecord:

@@ -96,9 +96,9 @@ class ShiftedClock(RedisDocuments):
     def now(self) -> float:
         return self._moved(super().now())
 
-    def _read(self, key: str) -> tuple[dict[str, Any] | None, float]:
-        document, now = super()._read(key)
-        return document, self._moved(now)
+    def _read(self, kind: Any, name: str) -> tuple[Any, float]:
+        record, now = super()._read(kind, name)
+        return record, self._moved(now)
 
     def _moved(self, now: float) -> float:
         return (now if self.frozen is None else self.frozen) + self.ahead_s

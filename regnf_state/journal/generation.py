@@ -13,7 +13,8 @@ from uuid import uuid4
 from redis import Redis
 
 from regnf_state.journal.journal import Journal
-from regnf_state.redis.documents import PREFIX, text
+from regnf_state.redis.documents import text
+from regnf_state.redis.keys import PREFIX
 
 _KEY = f"{PREFIX}generation"
 _MARK = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2]) return 1 end return 0"

@@ -13,18 +13,21 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import groupby
-from typing import Any, TypeVar
+from typing import TypeVar
 from uuid import uuid4
 
 from regnf_state.blobs.base import BlobStore
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.record_format import FORMAT, check_json_format, decoded, document_of
+from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 
 _JOBS = "journal/jobs"
 _FIELDS = "journal/fields"
 _STORAGE_ID = "journal/storage-id"
 _WEBHOOKS = "webhooks"
+_BESIDE = frozenset({"format", "owner"})
+"""Members of a document that are no members of the record."""
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
@@ -48,9 +51,19 @@ class Journal:
     # jobs
 
     def accept(self, job: JobRecord) -> None:
-        if not self._write(job, "accepted") and self._read(job.id, job.attempt, "accepted").created != job.created:
-            self.forget(job.id)  # a job of this id that has outlived its retention
+        if not self._write(job, "accepted") and not self._holds(job):
+            self.forget(job.id)  # a job of this id that has outlived its retention, or that cannot be read
             self._write(job, "accepted")
+
+    def _holds(self, job: JobRecord) -> bool:
+        """Whether what is written of this attempt is of this job. Raises UnreadableRecordError: of a later release."""
+        try:
+            return self._read(job.id, job.attempt, "accepted").created == job.created
+        except UnreadableRecordError as error:
+            if error.newer:
+                raise
+            logger.error("%s in the journal: written anew", error)
+            return False
 
     def join(self, job: JobRecord) -> None:
         """Keep the webhooks that later requests have added to the job."""
@@ -63,8 +76,8 @@ class Journal:
         self._write(job, "ended")
 
     def _write(self, job: JobRecord, event: str) -> bool:
-        document = json.dumps(asdict(job) | {"owner": job.owner}, separators=(",", ":"))
-        return self._blobs.put_if_absent(f"{_folder(job.id)}/{job.attempt:06d}-{event}", document.encode())
+        document = _text(job, owner=job.owner)
+        return self._blobs.put_if_absent(f"{_folder(job.id)}/{job.attempt:06d}-{event}", document)
 
     def forget(self, job_id: str) -> None:
         self._blobs.delete_prefix(_folder(job_id))
@@ -78,7 +91,7 @@ class Journal:
         """The job as it continues: ended as it did, or to be run as an attempt that did not exist before."""
         try:
             return self._recall(job_id, now)
-        except (ValueError, TypeError) as error:
+        except (ValueError, UnreadableRecordError) as error:
             logger.error("the journal of job %s does not read: %s", job_id, error)
             return None
 
@@ -104,12 +117,12 @@ class Journal:
 
     def _read(self, job_id: str, attempt: int, event: str) -> JobRecord:
         with self._blobs.open(f"{_folder(job_id)}/{attempt:06d}-{event}") as file:
-            return replace(_as_record(JobRecord, json.load(file)), version=1)
+            return replace(_as_record(JobRecord, job_id, file.read()), version=1)
 
     # fields
 
     def keep_field(self, field: FieldRecord) -> None:
-        self._blobs.put(f"{_FIELDS}/{field.sha256}", json.dumps(asdict(field), separators=(",", ":")).encode())
+        self._blobs.put(f"{_FIELDS}/{field.sha256}", _text(field))
 
     def forget_field(self, reference: str) -> None:
         self._blobs.delete(f"{_FIELDS}/{reference}")
@@ -122,10 +135,10 @@ class Journal:
         """The field as it continues; None when there is none, or its bytes are gone."""
         try:
             with self._blobs.open(f"{_FIELDS}/{reference}") as file:
-                field = replace(_as_record(FieldRecord, json.load(file)), version=1)
+                field = replace(_as_record(FieldRecord, reference, file.read()), version=1)
         except FileNotFoundError:
             return None
-        except (ValueError, TypeError) as error:
+        except UnreadableRecordError as error:
             logger.error("the journal of field %s does not read: %s", reference, error)
             return None
         if field.state == "rejected" or self._blobs.exists(f"fields/{reference}/field.safetensors"):
@@ -136,6 +149,15 @@ class Journal:
         return None
 
 
-def _as_record(kind: type[_Record], document: dict[str, Any]) -> _Record:
-    """The record of a document; members that this version does not know are left out."""
-    return kind(**{name: value for name, value in document.items() if name in kind.__dataclass_fields__})
+def _text(record: JobRecord | FieldRecord, **beside: str) -> bytes:
+    return json.dumps(document_of(record) | beside | {"format": FORMAT}, separators=(",", ":")).encode()
+
+
+def _as_record(kind: type[_Record], name: str, text: bytes) -> _Record:
+    """The record of a document. Raises UnreadableRecordError."""
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise UnreadableRecordError(name, "it is not JSON") from error
+    document = check_json_format(name, document)
+    return decoded(kind, name, json.dumps({key: value for key, value in document.items() if key not in _BESIDE}))

@@ -16,9 +16,19 @@ from redis import Redis
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.generation import Generation
 from regnf_state.journal.journal import Journal
-from regnf_state.records import FINISHED, NO_QUOTA, FieldRecord, JobNews, JobRecord, Quota
-from regnf_state.redis.documents import PREFIX
-from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.records import (
+    FINISHED,
+    NO_QUOTA,
+    FieldRecord,
+    JobNews,
+    JobRecord,
+    Quota,
+    UnreadableRecordError,
+)
+from regnf_state.redis.documents import Kind
+from regnf_state.redis.jobs import JOB, RedisRecordStore
+from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.unreadable import Stored
 from regnf_state.transitions import fields_of
 
 _USED = f"{PREFIX}fields:used"
@@ -37,10 +47,22 @@ class JournaledRecordStore(RedisRecordStore):
         """Tells whether Redis holds what the journal says."""
         return Generation(self._redis, self.journal)
 
+    def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
+        """Set a record aside, and put what the journal says in its place. Raises OSError: then nothing has changed."""
+        now = self.now()
+        job = self.journal.recall(name, now) if kind is JOB and not error.newer else None
+        field = self.journal.recall_field(name) if kind is not JOB and not error.newer else None
+        super()._heal(kind, name, stored, error)
+        if job is not None and not self.has_expired(job, now):
+            self.restore_job(job)
+        if field is not None:
+            self.restore_field(field)
+
     # jobs
 
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
-        self.get_job(record.id)  # recalls one that Redis has lost: its attempts must not be counted from one again
+        if not self._redis.exists(JOB.key(record.id)) and not self.generation.is_current():
+            self.recall_job(record.id)  # one that Redis has lost: its attempts must not be counted from one again
         job, created = super().create_job(record, max_active, quota)
         if created and (names := fields_of(job)):
             self._redis.zadd(_USED, dict.fromkeys(names, job.updated))

@@ -12,7 +12,7 @@ from typing import TypeVar
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
-from regnf_state.records import JobRecord
+from regnf_state.records import JobRecord, UnreadableRecordError
 
 _AT_ONCE = 16
 _PAGE = 1000
@@ -68,12 +68,18 @@ class Rebuilder:
         if job is None:
             return None
         if self._records.has_expired(job, now):
-            if self._records.get_job(job_id) is not None:
+            if self._is_known(job_id):
                 return None  # it was asked for again
             self._blobs.delete_prefix(f"jobs/{job_id}")
             self._records.journal.forget(job_id)
             return job_id
         return job if self._records.restore_job(job) else None
+
+    def _is_known(self, job_id: str) -> bool:
+        try:
+            return self._records.get_job(job_id) is not None
+        except UnreadableRecordError:
+            return True
 
 
 def _in_pages(names: Iterable[str], recall: Callable[[str], _Record | None]) -> Iterator[_Record]:

@@ -12,7 +12,8 @@ from typing import Any
 from redis import Redis
 
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord
-from regnf_state.redis.documents import PREFIX, Command, text
+from regnf_state.redis.documents import Command, text
+from regnf_state.redis.keys import PREFIX
 
 _KEY = f"{PREFIX}counters"
 BOUNDS_S = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
@@ -67,7 +68,7 @@ class Counters:
 
     def __init__(self, redis: Redis) -> None:
         held: Any = redis.hgetall(_KEY)
-        self._held = {tuple(text(name).split("|")): float(text(value)) for name, value in held.items()}
+        self._held = {tuple(text(name).split("|")): _number(text(value)) for name, value in held.items()}
 
     def counts(self, name: str) -> Iterable[tuple[Sequence[str], float]]:
         """(labels, value) of each count."""
@@ -82,3 +83,11 @@ class Counters:
                 total += self._held.get((name, *group, bound), 0.0)
                 buckets.append((bound, total))
             yield group, buckets, self._held.get((name, *group, "sum"), 0.0)
+
+
+def _number(value: str) -> float:
+    """What was counted; 0 for what is no number: a damaged count must not hide the others."""
+    try:
+        return float(value)
+    except ValueError:
+        return 0.0

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 from uuid import uuid4
 
 from redis import Redis
+from redis.exceptions import ResponseError
 
-PREFIX = "regnf:"
+from regnf_state.record_format import FORMAT, decoded, encoded
+from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
+from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.unreadable import UNREADABLE, Stored, UnreadableRecords
+
 _PAGE = 100
+_Record = TypeVar("_Record", JobRecord, FieldRecord)
+logger = logging.getLogger(__name__)
 
-# A document is a hash of ``document`` (JSON), ``version`` and ``token``. The token names the write that made it: when a
-# connection breaks after the script ran and the client runs it again, the second run finds its own token.
+# A document is a hash of ``document`` (JSON), ``version``, ``format`` and ``token``; other members of the hash stay as
+# they are. The token names the write that made it: when a connection breaks after the script ran and the client runs
+# it again, the second run finds its own token. An index that is no index is set aside, and begun anew.
 _WRITE = """
+local shape = redis.call('TYPE', KEYS[1]).ok
+if shape ~= 'hash' and shape ~= 'none' then return 'CONFLICT' end
 if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return 'OK' end
 if (redis.call('HGET', KEYS[1], 'version') or '0') ~= ARGV[2] then return 'CONFLICT' end
 for _, cap in ipairs(cjson.decode(ARGV[3])) do
@@ -27,7 +39,16 @@ for _, cap in ipairs(cjson.decode(ARGV[3])) do
   end
   if held + cap[3] > cap[4] then return cap[5] end
 end
-for i = 4, #ARGV do redis.call(unpack(cjson.decode(ARGV[i]))) end
+for i = 4, #ARGV do
+  local command = cjson.decode(ARGV[i])
+  local done = redis.pcall(unpack(command))
+  if type(done) == 'table' and done.err then
+    if not string.find(done.err, 'WRONGTYPE') then return done end
+    redis.call('RENAME', command[2], 'regnf:quarantine:' .. command[2])
+    redis.call('EXPIRE', 'regnf:quarantine:' .. command[2], 604800)
+    redis.call(unpack(command))
+  end
+end
 return 'OK'
 """
 
@@ -36,12 +57,24 @@ Cap = tuple[str, str, int, int, str]
 """(SCARD, HLEN or HVALS for the sum of a hash's values, key, what is to be added, the most, the answer beyond it)."""
 
 
+@dataclass(frozen=True)
+class Kind(Generic[_Record]):
+    """Jobs, or fields: their name in keys, and what their documents are read as."""
+
+    name: str
+    record: type[_Record]
+
+    def key(self, name: str) -> str:
+        return f"{PREFIX}{self.name}:{name}"
+
+
 class RedisDocuments:
     """Reads documents together with the server's clock, writes them together with their indexes, atomically."""
 
     def __init__(self, redis: Redis) -> None:
         self._redis = redis
         self._write = redis.register_script(_WRITE)
+        self.unreadable = UnreadableRecords(redis)
 
     def now(self) -> float:
         seconds, microseconds = self._redis.time()
@@ -50,35 +83,52 @@ class RedisDocuments:
     def ping(self) -> bool:
         return bool(self._redis.ping())
 
-    def _read(self, key: str) -> tuple[dict[str, Any] | None, float]:
-        """The document, if there is one, and the time of reading."""
+    # reading
+
+    def _read(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
+        """The record, if there is one, and the time of reading. Raises UnreadableRecordError."""
         with self._redis.pipeline(transaction=False) as pipeline:
-            pipeline.hget(key, "document")
+            ask(pipeline, kind.key(name))
             pipeline.time()
-            document, (seconds, microseconds) = pipeline.execute()
-        return json.loads(document) if document is not None else None, seconds + microseconds / 1e6
+            answer, (seconds, microseconds) = pipeline.execute(raise_on_error=False)
+        return self._record(kind, name, stored_in(answer)), seconds + microseconds / 1e6
 
-    def _read_each(self, keys: Iterable[str]) -> list[dict[str, Any] | None]:
-        """The document of each key, or None. One round trip."""
+    def _read_each(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record | None]:
+        """The record of each name, or None. One round trip. Raises UnreadableRecordError."""
+        return [self._record(kind, name, stored) for name, stored in self._fetch(kind, names)]
+
+    def _read_many(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record]:
+        """The records that exist and can be read, in the order of their names."""
+        found = (self._readable(kind, name, stored) for name, stored in self._fetch(kind, names))
+        return [record for record in found if record is not None]
+
+    def _read_to_create(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
+        """The same before a record is made: a damaged one does not stand in its way.
+
+        Raises UnreadableRecordError for one of a later release.
+        """
+        try:
+            return self._read(kind, name)
+        except UnreadableRecordError as error:
+            if error.newer:
+                raise
+            return None, self.now()
+
+    def _fetch(self, kind: Kind[Any], names: Sequence[str]) -> list[tuple[str, Stored | None]]:
         with self._redis.pipeline(transaction=False) as pipeline:
-            for key in keys:
-                pipeline.hget(key, "document")
-            return [None if document is None else json.loads(document) for document in pipeline.execute()]
+            for name in names:
+                ask(pipeline, kind.key(name))
+            answers = pipeline.execute(raise_on_error=False)
+        return [(name, stored_in(answer)) for name, answer in zip(names, answers, strict=True)]
 
-    def _read_many(self, keys: Iterable[str]) -> list[dict[str, Any]]:
-        """The documents that exist, in the order of their keys."""
-        return [document for document in self._read_each(keys) if document is not None]
-
-    def _newest_first(
-        self, index: str, key_of: Callable[[str], str], before: tuple[float, str] | None
-    ) -> Iterator[dict[str, Any]]:
-        """Documents listed in the sorted set ``index`` by time of creation, older than ``before`` = (created, name)."""
+    def _newest_first(self, index: str, kind: Kind[_Record], before: tuple[float, str] | None) -> Iterator[_Record]:
+        """Records listed in the sorted set ``index`` by time of creation, older than ``before`` = (created, name)."""
         highest: float = before[0] if before is not None else math.inf
         seen_at_highest = 0
         while True:
             answer: Any = self._redis.zrevrangebyscore(index, highest, "-inf", seen_at_highest, _PAGE, withscores=True)
             page = [(float(score), text(name)) for name, score in answer]
-            yield from self._read_many(key_of(name) for score, name in page if before is None or (score, name) < before)
+            yield from self._read_many(kind, [name for score, name in page if before is None or (score, name) < before])
             if len(page) < _PAGE:
                 return
             # continue from the last score, not by offset: records created in between would shift the offsets
@@ -86,23 +136,64 @@ class RedisDocuments:
             seen_at_highest = sum(score == lowest for score, _ in page) + (seen_at_highest if lowest == highest else 0)
             highest = lowest
 
+    # what cannot be read
+
+    def _record(self, kind: Kind[_Record], name: str, stored: Stored | None) -> _Record | None:
+        """What was read, decoded. What is damaged is set aside, and made anew where that is possible.
+
+        Raises UnreadableRecordError.
+        """
+        if stored is None:
+            return None
+        try:
+            return _decoded(kind, name, stored)
+        except UnreadableRecordError as error:
+            self._heal(kind, name, stored, error)
+            ((_, again),) = self._fetch(kind, [name])
+            if again is None:
+                raise
+            return _decoded(kind, name, again)
+
+    def _readable(self, kind: Kind[_Record], name: str, stored: Stored | None) -> _Record | None:
+        """The same for lists and rounds, which go on without it."""
+        try:
+            return self._record(kind, name, stored)
+        except UnreadableRecordError:
+            return None
+        except OSError as error:
+            logger.warning("%s %s is left out: %s", kind.name, name, type(error).__name__)
+            return None
+
+    def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
+        """Set a record aside."""
+        self.unreadable.set_aside(kind.name, kind.key(name), stored, error)
+
+    def _require_known(self, kind: Kind[Any], name: str) -> None:
+        """Raises UnreadableRecordError for a record that is not there because it was set aside."""
+        if self.unreadable.names(kind.key(name)):
+            raise UnreadableRecordError(name, "it was damaged")
+
+    # writing
+
     def _compare_and_set(
         self,
         key: str,
         expected_version: int,
         commands: Iterable[Command],
-        document: dict[str, Any] | None = None,
+        record: JobRecord | FieldRecord | None = None,
         caps: Sequence[Cap] = (),
     ) -> str:
-        """Run ``commands`` and store ``document`` if the version is the expected one (0: no document).
+        """Run ``commands`` and store ``record`` if the version is the expected one (0: no record).
 
         Returns OK, CONFLICT, or the answer of the first of ``caps`` that would be exceeded.
         """
         token = uuid4().hex
         writes = list(commands)
-        if document is not None:
-            text = json.dumps(document, separators=(",", ":"))
-            writes.insert(0, ("HSET", key, "document", text, "version", str(document["version"]), "token", token))
+        if record is not None:
+            members = ("document", encoded(record), "version", str(record.version), "format", str(FORMAT))
+            writes.insert(0, ("HSET", key, *members, "token", token))
+        if expected_version == 0:
+            writes.append(("ZREM", UNREADABLE, key))
         arguments: list[str | int] = [
             token,
             expected_version,
@@ -111,6 +202,34 @@ class RedisDocuments:
         ]
         answer: bytes | str = self._write(keys=[key], args=arguments)
         return answer.decode() if isinstance(answer, bytes) else answer
+
+
+def ask(pipeline: Any, key: str) -> None:
+    """Ask for what is held of a record; ``stored_in`` reads the answer."""
+    pipeline.hmget(key, "document", "version", "format")
+
+
+def stored_in(answer: Any) -> Stored | None:
+    """What was read under a key; None when there is nothing. Raises RedisError but for a key of another type."""
+    if is_wrong_type(answer):
+        return Stored(is_hash=False)
+    if isinstance(answer, Exception):
+        raise answer
+    return None if answer == [None, None, None] else Stored(True, *answer)
+
+
+def is_wrong_type(answer: object) -> bool:
+    """Whether a command was refused because its key holds something else."""
+    return isinstance(answer, ResponseError) and "WRONGTYPE" in str(answer)
+
+
+def _decoded(kind: Kind[_Record], name: str, stored: Stored) -> _Record:
+    if stored.document is None or stored.version is None:
+        raise UnreadableRecordError(name, "it is no record")
+    record = decoded(kind.record, name, stored.document, stored.format)
+    if text(stored.version) != str(record.version):
+        raise UnreadableRecordError(name, "its versions differ")  # no change could ever be written
+    return record
 
 
 def text(value: bytes | str) -> str:

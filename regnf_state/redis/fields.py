@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 from regnf_state import transitions
 from regnf_state.ownership import owner_of
-from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError
+from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
-from regnf_state.redis.documents import PREFIX, Cap, Command, RedisDocuments, text
+from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, text
+from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
@@ -18,8 +20,7 @@ _ATTEMPTS_KEPT_S = str(48 * 3600)
 """How long a deleted field's count of attempts is kept: longer than anything else that names them."""
 
 
-def _key(sha256: str) -> str:
-    return f"{PREFIX}field:{sha256}"
+FIELD = Kind("field", FieldRecord)
 
 
 def _created_keys(reference: str) -> tuple[str, str]:
@@ -61,22 +62,34 @@ class RedisFieldRecords(RedisDocuments):
             indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
             indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.bytes)))
-        return self._compare_and_set(_key(record.sha256), expected_version, indexes, asdict(record), caps)
+        return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
         while True:
-            document, now = self._read(_key(sha256))
-            if document is None:
-                raise StaleAttemptError("there is no such field")
-            known = FieldRecord(**document)
+            known, now = self._current_field(sha256)
             changed = change(known, now)
             if self._save_field(known.version, changed, counters.of_field(known, changed)) == "OK":
                 return changed
 
+    def _current_field(self, sha256: str) -> tuple[FieldRecord, float]:
+        """The field that is to be changed, and the time. Raises StaleAttemptError."""
+        try:
+            known, now = self._read(FIELD, sha256)
+        except UnreadableRecordError as error:
+            raise StaleAttemptError(str(error)) from error
+        if known is None:
+            raise StaleAttemptError("there is no such field")
+        return known, now
+
+    def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
+        super()._heal(kind, name, stored, error)
+        if kind is FIELD and not error.newer:
+            self._redis.srem(_VALIDATING, name)
+            self._redis.hdel(_stored_key(owner_of(name)), name)
+
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         while True:
-            document, now = self._read(_key(record.sha256))
-            known = FieldRecord(**document) if document is not None else None
+            known, now = self._read_to_create(FIELD, record.sha256)
             fresh = self._first(record) if known is None else transitions.restarted_field(known, record, now)
             if fresh is None:
                 assert known is not None
@@ -101,20 +114,20 @@ class RedisFieldRecords(RedisDocuments):
         return self._save_field(0, record) == "OK"
 
     def get_field(self, sha256: str) -> FieldRecord | None:
-        document, _ = self._read(_key(sha256))
-        return FieldRecord(**document) if document is not None else None
+        found, _ = self._read(FIELD, sha256)
+        if found is None:
+            self._require_known(FIELD, sha256)
+        return found
 
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
-        documents = self._read_each(map(_key, references))
-        return [None if document is None else FieldRecord(**document) for document in documents]
+        return self._read_each(FIELD, references)
 
     def list_fields(
         self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
     ) -> list[FieldRecord]:
         found: list[FieldRecord] = []
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
-        for document in self._newest_first(index, _key, before):
-            record = FieldRecord(**document)
+        for record in self._newest_first(index, FIELD, before):
             if label in (None, record.label):
                 found.append(record)
             if len(found) == limit:
@@ -126,22 +139,22 @@ class RedisFieldRecords(RedisDocuments):
 
     def validating_fields(self) -> list[FieldRecord]:
         names = sorted(text(name) for name in self._redis.smembers(_VALIDATING))
-        return [FieldRecord(**document) for document in self._read_many(map(_key, names))]
+        return self._read_many(FIELD, names)
 
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
     def delete_field(self, sha256: str) -> bool:
         while True:
-            document, _ = self._read(_key(sha256))
-            if document is None:
+            known, _ = self._read(FIELD, sha256)
+            if known is None:
                 return False
             commands: list[Command] = [
-                ("DEL", _key(sha256)),
+                ("DEL", FIELD.key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
                 ("SREM", _VALIDATING, sha256),
                 ("HDEL", _stored_key(owner_of(sha256)), sha256),
-                ("SET", _attempts_key(sha256), str(document["attempt"]), "EX", _ATTEMPTS_KEPT_S),
+                ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
             ]
-            if self._compare_and_set(_key(sha256), document["version"], commands) == "OK":
+            if self._compare_and_set(FIELD.key(sha256), known.version, commands) == "OK":
                 return True

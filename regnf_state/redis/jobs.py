@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
 from typing import Any, cast
 
 from redis import Redis
@@ -28,11 +27,14 @@ from regnf_state.records import (
     Quota,
     QuotaError,
     StaleAttemptError,
+    UnreadableRecordError,
 )
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
-from regnf_state.redis.documents import PREFIX, Cap, Command, text
+from regnf_state.redis.documents import Cap, Command, Kind, ask, is_wrong_type, stored_in, text
 from regnf_state.redis.fields import RedisFieldRecords
+from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}jobs:created"
 _ACTIVE = f"{PREFIX}jobs:active"
@@ -45,15 +47,14 @@ local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
 if not expires or tonumber(expires) > tonumber(ARGV[2]) then return 0 end
 redis.call('ZREM', KEYS[1], ARGV[1])
 redis.call('ZREM', KEYS[2], ARGV[1])
-local owner = redis.call('GET', KEYS[5])
-if owner then redis.call('ZREM', KEYS[2] .. ':' .. owner, ARGV[1]) end
+local owner = redis.pcall('GET', KEYS[5])
+if type(owner) == 'string' then redis.call('ZREM', KEYS[2] .. ':' .. owner, ARGV[1]) end
 redis.call('DEL', KEYS[3], KEYS[4])
 return 1
 """
 
 
-def _key(job_id: str) -> str:
-    return f"{PREFIX}job:{job_id}"
+JOB = Kind("job", JobRecord)
 
 
 def _created_keys(record: JobRecord) -> tuple[str, str]:
@@ -87,7 +88,7 @@ class RedisRecordStore(RedisFieldRecords):
 
     def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
         """What has to change around a record when ``before`` becomes ``after``."""
-        key, events = _key(after.id), _events_key(after.id)
+        key, events = JOB.key(after.id), _events_key(after.id)
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
             *(("SADD" if after.status in ACTIVE else "SREM", each, after.id) for each in (_ACTIVE, _active_key(after))),
@@ -116,50 +117,76 @@ class RedisRecordStore(RedisFieldRecords):
 
     def _change_job(self, job_id: str, change: Callable[[JobRecord, float], JobRecord]) -> JobRecord:
         while True:
-            document, now = self._read(_key(job_id))
-            if document is None:
-                raise StaleAttemptError("there is no such job")
-            known = JobRecord(**document)
+            known, now = self._current_job(job_id)
             changed = change(known, now)
             if changed is known:
                 return known
             commands = self._commands(known, changed)
-            if self._compare_and_set(_key(job_id), known.version, commands, asdict(changed)) == "OK":
+            if self._compare_and_set(JOB.key(job_id), known.version, commands, changed) == "OK":
                 return changed
+
+    def _current_job(self, job_id: str) -> tuple[JobRecord, float]:
+        """The job that is to be changed, and the time. Raises StaleAttemptError."""
+        try:
+            known, now = self._read(JOB, job_id)
+        except UnreadableRecordError as error:
+            raise StaleAttemptError(str(error)) from error
+        if known is None:
+            raise StaleAttemptError("there is no such job")
+        return known, now
+
+    def _heal(self, kind: Kind[Any], name: str, stored: Stored, error: UnreadableRecordError) -> None:
+        super()._heal(kind, name, stored, error)
+        if kind is JOB and not error.newer:
+            self._redis.srem(_ACTIVE, name)
+            self._redis.zrem(_WAITING, name)
+
+    def owns(self, owner: str, job_id: str) -> bool:
+        """Whether the owner's jobs list it, even if its record cannot be read."""
+        return self._redis.zscore(f"{_CREATED}:{owner}", job_id) is not None
 
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
         caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
         if quota.active_jobs is not None:
             caps.append(("SCARD", _active_key(record), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
         while True:
-            document, now = self._read(_key(record.id))
-            known = JobRecord(**document) if document is not None else None
+            known, now = self._read_to_create(JOB, record.id)
             fresh = transitions.restarted_job(known, record, now) if known is not None else record
             after = fresh or transitions.joined_job(cast(JobRecord, known), record)
             if after is known:
                 return after, False
             version = known.version if known is not None else 0
             commands = self._commands(known, after)
-            answer = self._compare_and_set(_key(record.id), version, commands, asdict(after), caps if fresh else ())
+            answer = self._compare_and_set(JOB.key(record.id), version, commands, after, caps if fresh else ())
             if answer == "FULL":
                 raise QueueFullError(f"{max_active} jobs are active already")
+            if answer == "QUOTA_ACTIVE_JOBS" and self._forget_ended(record.owner):
+                continue
             if answer.startswith("QUOTA"):
                 raise QuotaError(answer)
             if answer == "OK":
                 return after, fresh is not None
 
+    def _forget_ended(self, owner: str) -> bool:
+        """Strike jobs off an owner's active ones that are not active: records that were set aside. Whether any was."""
+        key = f"{PREFIX}owner:{owner}:active"
+        ended: Any = self._redis.sdiff([key, _ACTIVE])
+        return bool(ended) and bool(self._redis.srem(key, *ended))
+
     def restore_job(self, record: JobRecord) -> bool:
         """Put a record that was lost back as it is; False when the job is known."""
         commands = self._commands(None, record)
-        return self._compare_and_set(_key(record.id), 0, commands, asdict(record)) == "OK"
+        return self._compare_and_set(JOB.key(record.id), 0, commands, record) == "OK"
 
     def get_job(self, job_id: str) -> JobRecord | None:
-        document, _ = self._read(_key(job_id))
-        return JobRecord(**document) if document is not None else None
+        found, _ = self._read(JOB, job_id)
+        if found is None:
+            self._require_known(JOB, job_id)
+        return found
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         with self._redis.pipeline(transaction=False) as pipeline:
-            pipeline.exists(_key(job_id))
+            pipeline.exists(JOB.key(job_id))
             pipeline.get(_gone_key(job_id))
             held, gone = pipeline.execute()
         return not held and gone is not None and text(gone) == owner
@@ -169,9 +196,9 @@ class RedisRecordStore(RedisFieldRecords):
     ) -> list[JobRecord]:
         found: list[JobRecord] = []
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
-        for document in self._newest_first(index, _key, before):
-            if status in (None, document["status"]):
-                found.append(JobRecord(**document))
+        for record in self._newest_first(index, JOB, before):
+            if status in (None, record.status):
+                found.append(record)
             if len(found) == limit:
                 break
         return found
@@ -193,30 +220,29 @@ class RedisRecordStore(RedisFieldRecords):
 
     def delete_job(self, job_id: str) -> bool:
         while True:
-            document, _ = self._read(_key(job_id))
-            if document is not None and document["status"] in ACTIVE:
-                raise StaleAttemptError(f"a job that is {document['status']} is not deleted")
-            version = document["version"] if document is not None else 0
-            commands: list[Command] = [("DEL", _key(job_id), _events_key(job_id), _gone_key(job_id))]
+            known, _ = self._read_to_create(JOB, job_id)
+            if known is not None and known.status in ACTIVE:
+                raise StaleAttemptError(f"a job that is {known.status} is not deleted")
+            version = known.version if known is not None else 0
+            commands: list[Command] = [("DEL", JOB.key(job_id), _events_key(job_id), _gone_key(job_id))]
             indexes = [_CREATED, _WAITING, _EXPIRING]
-            if document is not None:
-                known = JobRecord(**document)
+            if known is not None:
                 indexes.append(_created_keys(known)[1])
                 commands += outbox.forgetting(known)
             commands += [("ZREM", index, job_id) for index in indexes]
-            if self._compare_and_set(_key(job_id), version, commands) == "OK":
-                return document is not None
+            if self._compare_and_set(JOB.key(job_id), version, commands) == "OK":
+                return known is not None
 
     def active_jobs(self) -> list[JobRecord]:
         names = sorted(text(name) for name in self._redis.smembers(_ACTIVE))
-        return [JobRecord(**document) for document in self._read_many(map(_key, names))]
+        return self._read_many(JOB, names)
 
     def expire_jobs(self) -> list[str]:
         now = self.now()
         expired = []
         names: Any = self._redis.zrangebyscore(_EXPIRING, "-inf", now)
         for job_id in map(text, names):
-            keys = [_EXPIRING, _CREATED, _key(job_id), _events_key(job_id), _gone_key(job_id)]
+            keys = [_EXPIRING, _CREATED, JOB.key(job_id), _events_key(job_id), _gone_key(job_id)]
             if self._expire(keys=keys, args=[job_id, now]):
                 expired.append(job_id)
         return expired
@@ -226,18 +252,19 @@ class RedisRecordStore(RedisFieldRecords):
         return None if rank is None else int(rank) + 1
 
     def events(self, job_id: str, after: str | None) -> list[JobEvent]:
-        return _events(self._redis.xread({_events_key(job_id): _start(after)}))
+        with self._redis.pipeline(transaction=False) as pipeline:
+            pipeline.xread({_events_key(job_id): _start(after)})
+            (answer,) = pipeline.execute(raise_on_error=False)
+        return _events(answer)
 
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
         with self._redis.pipeline(transaction=False) as pipeline:
             for job_id, after in positions:
-                pipeline.hget(_key(job_id), "document")
+                ask(pipeline, JOB.key(job_id))
                 pipeline.xread({_events_key(job_id): _start(after)})
-            answers = pipeline.execute()
-        return [
-            JobNews(JobRecord(**json.loads(document)) if document is not None else None, _events(entries))
-            for document, entries in zip(answers[::2], answers[1::2], strict=True)
-        ]
+            answers = pipeline.execute(raise_on_error=False)
+        found = zip(positions, map(stored_in, answers[::2]), answers[1::2], strict=True)
+        return [JobNews(self._readable(JOB, name, held), _events(entries)) for (name, _), held, entries in found]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
@@ -249,7 +276,11 @@ def _start(after: str | None) -> str:
 
 
 def _events(answer: Any) -> list[JobEvent]:
-    """The events in an answer to XREAD about one stream, in either protocol's shape."""
+    """The events in an answer to XREAD about one stream, in either protocol's shape; none where it is no stream."""
+    if is_wrong_type(answer):
+        return []
+    if isinstance(answer, Exception):
+        raise answer
     chunks = (
         [chunk for chunks in answer.values() for chunk in chunks]
         if isinstance(answer, dict)

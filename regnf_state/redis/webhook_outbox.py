@@ -5,15 +5,19 @@ A job has a message for each of its webhooks, named by the job, its attempt and 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from redis import Redis
 
+from regnf_state.record_format import LAST_TIME
 from regnf_state.records import JobRecord
 from regnf_state.redis.counters import count
-from regnf_state.redis.documents import PREFIX, Command, text
+from regnf_state.redis.documents import Command, is_wrong_type, text
+from regnf_state.redis.keys import PREFIX
 
+logger = logging.getLogger(__name__)
 _DUE = f"{PREFIX}webhooks:due"
 _LEASE_S = 60
 """A message that was taken and neither delivered nor put off for so long was taken by a process that died."""
@@ -27,7 +31,7 @@ return due[1]
 """
 _SETTLE = """
 if ARGV[1] == '' then redis.call('ZREM', KEYS[1], ARGV[2]) else redis.call('ZADD', KEYS[1], 'XX', ARGV[1], ARGV[2]) end
-if redis.call('HGET', KEYS[2], 'message') == ARGV[2] then redis.call('HSET', KEYS[2], unpack(ARGV, 3)) end
+if redis.pcall('HGET', KEYS[2], 'message') == ARGV[2] then redis.call('HSET', KEYS[2], unpack(ARGV, 3)) end
 """
 
 
@@ -45,6 +49,9 @@ class Delivery:
     last_error: str | None = None
     next_at: float | None = None
     delivered_at: float | None = None
+
+
+_UNREADABLE = Delivery("failed", last_error="RECORD_UNREADABLE")
 
 
 def _state_key(job_id: str, place: int) -> str:
@@ -105,8 +112,16 @@ class RedisOutbox:
 
     def claim(self) -> Message | None:
         """A message that is due, for this process alone for a minute; None when there is none."""
-        name: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
-        return None if name is None else Message.named(text(name))
+        while True:
+            name: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
+            if name is None:
+                return None
+            try:
+                return Message.named(text(name))
+            except ValueError:
+                self._redis.zrem(_DUE, name)
+                count(self._redis, "records_unreadable", "webhook")
+                logger.error("a message about a job has a name that cannot be read: it is dropped")
 
     def settle(self, message: Message, delivery: Delivery, outcome: str = "dropped") -> None:
         """Write down how a send went: put the message off until ``next_at``, or be done with it."""
@@ -127,21 +142,33 @@ class RedisOutbox:
         with self._redis.pipeline(transaction=False) as pipeline:
             for place in range(len(record.webhooks)):
                 pipeline.hgetall(_state_key(record.id, place))
-            return [_delivery({text(name): text(value) for name, value in held.items()}) for held in pipeline.execute()]
+            return [_delivery(held) for held in pipeline.execute(raise_on_error=False)]
 
     def waiting(self) -> int:
         """How many messages are still to be sent."""
         return int(self._redis.zcard(_DUE))
 
 
-def _delivery(found: dict[str, str]) -> Delivery:
+def _delivery(answer: Any) -> Delivery:
+    """The state that Redis holds of a message; members that are not known say nothing."""
+    if is_wrong_type(answer):
+        return _UNREADABLE
+    if isinstance(answer, Exception):
+        raise answer
+    found = {text(name): text(value) for name, value in answer.items()}
     if not found:
         return Delivery()
-    return Delivery(
-        state=cast(DeliveryState, found["state"]),
-        sends=int(found["sends"]),
-        last_status=int(found["last_status"]) if found.get("last_status") else None,
-        last_error=found.get("last_error") or None,
-        next_at=float(found["next_at"]) if found.get("next_at") else None,
-        delivered_at=float(found["delivered_at"]) if found.get("delivered_at") else None,
-    )
+    try:
+        made = Delivery(
+            state=cast(DeliveryState, found["state"]),
+            sends=int(found["sends"]),
+            last_status=int(found["last_status"]) if found.get("last_status") else None,
+            last_error=found.get("last_error") or None,
+            next_at=float(found["next_at"]) if found.get("next_at") else None,
+            delivered_at=float(found["delivered_at"]) if found.get("delivered_at") else None,
+        )
+    except (KeyError, ValueError):
+        return _UNREADABLE
+    times = (made.next_at or 0.0, made.delivered_at or 0.0)
+    is_sound = made.state in get_args(DeliveryState) and all(0 <= time < LAST_TIME for time in times)
+    return made if is_sound else _UNREADABLE

@@ -23,6 +23,7 @@ _COUNTS = {
     "job_attempts": ("Times that a job was handed to the workers.", ()),
     "jobs_finished": ("Jobs that have ended.", ("status", "verdict", "reason")),
     "imports": ("Imports that have ended.", ("state", "reason")),
+    "records_unreadable": ("Records that could not be read, by what they were of.", ("kind",)),
     "webhook_sends": ("Messages about jobs that were sent, or not.", ("outcome",)),
 }
 _TIMES = {
@@ -90,6 +91,7 @@ class _Held(Collector):
         )
         yield _gauge("workers", "Workers that have reported lately.", services.queue.live_workers())
         yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(services.redis).waiting())
+        yield _gauge("records_set_aside", "Records known to be unreadable.", services.records.unreadable.total())
         counters = Counters(services.redis)
         for name, (about, names) in _COUNTS.items():
             counter = CounterMetricFamily(f"regnf_{name}", about, labels=names)

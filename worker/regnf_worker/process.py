@@ -20,6 +20,7 @@ from rq.serializers import JSONSerializer
 from rq.utils import now
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
+from regnf_state.records import UnreadableRecordError
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import attempt_of
 from regnf_worker import kernel
@@ -142,7 +143,7 @@ class RegnfWorker(ResilientWorker):
                     f"settling job {job.id}",
                     lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
                 )
-            except (RedisError, OSError) as error:
+            except (RedisError, OSError, UnreadableRecordError) as error:
                 self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
 
         if self._context.settings.storage_url is None:

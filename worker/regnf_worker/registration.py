@@ -18,7 +18,7 @@ from regnf_state.logs import log_context
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.ownership import sha256_of
 from regnf_state.problems import problem_document
-from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
+from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.registration_request import RegistrationRequest
 from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
 from regnf_worker.context import Context
@@ -63,6 +63,9 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
             _give_back(context, job_id, attempt)
         except (RedisError, StorageUnavailableError):
             raise
+        except UnreadableRecordError as error:
+            logger.error("job %s attempt %d failed: %s", job_id, attempt, error)
+            _fail(context, job_id, attempt, problem_document(error.reason))
         except RegnfError as error:
             _fail(context, job_id, attempt, problem_document(error.reason, str(error), hint=error.hint))
         except Exception as error:

@@ -11,7 +11,7 @@ from regnf_service.fields.uploads import Received, Upload
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
-from regnf_state.records import FieldRecord, QuotaError
+from regnf_state.records import FieldRecord, QuotaError, UnreadableRecordError
 
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
@@ -24,7 +24,7 @@ def check_room(services: Services, caller: str, sha256: str, size: int | None) -
     quota = services.quota
     if size is None or (quota.fields is None and quota.stored_bytes is None):
         return
-    known = services.records.get_field(reference_of(caller, sha256))
+    known = _known(services, reference_of(caller, sha256))
     if known is not None and known.state != "rejected":
         return
     count, stored = services.records.stored(caller)
@@ -32,6 +32,19 @@ def check_room(services: Services, caller: str, sha256: str, size: int | None) -
         raise Problem("QUOTA_FIELDS", headers=CLOSE)
     if quota.stored_bytes is not None and stored + size > quota.stored_bytes:
         raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
+
+
+def _known(services: Services, reference: str) -> FieldRecord | None:
+    """The field that is held; a damaged record does not keep its bytes from being sent again.
+
+    Raises UnreadableRecordError for a record of a later release.
+    """
+    try:
+        return services.records.get_field(reference)
+    except UnreadableRecordError as error:
+        if error.newer:
+            raise
+        return None
 
 
 @dataclass(frozen=True)
@@ -55,7 +68,7 @@ async def store_upload(
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, and QuotaError.
     """
     reference = reference_of(caller, received.sha256)
-    known = await in_thread(services.records.get_field, reference)
+    known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
         return await in_thread(_keep, services, known, description)
     await upload.commit(original_key(reference))

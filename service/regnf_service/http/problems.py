@@ -22,7 +22,7 @@ from regnf_service.http.contract import allowed_methods
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.reasons import REASONS
-from regnf_state.records import QueueFullError, QuotaError, RecordError
+from regnf_state.records import QueueFullError, QuotaError, RecordError, UnreadableRecordError
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
@@ -43,6 +43,8 @@ def problem_of(error: Exception) -> Problem:
             return Problem("QUEUE_FULL", headers=RETRY_LATER)
         case QuotaError():
             return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
+        case UnreadableRecordError():
+            return Problem(error.reason, headers={"Retry-After": "60"})
         case RecordError():
             return Problem("CONFLICT")
         case RegnfError():

@@ -13,7 +13,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from regnf_service.http.middleware import is_open
 from regnf_service.http.problems import problem_response
 from regnf_service.problem import Problem
-from regnf_state.redis.documents import PREFIX, text
+from regnf_state.redis.documents import text
+from regnf_state.redis.keys import PREFIX
 
 # The server's clock, so that processes need not agree on one; a step back of it refills nothing and costs nothing.
 _TAKE = """

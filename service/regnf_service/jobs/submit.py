@@ -106,12 +106,16 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: Registra
     asked = digest(request.values())  # of all of it: another webhook is another request
     mine = f"{asked} {services.records.now()!r}"
     bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
-    bound_request, _, bound_at = bound.partition(" ")
+    bound_request, _, bound_at_text = bound.partition(" ")
+    try:
+        bound_at = float(bound_at_text)
+    except ValueError:
+        return None  # damaged: nothing is done twice, for the job's id follows from the request
     if bound_request != asked:
         raise Problem("IDEMPOTENCY_KEY_REUSED")
     known = services.records.get_job(job_id) if bound != mine else None
     # a job that has not changed since the key came up is not that call's doing: the call never got so far
-    if known is None or known.updated < float(bound_at):
+    if known is None or known.updated < bound_at:
         return None
     return known if request.webhook is None or request.webhook in known.webhooks else None
 

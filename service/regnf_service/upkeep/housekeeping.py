@@ -17,8 +17,8 @@ from redis import Redis
 from regnf_service.upkeep.lease import Term
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
-from regnf_state.records import ACTIVE, FieldRecord, JobRecord
-from regnf_state.redis.documents import PREFIX
+from regnf_state.records import ACTIVE, FieldRecord, JobRecord, UnreadableRecordError
+from regnf_state.redis.keys import PREFIX
 from regnf_state.settings import Settings
 from regnf_state.transitions import fields_of
 
@@ -101,7 +101,7 @@ class Housekeeper:
     def _forget_expired(self, term: Term) -> None:
         """Delete journal entries of jobs whose records expired while a process died."""
         for job_id in self._records.journal.jobs():
-            if self._records.get_job(job_id) is not None:
+            if self._is_known("jobs", job_id):
                 continue
             now = self._records.now()
             job = self._records.journal.recall(job_id, now)
@@ -110,13 +110,20 @@ class Housekeeper:
                 self._blobs.delete_prefix(f"jobs/{job_id}")
                 self._records.journal.forget(job_id)
 
+    def _is_known(self, top: str, name: str) -> bool:
+        """Whether there is a record, be it one that cannot be read: its files stay until the operator has looked."""
+        try:
+            known = self._records.get_job(name) if top == "jobs" else self._records.get_field(name)
+        except UnreadableRecordError:
+            return True
+        return known is not None
+
     def _drop_orphans(self, term: Term, folders: dict[str, Kept]) -> Iterator[str]:
         """Folders that were written a day ago at least and belong to no record."""
         now = self._records.now()
         for folder, kept in list(folders.items()):
             top, name = folder.split("/")
-            known = self._records.get_job(name) if top == "jobs" else self._records.get_field(name)
-            if known is None and kept.modified + _ORPHANED_AFTER_S <= now:
+            if not self._is_known(top, name) and kept.modified + _ORPHANED_AFTER_S <= now:
                 term.confirm()
                 self._blobs.delete_prefix(folder)
                 del folders[folder]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from redis import Redis
+from redis.exceptions import RedisError
 
 from regnf_service.upkeep.housekeeping import Housekeeper
 from regnf_service.upkeep.lease import Lease, LeaseLostError, Term
@@ -22,7 +23,7 @@ from regnf_state.journal.rebuild import Rebuilder
 from regnf_state.problems import problem_document
 from regnf_state.queue import JobQueue
 from regnf_state.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
-from regnf_state.redis.documents import PREFIX
+from regnf_state.redis.keys import PREFIX
 from regnf_state.settings import Settings
 
 _LEADER_KEY = f"{PREFIX}reaper"
@@ -176,6 +177,11 @@ def _note(
         action = look(record, now)
     except StaleAttemptError:
         return  # it has changed in between
+    except (RedisError, OSError, LeaseLostError):
+        raise
+    except Exception:
+        logger.exception("%s is left out of this round: an internal error", name)
+        return
     if action is not None:
         actions[action].append(name)
         logger.warning("%s: %s", name, action)

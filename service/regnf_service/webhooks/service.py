@@ -50,5 +50,8 @@ async def _deliver(deliverer: Deliverer, stopping: asyncio.Event, threads: Capac
         except RedisError as error:
             logger.warning("webhooks wait for Redis: %s", type(error).__name__)
             sent = False
+        except Exception:
+            logger.exception("an internal error ended the delivery of a message; it comes up again")
+            sent = False
         if not sent:
             await pause(_LOOK_EVERY_S, stopping)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query
 from starlette.responses import JSONResponse, Response
@@ -105,13 +105,13 @@ async def list_fields(
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
-) -> dict[str, Any]:
+) -> JSONResponse:
     before = decode_token(page_token)
     # one more than asked for tells whether there is a next page
     found = await in_thread(services.records.list_fields, label, limit + 1, before, caller)
     page = found[:limit]
     more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
-    return {"fields": [field_document(record, prefix) for record in page], "next_page_token": more}
+    return JSONResponse({"fields": [field_document(record, prefix) for record in page], "next_page_token": more})
 
 
 @router.delete(

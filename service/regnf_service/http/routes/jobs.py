@@ -86,13 +86,13 @@ def list_jobs(
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
-) -> dict[str, Any]:
+) -> JSONResponse:
     """`queue_position` is left out here: ask for the job itself."""
     found = services.records.list_jobs(status, limit + 1, decode_token(page_token), caller)
     page = found[:limit]
     more = encode_token(page[-1].created, page[-1].id) if len(found) > limit else None
     documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page]
-    return {"jobs": documents, "next_page_token": more}
+    return JSONResponse({"jobs": documents, "next_page_token": more})
 
 
 @router.get(

@@ -1,0 +1,3 @@
+"""What every key of the service begins with, whichever module it belongs to."""
+
+PREFIX = "regnf:"

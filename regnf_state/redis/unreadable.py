@@ -1,0 +1,77 @@
+"""Records that cannot be read: noted once, and set aside where they are damaged, so that everything else goes on.
+
+What a later release has written stays where it is. Anything else is renamed to regnf:quarantine:{key} for a week. A
+sorted set names both, by the time when they were found; there are at most a thousand.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+from redis import Redis
+
+from regnf_state.records import UnreadableRecordError
+from regnf_state.redis.keys import PREFIX
+
+logger = logging.getLogger(__name__)
+UNREADABLE = f"{PREFIX}unreadable"
+QUARANTINE = f"{PREFIX}quarantine:"
+KEPT_S = 7 * 24 * 3600
+_MOST = 1000
+# only what is still as it was read: another process may have put a good record in its place
+_SET_ASIDE = """
+local is_hash = redis.call('TYPE', KEYS[1]).ok == 'hash'
+if is_hash ~= (ARGV[1] == 'hash') or redis.call('EXISTS', KEYS[1]) == 0 then return 0 end
+if is_hash and (redis.call('HGET', KEYS[1], 'document') or '') ~= ARGV[2] then return 0 end
+local now = redis.call('TIME')[1]
+redis.call('ZREMRANGEBYSCORE', KEYS[2], '-inf', now - ARGV[5])
+local first = redis.call('ZADD', KEYS[2], 'NX', now, KEYS[1])
+if ARGV[3] == 'move' then
+  redis.call('RENAME', KEYS[1], ARGV[4] .. KEYS[1])
+  redis.call('EXPIRE', ARGV[4] .. KEYS[1], ARGV[5])
+end
+if first == 1 then redis.call('HINCRBY', 'regnf:counters', 'records_unreadable|' .. ARGV[7], 1) end
+while redis.call('ZCARD', KEYS[2]) > tonumber(ARGV[6]) do
+  redis.call('DEL', ARGV[4] .. redis.call('ZPOPMIN', KEYS[2])[1])
+end
+return 1 + first
+"""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a key holds of a record, as it is: a hash with these members, or something that is no hash."""
+
+    is_hash: bool
+    document: bytes | str | None = None
+    version: bytes | str | None = None
+    format: bytes | str | None = None
+
+
+class UnreadableRecords:
+    """The list of them in one Redis."""
+
+    def __init__(self, redis: Redis) -> None:
+        self._redis = redis
+        self._set_aside = redis.register_script(_SET_ASIDE)
+
+    def set_aside(self, kind: str, key: str, stored: Stored, error: UnreadableRecordError) -> bool:
+        """Note it, and rename it if it is damaged. False when it is not there any more as it was read."""
+        shape, document = ("hash" if stored.is_hash else "other"), stored.document or b""
+        move = "stay" if error.newer else "move"
+        answer: Any = self._set_aside(
+            keys=[key, UNREADABLE], args=[shape, document, move, QUARANTINE, KEPT_S, _MOST, kind]
+        )
+        if answer == 2:
+            where = "it stays where it is" if error.newer else f"it is kept as {QUARANTINE}{key} for a week"
+            logger.error("%s; %s", error, where)
+        return bool(answer)
+
+    def names(self, key: str) -> bool:
+        """Whether what is, or was, under this key is known to be unreadable."""
+        return self._redis.zscore(UNREADABLE, key) is not None
+
+    def total(self) -> int:
+        return int(self._redis.zcard(UNREADABLE))
