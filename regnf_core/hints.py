@@ -50,6 +50,11 @@ HINTS: dict[str, str] = {
     "WORKER_LOST": "Most often memory ran out. Post the same request to start it again, or use a worker with more "
     "memory.",
     "JOB_TIMEOUT": "Use fewer samples, or set a longer time limit for the service (REGNF_JOB_TIMEOUT_S).",
+    "OPTIONS_TOO_COSTLY": "Decrease the options that `errors` names. For the preset paper most often: fewer views, a "
+    "smaller image_size or a larger pixel_stride.",
+    "JOB_MEMORY_LIMIT": "Use fewer rays or samples, or a smaller field; or set a higher limit for the service "
+    "(REGNF_JOB_MEMORY_BYTES).",
+    "JOB_DISK_LIMIT": "Use fewer rays or samples, or set a higher limit for the service (REGNF_JOB_SCRATCH_BYTES).",
     "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
 }
 """Errors may carry a hint of their own, which says more."""

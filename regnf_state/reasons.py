@@ -91,6 +91,11 @@ REASONS: dict[str, Reason] = {
         422, "Invalid detection", "The box is malformed: every number finite, every edge positive, min below max."
     ),
     "INVALID_OPTIONS": Reason(422, "Invalid options", "An option is unknown, of the wrong type or out of its range."),
+    "OPTIONS_TOO_COSTLY": Reason(
+        422,
+        "Options too costly",
+        "The options multiply to more memory or time than one job may have; `errors` names them, with both numbers.",
+    ),
     "INVALID_TRANSFORM": Reason(
         422,
         "Invalid transform",
@@ -148,6 +153,12 @@ REASONS: dict[str, Reason] = {
     "JOB_TIMEOUT": Reason(500, "Job took too long", "The job exceeded its time and was stopped."),
     "WORKER_LOST": Reason(500, "Worker lost", "The worker vanished twice while it ran this job. Post it again."),
     "OUT_OF_MEMORY": Reason(500, "Out of memory", "The job needed more memory than the worker has."),
+    "JOB_MEMORY_LIMIT": Reason(
+        500, "Job over its memory", "The job needed more memory than one job may have; `limit_bytes` says how much."
+    ),
+    "JOB_DISK_LIMIT": Reason(
+        500, "Job over its disk space", "The job wrote more than one job may; `limit_bytes` says how much."
+    ),
     # the service itself
     "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
     "RECORD_UNREADABLE": Reason(

@@ -81,6 +81,11 @@ class Settings(BaseSettings):
     webhook_secrets_file: Path | None = None
     """More of them, one a line."""
     job_timeout_s: int = Field(default=900, ge=1)
+    job_memory_bytes: int | None = Field(default=None, ge=512 * MIB)
+    """Of each registration's process, beyond what its worker holds. Unset: three quarters of what the machine or its
+    control group grants, divided by the workers; 1 GiB at least."""
+    job_scratch_bytes: int = Field(default=4096 * MIB, ge=64 * MIB)
+    """Temporary files of one job, and the largest single file that it may write."""
     import_timeout_s: int = Field(default=120, ge=1)
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
     heartbeat_s: float = Field(default=5.0, gt=0)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import json
+import mmap
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +60,42 @@ class TinyEngine:
 
     def exhaust(self, report: Report) -> None:
         raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")
+
+    def fill_memory(self, report: Report) -> None:
+        """Memory of its own, until it gets no more."""
+        held = []
+        while True:
+            held.append(bytearray(16 << 20))
+
+    def fill_shared_memory(self, report: Report) -> None:
+        """Memory that the kernel does not count as the process' data."""
+        held = []
+        while True:
+            held.append(mmap.mmap(-1, 16 << 20))
+            held[-1].write(b"." * (16 << 20))
+            time.sleep(0.01)
+
+    def fill_memory_and_abort(self, report: Report) -> None:
+        """What native code does: it catches no std::bad_alloc, and aborts."""
+        held = []
+        with suppress(MemoryError):
+            while True:
+                held.append(bytearray(16 << 20))
+        os.abort()
+
+    def abort(self, report: Report) -> None:
+        os.abort()
+
+    def fill_disk(self, report: Report) -> None:
+        """Temporary files, one after the other."""
+        for number in count():
+            Path(tempfile.gettempdir(), f"{number}").write_bytes(b"." * (8 << 20))
+            time.sleep(0.01)
+
+    def write_one_large_file(self, report: Report) -> None:
+        """A file beyond the limit of a single one; it has no content, and takes no space."""
+        with Path(tempfile.gettempdir(), "large").open("wb") as file:
+            file.truncate(1 << 40)
 
     def iterate(self, report: Report) -> None:
         """Goes on until it is stopped, reporting all the while."""

@@ -90,6 +90,8 @@ class Heartbeat:
             self._note(change)
         except RedisError as error:
             logger.warning("job %s attempt %d: Redis does not answer: %s", self._job_id, self._attempt, error)
+        except MemoryError:
+            logger.warning("job %s attempt %d: no memory is left for a heartbeat", self._job_id, self._attempt)
 
     def _note(self, change: Any, *arguments: Any) -> None:
         try:

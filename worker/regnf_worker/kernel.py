@@ -33,9 +33,11 @@ def die_with_parent(parent_pid: int) -> None:
 
 
 class Exit(NamedTuple):
-    """The end of a child. ``status`` as waitpid has it; None when other code has waited for the child."""
+    """The end of a child. ``status`` as waitpid has it; None when other code has waited for the child. ``peak_memory``:
+    the most that was resident, bytes."""
 
     status: int | None
+    peak_memory: int = 0
 
 
 def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | None:
@@ -47,11 +49,11 @@ def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | None:
     select.select([ended], [], [], seconds)
     while True:
         try:
-            pid, status = os.waitpid(child, os.WNOHANG)
+            pid, status, usage = os.wait4(child, os.WNOHANG)
         except ChildProcessError:
             return Exit(None)
         if pid:
-            return Exit(status)
+            return Exit(status, usage.ru_maxrss * 1024)
         if time.monotonic() >= deadline:
             return None
         time.sleep(_EXIT_POLL_S)  # the kernel closes a process' files a moment before it can be waited for

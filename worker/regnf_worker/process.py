@@ -25,6 +25,7 @@ from regnf_state.redis.client import connect
 from regnf_state.redis.queue import attempt_of
 from regnf_worker import kernel
 from regnf_worker.context import Context
+from regnf_worker.job_limits import JobLimits
 from regnf_worker.resilient_worker import ResilientWorker
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
@@ -58,6 +59,8 @@ class RegnfWorker(ResilientWorker):
             IMPORT_QUEUE_NAME: context.settings.import_timeout_s + _IMPORT_MARGIN_S,
             QUEUE_NAME: context.settings.job_timeout_s,
         }
+        self._job_limits = JobLimits.of(context.settings)
+        self._exceeded: str | None = None
         self._started = 0.0
         self._limit_s = 0.0
         self._late = False
@@ -82,19 +85,21 @@ class RegnfWorker(ResilientWorker):
         job.timeout = self._limit_s = self._limits[queue.name]
         self._started = time.monotonic()
         self._late = self._given_back = False
+        self._exceeded = None
         oom_kills = kernel.oom_kills()
         self.begin_job(job)
         try:
-            status = self._run_child(job, queue)
+            end = self._run_child(job, queue)
         finally:
             self._scratch.empty()
         try:
-            self.finish_job(job, queue, status)
+            self.finish_job(job, queue, end.status)
         finally:
-            self._settle(job, queue, status, kernel.oom_kills() > oom_kills)
+            self._settle(job, queue, end, kernel.oom_kills() > oom_kills)
 
-    def _run_child(self, job: Any, queue: Any) -> int | None:
-        """Fork a child for the job and wait for its end. Its status, as waitpid has it; None when it is unknown."""
+    def _run_child(self, job: Any, queue: Any) -> kernel.Exit:
+        """Fork a child for the job and wait for its end."""
+        limited = _is_limited(queue)
         ended, held_by_child = os.pipe()
         parent = os.getpid()
         child = os.fork()
@@ -103,6 +108,8 @@ class RegnfWorker(ResilientWorker):
             kernel.die_with_parent(parent)
             kernel.prefer_as_oom_victim()
             self._scratch.use()
+            if limited:
+                self._job_limits.hold_here()
             self.main_work_horse(job, queue)
             os._exit(0)
         os.close(held_by_child)
@@ -111,15 +118,16 @@ class RegnfWorker(ResilientWorker):
         job.timeout = -1  # the limit is kept here, by the monotonic clock: RQ uses the wall clock
         try:
             while (exit_ := kernel.wait_for_exit(child, ended, self.job_monitoring_interval)) is None:
-                self._limit_child()
+                self._limit_child(limited)
                 self.report_running(job)
         finally:
             os.close(ended)
         self._horse_pid = 0
-        return exit_.status
+        return exit_
 
-    def _limit_child(self) -> None:
-        """Kill a child that is past its time limit, or past the time that a worker which stops grants it."""
+    def _limit_child(self, limited: bool) -> None:
+        """Kill a child that is past its time limit, past the time that a worker which stops grants it, or, ``limited``,
+        over a limit of its memory or disk space."""
         now_s = time.monotonic()
         if now_s - self._started > self._limit_s + _LATE_GRACE_S:
             self._late = True
@@ -127,13 +135,21 @@ class RegnfWorker(ResilientWorker):
         elif self._give_back_at is not None and now_s >= self._give_back_at:
             self._given_back = True
             self.kill_horse()
+        elif limited:
+            self._exceeded = self._job_limits.exceeded_by(self._horse_pid, self._scratch.folder)
+            if self._exceeded is not None:
+                self.kill_horse()
 
-    def _settle(self, job: Any, queue: Any, status: int | None, out_of_memory: bool) -> None:
+    def _settle(self, job: Any, queue: Any, ended: kernel.Exit, out_of_memory: bool) -> None:
+        status = ended.status
         end = ChildExit(
             signal=os.WTERMSIG(status) if status is not None and os.WIFSIGNALED(status) else None,
             late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
             given_back=self._given_back,
+            exceeded=self._exceeded,
+            crashed_near_limit=_is_limited(queue) and bool(status) and self._job_limits.is_near(ended.peak_memory),
+            limits=self._job_limits,
         )
         settle = self._settlers[queue.name]
 
@@ -161,3 +177,8 @@ class RegnfWorker(ResilientWorker):
     def request_force_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Told to stop again: at once."""
         self._give_back_at = time.monotonic()
+
+
+def _is_limited(queue: Any) -> bool:
+    """Whether the worker limits a job of this queue: an import's process has limits of its own."""
+    return bool(queue.name != IMPORT_QUEUE_NAME)

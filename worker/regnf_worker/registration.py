@@ -25,6 +25,7 @@ from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
 from regnf_worker.fields import Fields, FieldsNotReadyError
 from regnf_worker.heartbeat import Heartbeat
+from regnf_worker.job_limits import JobLimits, held_memory_limit, open_reserve
 from regnf_worker.models import ObjectModels
 from regnf_worker.problems import are_files_away, fault, new_incident
 from regnf_worker.retry import retry_until_available
@@ -71,12 +72,18 @@ def _run(context: Context, record: JobRecord, make_engine: Callable[[], Registra
         except Exception as error:
             if are_files_away(error):
                 raise
+            open_reserve()
             incident = new_incident()
             logger.exception("job %s attempt %d failed, incident %s", job_id, attempt, incident)
-            _fail(context, job_id, attempt, fault(error, incident))
+            _fail(context, job_id, attempt, fault(error, incident, _limits_held(context)))
         else:
             _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, manifest))
             discard_others(context.blobs, manifest)
+
+
+def _limits_held(context: Context) -> JobLimits | None:
+    """The job's limits, where they hold for this process."""
+    return JobLimits.of(context.settings) if held_memory_limit() is not None else None
 
 
 def _update(context: Context, job_id: str, attempt: int, **changes: Any) -> JobRecord:

@@ -13,6 +13,8 @@ from regnf_state.records import ACTIVE, JobRecord, StaleAttemptError
 from regnf_worker.artifacts import discard, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.imports import claim_import, reject
+from regnf_worker.job_limits import JobLimits
+from regnf_worker.problems import OVER_LIMIT, over_limit
 
 logger = logging.getLogger(__name__)
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
@@ -32,15 +34,28 @@ class ChildExit:
     out_of_memory: bool = False
     given_back: bool = False
     """The worker itself was told to stop and ended its job."""
+    exceeded: str | None = None
+    """The worker ended it for this: JOB_MEMORY_LIMIT, JOB_DISK_LIMIT."""
+    crashed_near_limit: bool = False
+    """It ended by itself, not well, after it had used most of the memory that it may: native code that gets no memory
+    aborts."""
+    limits: JobLimits | None = None
+    """Those that held for it."""
 
     @property
     def worth_another_try(self) -> bool:
         """Usually Redis or storage was away, or somebody killed it; it was neither too slow nor too large."""
-        return not self.late and (self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory))
+        if self.late or self.exceeded or self.reason() == "JOB_MEMORY_LIMIT":
+            return False
+        return self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory)
 
     def reason(self) -> str:
         if self.late:
             return "JOB_TIMEOUT"
+        if self.exceeded:
+            return self.exceeded
+        if self.crashed_near_limit and self.signal not in _FROM_OUTSIDE:
+            return "JOB_MEMORY_LIMIT"
         if self.out_of_memory and self.signal == signal.SIGKILL:
             return "OUT_OF_MEMORY"
         return "WORKER_LOST" if self.signal is not None else "INTERNAL"
@@ -109,4 +124,6 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
 
 def _problem(end: ChildExit) -> dict[str, Any]:
     reason = end.reason()
+    if end.limits is not None and reason in OVER_LIMIT:
+        return over_limit(reason, end.limits)
     return problem_document(reason, _DETAILS.get(reason))

@@ -7,6 +7,7 @@ from typing import Any
 
 from regnf_core.detections import Bounds, require_in_scene
 from regnf_core.errors import InvalidDetectionError
+from regnf_service.jobs.cost_limits import check_cost
 from regnf_service.jobs.identity import digest, job_id_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
@@ -28,8 +29,9 @@ def check_fields(services: Services, caller: str, request: RegistrationRequest, 
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
-    Raises Problem FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
+    Raises Problem OPTIONS_TOO_COSTLY, FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
     """
+    check_cost(services.settings, request)
     services.webhooks.check(caller, request.webhook)
     asked = [request.scene, *named.values()]
     scene, *found = services.records.get_fields([reference_of(caller, sha256) for sha256 in asked])

@@ -87,6 +87,7 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INVALID_REQUEST",
             "INVALID_DETECTION",
             "INVALID_OPTIONS",
+            "OPTIONS_TOO_COSTLY",
             "INVALID_TRANSFORM",
             "INITIAL_TRANSFORM_UNSUPPORTED",
             "LIBRARY_SEARCH_UNSUPPORTED",
