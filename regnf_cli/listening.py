@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import ipaddress
+import logging
 import socket
 
 from regnf_cli.start_errors import StartError
+from regnf_service.http.hosts import HostsError, allowed_hosts
 from regnf_service.tokens import TokensError, read_callers
 from regnf_service.webhooks.signing import read_secrets
 from regnf_service.webhooks.targets import AllowList
@@ -15,11 +17,15 @@ from regnf_state.settings import Settings
 _BACKLOG = 2048
 _TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
 
+_HOSTS_HINT = 'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"].'
+logger = logging.getLogger(__name__)
+
 
 def check_access(settings: Settings) -> None:
     """Raises StartError for what would let strangers in, and for callers that cannot be read.
 
-    UNAUTHENTICATED_PUBLIC_BIND: others can reach the address while no token is asked for. TOKENS_UNUSABLE: see there.
+    UNAUTHENTICATED_PUBLIC_BIND: others can reach the address while no token is asked for. TOKENS_UNUSABLE and
+    ALLOWED_HOSTS_UNUSABLE: see there.
     """
     if not settings.is_private and not settings.needs_token and not settings.allow_unauthenticated:
         raise StartError(
@@ -33,6 +39,14 @@ def check_access(settings: Settings) -> None:
         AllowList(settings.webhook_hosts)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
+    try:
+        allowed_hosts(settings)
+    except HostsError as error:
+        raise StartError(str(error), reason=error.reason, hint=_HOSTS_HINT) from error
+    if not settings.is_private and not settings.allowed_hosts:
+        logger.warning(
+            "REGNF_ALLOWED_HOSTS is empty: who calls by a name, or through a port of another host, is refused"
+        )
 
 
 def open_socket(settings: Settings) -> socket.socket:

@@ -19,6 +19,12 @@ class Reason:
 
 REASONS: dict[str, Reason] = {
     # the request as such
+    "MALFORMED_REQUEST": Reason(400, "Malformed request", "The request's head or the framing of its body is no HTTP."),
+    "REQUEST_STALLED": Reason(408, "Request stalled", "The request's head did not arrive in time. Send it at once."),
+    "HEADERS_TOO_LARGE": Reason(431, "Headers too large", "The request's head has too many lines or too many bytes."),
+    "TOO_MANY_CONNECTIONS": Reason(
+        503, "Too many connections", "The service, or your address, has the maximum number of connections. Close some."
+    ),
     "MALFORMED_JSON": Reason(
         400, "Malformed JSON", "The body is not one JSON value in UTF-8, names a member twice, or nests too deeply."
     ),
@@ -31,13 +37,28 @@ REASONS: dict[str, Reason] = {
     "INVALID_HEADER": Reason(400, "Invalid header", "A request header does not follow its grammar or its limits."),
     "INVALID_EVENT_ID": Reason(400, "Invalid event id", "`Last-Event-ID` is not the id of an event of this service."),
     "UNAUTHENTICATED": Reason(401, "Authentication required", "Send `Authorization: Bearer` with a valid token."),
+    "HOST_NOT_ALLOWED": Reason(
+        421,
+        "Host not allowed",
+        "The service does not answer under the name in `Host`. List the name in REGNF_ALLOWED_HOSTS, or use another.",
+    ),
+    "ORIGIN_NOT_ALLOWED": Reason(
+        403,
+        "Origin not allowed",
+        "A browser sent this for a page of another site. A proxy must pass `Host` on unchanged, with its port.",
+    ),
+    "TOO_MANY_WRONG_TOKENS": Reason(
+        429, "Too many wrong tokens", "Too many wrong tokens came from your address. A right one is taken at once."
+    ),
     "NOT_FOUND": Reason(404, "Not found", "There is nothing under this address. `GET /` names every address."),
     "METHOD_NOT_ALLOWED": Reason(405, "Method not allowed", "The header `Allow` lists what this address answers to."),
     "RATE_LIMITED": Reason(
         429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
     ),
     "CONFLICT": Reason(409, "Conflict", "Another client changed it at the same time. Read it again, then repeat."),
-    "REQUEST_TOO_LARGE": Reason(413, "Request too large", "The JSON or a text part exceeds the service's limit."),
+    "REQUEST_TOO_LARGE": Reason(
+        413, "Request too large", "The JSON or a text part exceeds the service's limit of bytes or of values."
+    ),
     "UNSUPPORTED_MEDIA_TYPE": Reason(
         415, "Unsupported media type", "The `Content-Type` or `Content-Encoding` is not one this address takes."
     ),
@@ -52,7 +73,9 @@ REASONS: dict[str, Reason] = {
     "DIGEST_MISMATCH": Reason(400, "Digest mismatch", "The bytes that arrived are not the bytes that were announced."),
     "UPLOAD_EMPTY": Reason(400, "Empty upload", "The upload has no bytes."),
     "UPLOAD_INCOMPLETE": Reason(400, "Incomplete upload", "The body ended before its declared length."),
-    "UPLOAD_STALLED": Reason(408, "Upload stalled", "The body sent nothing for too long. Nothing was kept."),
+    "UPLOAD_STALLED": Reason(
+        408, "Upload stalled", "The body sent nothing, or too little, for too long. Nothing was kept."
+    ),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
     "FIELD_NOT_RECOGNIZED": Reason(
         415, "Not a field file", "The file is not a field in any format that the service reads."

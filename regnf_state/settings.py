@@ -56,6 +56,11 @@ class Settings(BaseSettings):
     """More of them, one a line."""
     publish: str | None = None
     """In a container: where its port is published on the host, as compose takes it, `address:port`."""
+    allowed_hosts: frozenset[str] = frozenset()
+    """JSON list of the names under which the service is called: `host`, `host:port`, `*.domain`; `*`: any.
+
+    Loopback's names and the address that a connection arrives on need not be listed.
+    """
     allow_unauthenticated: bool = False
     """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
     max_upload_bytes: int = Field(default=4096 * MIB, ge=1)

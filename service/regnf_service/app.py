@@ -13,7 +13,9 @@ from starlette.staticfiles import StaticFiles
 from regnf_core import __version__
 from regnf_service.http import problems
 from regnf_service.http.contract import build_contract
+from regnf_service.http.hosts import allowed_hosts
 from regnf_service.http.middleware import RequestContext, TokenGate
+from regnf_service.http.origin_gate import OriginGate
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
@@ -35,7 +37,7 @@ def create_app(
 ) -> FastAPI:
     """The application over the given stores, or over those that the settings name.
 
-    Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable.
+    Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable, HostsError likewise.
     """
     settings = settings or Settings()
     callers = read_callers(settings.api_tokens, settings.api_tokens_file)
@@ -51,6 +53,7 @@ def create_app(
         openapi_url=None,
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,  # the framework's redirects lead to whatever `Host` says
         generate_unique_id_function=lambda route: route.name,
         lifespan=lifespan_of(services, metrics),
         middleware=_middleware(settings, callers, metrics, limiter),
@@ -76,7 +79,8 @@ def _middleware(
         allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
     limits = [Middleware(RateGate, limiter=limiter)] if limiter is not None else []
-    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), gate, *limits]
+    hosts = Middleware(OriginGate, hosts=allowed_hosts(settings))
+    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), hosts, gate, *limits]
 
 
 def _include_routers(app: FastAPI, **how: Any) -> None:

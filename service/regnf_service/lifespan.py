@@ -11,7 +11,9 @@ from fastapi import FastAPI
 from redis.exceptions import RedisError
 
 from regnf_service.concurrency import in_thread, pause
-from regnf_service.metrics import Metrics, served
+from regnf_service.http.hosts import allowed_hosts
+from regnf_service.metrics import Metrics
+from regnf_service.metrics_port import served
 from regnf_service.services import Services
 from regnf_service.shutdown import stopping_on_signals
 from regnf_service.upkeep.housekeeping import Housekeeper
@@ -35,7 +37,8 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
             deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
         )
         at = services.settings
-        with served(metrics, at.metrics_host, at.metrics_port), stopping_on_signals(services.stopping):
+        scrapes = served(metrics.registry, allowed_hosts(at), at.metrics_host, at.metrics_port)
+        with scrapes, stopping_on_signals(services.stopping):
             yield
         services.stopping.set()
         # the server has interrupted the uploads that were running, and does not wait until they are cleaned up

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from collections import Counter as Tally
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 
-from prometheus_client import CollectorRegistry, Counter, Histogram, start_http_server
+from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
@@ -107,21 +106,6 @@ class _Held(Collector):
 
 def _gauge(name: str, about: str, value: float) -> GaugeMetricFamily:
     return GaugeMetricFamily(f"regnf_{name}", about, value=value)
-
-
-@contextmanager
-def served(metrics: Metrics, host: str, port: int | None) -> Iterator[None]:
-    """Answer scrapes on a port of their own while the context lasts; None: not at all."""
-    if port is None:
-        yield
-        return
-    server, thread = start_http_server(port, host, metrics.registry)
-    try:
-        yield
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 class Measured:

@@ -45,4 +45,4 @@ class AppTransport(httpx.BaseTransport):
 
 def client_of(app: Any, **options: Any) -> httpx.Client:
     """A client of the application; close it, or use it as a context manager."""
-    return httpx.Client(transport=AppTransport(app), base_url="http://service", timeout=30, **options)
+    return httpx.Client(transport=AppTransport(app), base_url="http://localhost", timeout=30, **options)

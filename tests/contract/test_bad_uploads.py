@@ -159,7 +159,8 @@ def raw_call(app: Any, messages: list[dict[str, Any]], headers: list[tuple[bytes
         scope = {
             "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "PUT", "scheme": "http",
             "path": PUT_GOOD, "raw_path": PUT_GOOD.encode(), "query_string": b"", "root_path": "",
-            "headers": headers or [], "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 2),
+            "headers": [(b"host", b"localhost"), *(headers or [])],
+            "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 2),
         }  # fmt: skip
         await app(scope, receive, send)
 

@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.usefixtures("nothing_stays_live"), pytest.mark.xdist_g
 
 
 def head_of(method: str, path: str, **headers: object) -> bytes:
-    lines = [f"{method} {path} HTTP/1.1", "Host: service"]
+    lines = [f"{method} {path} HTTP/1.1", "Host: localhost"]
     lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
     return ("\r\n".join(lines) + "\r\n\r\n").encode()
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
+from regnf_service.http.hosts import AllowedHosts
 from regnf_state.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,6 +25,8 @@ FULL = ["auth.existingSecret=callers", "redis.existingSecret=redis", "autoscalin
         "webhooks.hosts={hooks.example.org,http://10.0.0.1:80}", "webhooks.existingSecret=hooks",
         "api.ingress.enabled=true", "api.ingress.host=regnf.example.org", "api.ingress.tlsSecret=tls",
         "settings.REGNF_RETENTION_S=3600"]  # fmt: skip
+
+SERVICE_DOMAINS = ("", ".lab", ".lab.svc", ".lab.svc.cluster.local")
 
 
 def helm(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -171,3 +174,14 @@ def test_what_cannot_work_is_refused(settings: list[str], said: str) -> None:
     done = helm("template", "demo", str(CHART), *sets)
     assert done.returncode != 0
     assert said in done.stderr
+
+
+def test_the_front_end_knows_its_names() -> None:
+    for settings, more in (
+        (OPEN, set()),
+        ([*FULL, "api.allowedHosts={balancer.lan}"], {"regnf.example.org", "balancer.lan"}),
+    ):
+        value = environment(pods(render(settings))["demo-api"])["REGNF_ALLOWED_HOSTS"]
+        services = {f"demo-{name}{domain}" for name in ("api", "metrics") for domain in SERVICE_DOMAINS}
+        assert set(json.loads(value)) == services | more
+        AllowedHosts(json.loads(value))

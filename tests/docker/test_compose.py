@@ -53,7 +53,7 @@ def test_what_watches_finds_what_it_watches() -> None:
     config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yaml").read_text())
     (job,) = config["scrape_configs"]
     port = services()["api"]["environment"]["REGNF_METRICS_PORT"]
-    assert (job["job_name"], job["static_configs"]) == ("regnf", [{"targets": [f"api:{port}"]}])
+    assert (job["job_name"], job["dns_sd_configs"]) == ("regnf", [{"names": ["api"], "type": "A", "port": int(port)}])
     for rules in config["rule_files"]:
         assert (ROOT / "deploy/prometheus" / Path(rules).name).is_file()
     folder = ROOT / "deploy/grafana/provisioning"

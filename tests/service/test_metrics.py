@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
-from regnf_service.metrics import Metrics, served
+from regnf_service.http.hosts import AllowedHosts
+from regnf_service.metrics import Metrics
+from regnf_service.metrics_port import served
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.counters import BOUNDS_S, Counters
@@ -155,14 +160,33 @@ def test_they_have_a_port_of_their_own(tmp_path: Path, any_redis: Redis) -> None
     probe.shutdown()
     probe.server_close()
     thread.join()
-    with served(metrics, "127.0.0.1", port):
+    hosts = AllowedHosts({"api"})
+    with served(metrics.registry, hosts, "127.0.0.1", port):
         answer = httpx.get(f"http://127.0.0.1:{port}/metrics")
         assert answer.headers["content-type"].startswith("text/plain")
         assert ("regnf_uploads_active",) in values(answer.text)
+        assert answer.headers["cross-origin-resource-policy"] == "same-origin"
+        for headers, status in (
+            ({"Host": "evil.example"}, 421),
+            ({"Host": "localhost", "Origin": "http://evil.example"}, 403),
+            ({"Sec-Fetch-Site": "cross-site"}, 403),
+            ({"Host": "api:9464"}, 200),
+        ):
+            assert httpx.get(f"http://127.0.0.1:{port}/metrics", headers=headers).status_code == status
     with pytest.raises(httpx.ConnectError):
         httpx.get(f"http://127.0.0.1:{port}/metrics")
-    with served(metrics, "127.0.0.1", None):
+    with served(metrics.registry, hosts, "127.0.0.1", None):
         pass
+
+
+def test_silent_connections_do_not_fill_the_metrics_port(tmp_path: Path, any_redis: Redis) -> None:
+    metrics = make_world(tmp_path, any_redis).app.state.metrics
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with served(metrics.registry, AllowedHosts(()), "127.0.0.1", port), ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(17)]
+        assert silent[-1].recv(1) == b""
+        assert threading.active_count() < 40
 
 
 def test_the_verdict_is_kept_with_the_job(redis: Redis) -> None:

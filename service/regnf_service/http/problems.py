@@ -19,6 +19,7 @@ from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
 from regnf_service.http.contract import allowed_methods
+from regnf_service.http.security_headers import SECURITY_HEADERS
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.reasons import REASONS
@@ -71,7 +72,7 @@ def _query_problem(error: RequestValidationError) -> Problem:
 def problem_response(problem: Problem, scope: Mapping[str, Any]) -> JSONResponse:
     """The answer to send, carrying the request's id in body and header."""
     request_id = scope.get("state", {}).get("request_id")
-    headers = {"Cache-Control": "no-store"} | problem.headers
+    headers = SECURITY_HEADERS | problem.headers  # an internal error is answered outside of the middleware
     if request_id is not None:
         headers["X-Request-ID"] = request_id
     instance = json_instance(scope.get("path", ""))

@@ -63,3 +63,18 @@ envFrom:
 - name: tmp
   emptyDir: {sizeLimit: 1Gi}
 {{- end -}}
+
+{{/* Under which names the front end is called: its services', the ingress' and those of the values. Probes use addresses. */}}
+{{- define "regnf.allowedHosts" -}}
+{{- $hosts := list -}}
+{{- range list "api" "metrics" -}}
+{{- $service := printf "%s-%s" (include "regnf.name" $) . -}}
+{{- range list "" (printf ".%s" $.Release.Namespace) (printf ".%s.svc" $.Release.Namespace) (printf ".%s.svc.cluster.local" $.Release.Namespace) -}}
+{{- $hosts = append $hosts (printf "%s%s" $service .) -}}
+{{- end -}}
+{{- end -}}
+{{- if .Values.api.ingress.enabled -}}
+{{- $hosts = append $hosts .Values.api.ingress.host -}}
+{{- end -}}
+{{- concat $hosts .Values.api.allowedHosts | uniq | toJson -}}
+{{- end -}}

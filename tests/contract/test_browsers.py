@@ -1,0 +1,202 @@
+"""Other web pages: what a browser sends for them is refused, whatever they try, with tokens and without."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import anyio
+import httpx
+import pytest
+from fastapi import FastAPI
+from redis import Redis
+
+from regnf_service.http.security_headers import SECURITY_HEADERS
+from tests.contract.world import NOBODY, World, assert_refused, make_world
+
+OWN = "http://localhost"
+TOKEN = {"Authorization": "Bearer open-sesame-open-sesame"}
+FOREIGN: list[dict[str, str]] = [
+    {"Origin": "http://evil.example"},
+    {"Origin": "null"},
+    {"Origin": "http://localhost:9999"},
+    {"Origin": "http://localhost.evil.example"},
+    {"Origin": "http://evil@localhost"},
+    {"Origin": "http://localhost/"},
+    {"Origin": "file://"},
+    {"Origin": "chrome-extension://localhost"},
+    {"Origin": ""},
+    {"Origin": f"{OWN} http://evil.example"},
+    {"Sec-Fetch-Site": "cross-site"},
+    {"Sec-Fetch-Site": "same-site"},
+    {"Sec-Fetch-Site": "anything"},
+    {"Origin": OWN, "Sec-Fetch-Site": "cross-site"},
+    {"Origin": "http://evil.example", "Sec-Fetch-Site": "same-origin"},
+]
+CALLS = [
+    ("GET", "/fields"), ("GET", "/jobs"), ("GET", f"/jobs/{NOBODY}/artifacts/trace.json"), ("POST", "/register"),
+    ("POST", "/fields"), ("PUT", f"/fields/{NOBODY * 2}"), ("DELETE", f"/fields/{NOBODY * 2}"),
+    ("POST", f"/jobs/{NOBODY}/cancel"), ("POST", f"/v1/jobs/{NOBODY}/cancel"), ("OPTIONS", "/register"),
+    ("GET", "/healthz"), ("GET", "/static/js/app.js"), ("GET", "/nowhere"),
+]  # fmt: skip
+STRANGERS = [
+    "evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "evil-localhost", "localhost.", "a@localhost",
+    "localhost:80:80", "localhost:http", "localhost:0", "localhost:65536", "localhost:", "localhost,evil.example",
+    "localhost/", "localhost#", "localhost evil.example", "127.1", "2130706433", "0x7f000001", "0177.0.0.1", "10.0.0.5",
+    "[::1", "::1", "[::1%25eth0]", "[127.0.0.1]", "xn--lcalhost-abc", "", ":80", "*", "0.0.0.0", "[::]",
+    "a" * 300, "evil.localhost", "service.internal",
+]  # fmt: skip
+
+
+@pytest.fixture(params=["without tokens", "with tokens"])
+def browsed(request: pytest.FixtureRequest, tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+    guarded = request.param == "with tokens"
+    settings = {"api_tokens": frozenset({"lab:open-sesame-open-sesame"})} if guarded else {}
+    made = make_world(tmp_path, any_redis, **settings)
+    if guarded:
+        made.client.headers.update(TOKEN)
+    with made.client:
+        yield made
+
+
+def call(client: httpx.Client, method: str, path: str, **headers: str) -> httpx.Response:
+    return client.request(method, path, headers=headers)
+
+
+@pytest.mark.parametrize(("method", "path"), CALLS)
+def test_nothing_is_done_for_a_page_of_another_site(browsed: World, method: str, path: str) -> None:
+    for headers in FOREIGN:
+        assert_refused(call(browsed.client, method, path, **headers), 403, "ORIGIN_NOT_ALLOWED")
+
+
+@pytest.mark.parametrize("host", STRANGERS)
+def test_a_name_that_is_not_the_services_is_refused(browsed: World, host: str) -> None:
+    for method, path in (("GET", "/fields"), ("POST", "/register"), ("DELETE", f"/fields/{NOBODY * 2}")):
+        assert_refused(call(browsed.client, method, path, Host=host), 421, "HOST_NOT_ALLOWED")
+    answer = call(browsed.client, "GET", "/fields", Host=host, **{"X-Forwarded-Host": "localhost", "Origin": OWN})
+    assert_refused(answer, 421, "HOST_NOT_ALLOWED")
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "LOCALHOST:8080", "127.0.0.1", "127.8.9.10:1", "[::1]", "[::ffff:127.0.0.1]:80"]
+)
+def test_loopback_needs_no_list(browsed: World, host: str) -> None:
+    assert call(browsed.client, "GET", "/fields", Host=host).status_code == 200
+
+
+@pytest.mark.parametrize("host", ["", "localhost"])
+def test_two_hosts_or_none_are_refused(browsed: World, host: str) -> None:
+    given = [(b"host", b"localhost"), (b"host", host.encode())] if host else []
+    assert bare_call(browsed.app, "/fields", given) == 421
+    assert bare_call(browsed.app, "http://evil.example/fields", [(b"host", b"localhost")]) == 421
+
+
+def bare_call(app: FastAPI, path: str, headers: list[tuple[bytes, bytes]], kind: str = "http") -> int:
+    """The status of the answer, or the code with which a web socket is closed."""
+    sent: list[dict[str, object]] = []
+
+    async def receive() -> dict[str, object]:
+        return {"type": "websocket.connect"} if kind == "websocket" else {"type": "http.request", "body": b""}
+
+    async def send(message: dict[str, object]) -> None:
+        sent.append(message)
+
+    scope = {
+        "type": kind, "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "GET", "scheme": "http",
+        "path": path, "raw_path": path.encode(), "query_string": b"", "root_path": "", "headers": [*headers, *AS_TOKEN],
+        "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 2), "subprotocols": [],
+    }  # fmt: skip
+    anyio.run(app, scope, receive, send)
+    return int(sent[0].get("status") or sent[0]["code"])  # type: ignore[call-overload]
+
+
+AS_TOKEN = [(b"authorization", TOKEN["Authorization"].encode())]
+
+
+def test_a_web_socket_is_refused(browsed: World) -> None:
+    assert bare_call(browsed.app, "/fields", [(b"host", b"localhost")], "websocket") == 1008
+
+
+def test_the_operator_names_hosts(tmp_path: Path, any_redis: Redis) -> None:
+    listed = frozenset({"Fields.example.org", "api:8080", "*.lab.example.org", "[2001:db8::1]"})
+    with make_world(tmp_path, any_redis, allowed_hosts=listed).client as client:
+        for host in ("fields.example.org:444", "api:8080", "a.b.lab.example.org", "[2001:DB8:0::1]:80"):
+            assert call(client, "GET", "/fields", Host=host).status_code == 200, host
+        for host in ("api", "api:80", "lab.example.org", "evillab.example.org", "x.fields.example.org"):
+            assert_refused(call(client, "GET", "/fields", Host=host), 421, "HOST_NOT_ALLOWED")
+        # a neighbor below the same domain, or behind another port, is another site
+        for origin in ("https://b.lab.example.org", "https://fields.example.org", "https://a.lab.example.org:8443"):
+            refused = call(client, "POST", "/register", Host="a.lab.example.org", Origin=origin)
+            assert_refused(refused, 403, "ORIGIN_NOT_ALLOWED")
+        own = call(client, "POST", "/register", Host="a.lab.example.org", Origin="https://a.lab.example.org")
+        assert_refused(own, 415, "UNSUPPORTED_MEDIA_TYPE")
+
+
+def test_any_host_is_a_choice_and_says_nothing_of_origins(tmp_path: Path, any_redis: Redis) -> None:
+    with make_world(tmp_path, any_redis, allowed_hosts=frozenset({"*"})).client as client:
+        assert call(client, "GET", "/fields", Host="whatever.example").status_code == 200
+        foreign = call(client, "GET", "/fields", Host="whatever.example", Origin="http://evil.example")
+        assert_refused(foreign, 403, "ORIGIN_NOT_ALLOWED")
+
+
+@pytest.mark.parametrize(
+    ("settings", "host"),
+    [
+        ({"publish": "192.168.1.5:8080", "api_tokens": frozenset({"lab:open-sesame-open-sesame"})}, "192.168.1.5:8080"),
+        ({"host": "fields.lan", "api_tokens": frozenset({"lab:open-sesame-open-sesame"})}, "fields.lan:8080"),
+    ],
+)
+def test_where_it_was_told_to_listen_it_answers(
+    tmp_path: Path, any_redis: Redis, settings: dict[str, object], host: str
+) -> None:
+    with make_world(tmp_path, any_redis, **settings).client as client:
+        assert call(client, "GET", "/fields", Host=host, **TOKEN).status_code == 200
+        neighbor = {"Origin": f"http://{host.partition(':')[0]}"}
+        assert_refused(call(client, "GET", "/fields", Host=host, **TOKEN, **neighbor), 403, "ORIGIN_NOT_ALLOWED")
+
+
+def test_the_page_itself_and_programs_go_on(world: World) -> None:
+    job = world.submit()
+    own = {"Sec-Fetch-Site": "same-origin", "Sec-Fetch-Mode": "cors"}
+    assert call(world.client, "GET", f"/jobs/{job}", **own).status_code == 200
+    assert call(world.client, "POST", f"/jobs/{job}/cancel", Origin=OWN, **own).status_code == 202
+
+
+def test_a_link_leads_to_the_pages_and_to_nothing_else(world: World) -> None:
+    job = world.submit()
+    visit = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+    for path in (f"/jobs/{job}/view", f"/v1/jobs/{job}/view", "/docs"):
+        assert call(world.client, "GET", path, **visit).status_code == 200
+        framed = visit | {"Sec-Fetch-Dest": "iframe"}
+        assert_refused(call(world.client, "GET", path, **framed), 403, "ORIGIN_NOT_ALLOWED")
+    assert_refused(call(world.client, "GET", f"/jobs/{job}", **visit), 403, "ORIGIN_NOT_ALLOWED")
+    assert_refused(call(world.client, "POST", f"/jobs/{job}/view", **visit), 403, "ORIGIN_NOT_ALLOWED")
+
+
+def test_every_answer_has_its_headers(world: World) -> None:
+    job = world.submit()
+    world.succeed(job)
+    paths = ["/", "/docs", "/healthz", "/nowhere", f"/jobs/{job}", f"/jobs/{job}/view", f"/jobs/{job}/result"]
+    paths += ["/static/js/app.js", "/static/none", "/fields", "/fields?nothing=1", f"/jobs/{job}/artifacts/result.json"]
+    answers = [world.client.get(path) for path in paths] + [call(world.client, "GET", "/jobs", Host="evil.example")]
+    for answer in answers:
+        policy = answer.headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in policy
+        assert "unsafe" not in policy
+        for name in SECURITY_HEADERS.keys() - {"Content-Security-Policy", "Cache-Control"}:
+            assert answer.headers[name] == SECURITY_HEADERS[name], (answer.url, name)
+        assert answer.headers.get_list("cache-control"), answer.url
+
+
+def test_an_internal_error_has_them_too(browsed: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(browsed.records, "list_jobs", None)
+    answer = browsed.client.get("/jobs")
+    assert_refused(answer, 500, "INTERNAL")
+    assert {name: answer.headers[name] for name in SECURITY_HEADERS} == SECURITY_HEADERS
+
+
+def test_nothing_redirects_to_whatever_host_says(browsed: World) -> None:
+    for path in ("/fields/", "/jobs/", "/docs/", "/static", "/v1", "/v1/", "//evil.example/..", "/static/../static"):
+        answer = browsed.client.get(path)
+        assert answer.status_code in (200, 404), path
+        assert "location" not in answer.headers
