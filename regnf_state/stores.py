@@ -10,6 +10,7 @@ from regnf_state.blobs.base import BlobStore
 from regnf_state.blobs.open import open_blobs
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
+from regnf_state.redis.bounded_client import connect_bounded
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
@@ -31,14 +32,16 @@ class Stores:
     queue: JobQueue
 
 
-def open_stores(settings: Settings, *, retries: int, storage_wait_s: float, existing: bool = False) -> Stores:
+def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: float, existing: bool = False) -> Stores:
     """The stores that the settings name. Raises NoRedisError.
 
-    A command to Redis is tried again ``retries`` times, and a storage that is away is waited for ``storage_wait_s``
-    seconds. ``existing``: for a job, which makes no storage of its own where that of its worker is away.
+    A command to Redis is tried again ``retries`` times; None: for four seconds at most, and not at all while Redis
+    gives no answer. A storage that is away is waited for ``storage_wait_s`` seconds. ``existing``: for a job, which
+    makes no storage of its own where that of its worker is away.
     """
     if settings.redis_url is None:
         raise NoRedisError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
-    redis = connect(settings.redis_url, retries=retries)
+    url = settings.redis_url
+    redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
     return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, RqJobQueue(redis))

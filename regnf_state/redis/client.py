@@ -1,4 +1,7 @@
-"""How regnf talks to Redis: explicit time limits, health checks, retries with back-off."""
+"""How workers and tools talk to Redis: explicit time limits, health checks, retries with back-off.
+
+The API has a client of its own, whose calls end sooner: regnf_state.redis.bounded_client.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from redis.retry import Retry
 
 SOCKET_TIMEOUT_S = 10.0
 RETRIES = 6
-"""About four seconds in all."""
+"""About four seconds in all, where a server refuses connections; each attempt at one that is silent takes ten."""
 
 
 def connect(url: str, *, retries: int = RETRIES, socket_timeout_s: float = SOCKET_TIMEOUT_S) -> Redis:

@@ -24,7 +24,6 @@ from regnf_service.metrics import Measured, Metrics
 from regnf_service.services import Services
 from regnf_service.tokens import Callers, read_callers
 from regnf_service.webhooks.service import webhooks_of
-from regnf_state.redis.client import RETRIES
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores, open_stores
 
@@ -41,7 +40,7 @@ def create_app(
     """
     settings = settings or Settings()
     callers = read_callers(settings.api_tokens, settings.api_tokens_file)
-    stores = stores or open_stores(settings, retries=RETRIES, storage_wait_s=_STORAGE_WAIT_S)
+    stores = stores or open_stores(settings, retries=None, storage_wait_s=_STORAGE_WAIT_S)
     if limiter is None and settings.calls_per_s:
         limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
     webhooks = webhooks_of(settings, stores.redis)

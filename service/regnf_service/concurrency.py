@@ -6,21 +6,45 @@ import asyncio
 import random
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from functools import partial, wraps
+from typing import Any, ParamSpec, TypeVar
 
-from anyio import to_thread
+from anyio import CapacityLimiter, to_thread
+from anyio.lowlevel import RunVar
 
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 
 _LOOK_EVERY_S = 0.02
+_STORE_THREADS = 40
+_threads: RunVar[CapacityLimiter] = RunVar("store_threads")
+_Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+
+
+def _store_threads() -> CapacityLimiter:
+    """The threads for calls of stores. When all of them wait, what needs no store is still answered."""
+    try:
+        return _threads.get()
+    except LookupError:
+        _threads.set(CapacityLimiter(_STORE_THREADS))
+        return _threads.get()
 
 
 async def in_thread(work: Callable[..., _Result], *arguments: Any) -> _Result:
     """Run blocking work, a call of a store, in a thread."""
-    return await to_thread.run_sync(work, *arguments)
+    return await to_thread.run_sync(work, *arguments, limiter=_store_threads())
+
+
+def blocking(route: Callable[_Given, _Result]) -> Callable[_Given, Awaitable[_Result]]:
+    """A route that calls stores, run in a thread of theirs. The framework would take one that everything shares."""
+
+    @wraps(route)
+    async def run(*args: _Given.args, **kwargs: _Given.kwargs) -> _Result:
+        return await in_thread(partial(route, *args, **kwargs))
+
+    return run
 
 
 async def pause(seconds: float, stopping: asyncio.Event) -> bool:

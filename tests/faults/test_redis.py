@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -115,6 +117,32 @@ def test_redis_out_of_memory(house: House) -> None:
         again = house.client.post("/register", json=request)
         assert again.status_code == 202, again.text
         check_promise(house, [job_id, again.json()["id"]])
+    assert done[job_id]["attempts"] == 1
+    assert worker.poll() is None
+
+
+def test_redis_frozen(house: House) -> None:
+    """Calls are told 503 within four seconds, then at once; pages come, streams end; then everything goes on."""
+    _, worker = house.start_both()
+    job_id = house.running()
+    assert house.server.process is not None
+    with fault() as one, house.client.stream("GET", f"/jobs/{job_id}/events", timeout=20) as stream:
+        lines = stream.iter_lines()
+        next(lines)
+        house.server.process.send_signal(signal.SIGSTOP)
+        with ThreadPoolExecutor(60) as pool:
+            asked = [pool.submit(house.client.get, f"/jobs/{job_id}", timeout=20) for _ in range(60)]
+            assert house.client.get("/static/favicon.svg", timeout=20).status_code == 200
+            assert house.client.get("/healthz", timeout=20).status_code == 200
+            answers = [each.result() for each in asked]
+        assert {(each.status_code, each.json()["reason"]) for each in answers} == {(503, "STORE_UNAVAILABLE")}
+        assert all("Retry-After" in each.headers for each in answers)
+        list(lines)  # the stream ends, and whole: a broken one raises
+        house.server.process.send_signal(signal.SIGCONT)
+        eventually(lambda: house.client.get(f"/jobs/{job_id}").status_code == 200, house.log)
+        one.over()
+        house.let_go()
+        done = check_promise(house, [job_id])
     assert done[job_id]["attempts"] == 1
     assert worker.poll() is None
 

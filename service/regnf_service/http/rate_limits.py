@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from anyio import to_thread
 from redis import Redis
 from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from regnf_service.concurrency import in_thread
 from regnf_service.http.middleware import is_open
 from regnf_service.http.problems import problem_response
 from regnf_service.problem import Problem
@@ -63,7 +63,7 @@ class RateGate:
         wait = 0.0
         if scope["type"] == "http" and not is_open(scope):
             try:
-                wait = await to_thread.run_sync(self._limiter.take, scope["state"]["caller"])
+                wait = await in_thread(self._limiter.take, scope["state"]["caller"])
             except RedisError:
                 wait = 0.0  # whatever the call needs of Redis will say that it is away
         if wait > 0:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import AsyncIterator
 
+from redis.exceptions import RedisError
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
@@ -14,6 +16,7 @@ from regnf_service.services import Services
 from regnf_state.records import FINISHED, JobEvent
 
 MEDIA_TYPE = "text/event-stream"
+logger = logging.getLogger(__name__)
 _HEARTBEAT_S = 10.0
 _RECONNECT_MS = 2000
 
@@ -24,14 +27,19 @@ def format_event(event: JobEvent) -> str:
 
 
 async def event_stream(services: Services, job_id: str, after: str | None) -> AsyncIterator[str]:
-    """The job's events after the given one, until it has finished, is gone, or the service stops.
+    """The job's events after the given one, until it has finished, is gone, a store is away, or the service stops.
 
     A comment every ten seconds keeps proxies from taking the connection for dead.
     """
     yield f"retry: {_RECONNECT_MS}\n\n"
     last_sent = time.monotonic()
     while not services.stopping.is_set():
-        record, events = await services.job_watch.news(job_id, after)
+        try:
+            record, events = await services.job_watch.news(job_id, after)
+        except (RedisError, OSError) as error:
+            # the client connects again, and is told when with the 503 that it then gets
+            logger.warning("an event stream ends: a store does not answer: %s", type(error).__name__)
+            return
         for event in events:
             yield format_event(event)
             after = event.id

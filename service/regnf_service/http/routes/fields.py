@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query
 from starlette.responses import JSONResponse, Response
 
 from regnf_core.importing.gate.picture import PICTURE_NAME
-from regnf_service.concurrency import in_thread
+from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
@@ -78,6 +78,7 @@ async def get_field(
         **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
     },
 )
+@blocking
 def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
     """The surface from two sides, and its section with lines of equal distance: orange is inside."""
     record = _require(services, caller, sha256)
@@ -121,6 +122,7 @@ async def list_fields(
     response_class=Response,
     responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"),
 )
+@blocking
 def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
     """Refused while an active job needs the field. Results of finished jobs stay."""
     reference = _require(services, caller, sha256).sha256

@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 from fastapi import APIRouter, Header, Query
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from regnf_service.concurrency import in_thread
+from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import sse
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.etags import IfNoneMatchDep
@@ -79,6 +79,7 @@ def _etag(seen: _Seen) -> str:
     response_model=JobPage,
     responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
 )
+@blocking
 def list_jobs(
     services: ServicesDep,
     caller: CallerDep,
@@ -200,6 +201,7 @@ async def cancel_job(
     response_class=Response,
     responses=refusals("JOB_NOT_FOUND", "JOB_ACTIVE", "JOB_EXPIRED"),
 )
+@blocking
 def delete_job(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
     """Only a finished job: cancel it first."""
     if find_job(services, id, caller).status in ACTIVE:

@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from regnf_core import __version__
+from regnf_service.concurrency import blocking
 from regnf_service.http.contract import contract_yaml
 from regnf_service.http.dependencies import PrefixDep, ServicesDep
 from regnf_service.http.docs_page import STYLE_POLICY, render_docs
@@ -39,6 +40,7 @@ async def healthz() -> dict[str, str]:
     response_model=ReadyDocument,
     responses=refusals("INVALID_QUERY", "NOT_READY"),
 )
+@blocking
 def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
     """Records, storage and at least one live worker. A 503 has the same `checks`, and its detail names what is missing.
 

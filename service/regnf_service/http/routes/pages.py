@@ -7,6 +7,7 @@ from pathlib import Path
 from fastapi import APIRouter
 from starlette.responses import FileResponse
 
+from regnf_service.concurrency import blocking
 from regnf_service.http.dependencies import ServicesDep
 from regnf_service.http.routes.documentation import get_and_head, refusals
 from regnf_service.jobs.lookup import find_job
@@ -27,6 +28,7 @@ PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-acti
         **refusals("JOB_NOT_FOUND", "JOB_EXPIRED"),
     },
 )
+@blocking
 def view(id: str, services: ServicesDep) -> FileResponse:  # noqa: A002
     """Shows progress while the job is active. Where tokens are needed, the page asks for one."""
     if not services.settings.needs_token:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Header
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from regnf_service.concurrency import in_thread
+from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.ranges import ByteRange, parse_range
@@ -66,6 +66,7 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
         ),
     },
 )
+@blocking
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
     """A failed job has no result: the member `error` of the 409 is the job's own problem."""
     manifest = _manifest(services, id, caller)
