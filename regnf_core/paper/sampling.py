@@ -5,6 +5,8 @@ Cameras look at the object from several sides; every ray returns the first point
 
 from __future__ import annotations
 
+from itertools import islice
+
 import torch
 from torch import Tensor
 
@@ -12,14 +14,17 @@ from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.options import Axis, SamplingOptions
-from regnf_core.surface.cameras import axis_vector, camera_positions, cast_rays
+from regnf_core.surface.cameras import Rays, axis_vector, camera_positions, cast_rays
 from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
-from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, shortest_step
+from regnf_core.surface.sphere_tracing import clip_to_region, first_hits, points_in_order, shortest_step
 from regnf_core.surface.surface_bounds import surface_bounds
 
 _BOX_MARGIN = 0.05  # the box is grown by this share of its size before points outside are dropped
 _TOLERANCE_SHARE = 1e-3  # of the box's diagonal: largest |S| at a returned point
 _CLEARANCE = 0.75  # a camera keeps this many box diagonals from the center at least: outside the box, with room to see
+
+_PARTS_OF_A_GROUP = 16
+"""Four million rays, at about 100 bytes each while they are followed."""
 
 
 def sample_scene(
@@ -65,17 +70,36 @@ def _camera_positions(box: OrientedBox, distance: float, views: int, turn: float
 
 
 def _trace_views(field: SdfField, box: OrientedBox, positions: Tensor, options: SamplingOptions) -> Tensor:
-    """(M, 3) first surface points, seen from the cameras at ``positions`` (V, 3), within the slightly grown box."""
+    """(M, 3) first surface points, seen from the cameras at ``positions`` (V, 3), within the slightly grown box.
+
+    Memory is bounded: rays are cast in parts and followed in groups. The groups are as large as they are because
+    networks round a little differently when a point is evaluated among others; one group is the usual case.
+    """
     grown = OrientedBox(box.center, box.size * (1.0 + _BOX_MARGIN), box.rotation)
-    rays = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)
-    rays = type(rays)(rays.origins.to(field.device), rays.directions.to(field.device))
+    parts = cast_rays(positions, box.center, grown.corners(), options.image_size, options.pixel_stride)
+    clipped = (_within(field, grown, rays) for rays in parts)
+    step, tolerance = shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal
+    found = []
+    while group := list(islice(clipped, _PARTS_OF_A_GROUP)):
+        found.append(first_hits(field, *_joined(group), step, tolerance))
+    points = points_in_order(found)
+    return points[grown.contains(points)]
+
+
+def _within(field: SdfField, grown: OrientedBox, rays: Rays) -> tuple[Rays, Tensor, Tensor]:
+    """The rays, and from where to where (N,) each is followed: a ray that misses the box, nowhere."""
+    rays = Rays(rays.origins.to(field.device), rays.directions.to(field.device))
     entry, bounds_exit = clip_to_region(rays, field.bounds[0], field.bounds[1])
-    local = type(rays)(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))
+    local = Rays(grown.to_local(rays.origins), rays.directions @ grown.rotation.to(rays.directions))
     box_entry, box_exit = clip_to_region(local, -grown.size / 2, grown.size / 2)
     # A ray starts at the camera, since surface before the box occludes it, and ends where it leaves the box.
-    last = torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
-    hits = first_hits(field, rays, entry, last, shortest_step(box.diagonal), _TOLERANCE_SHARE * box.diagonal)
-    return hits.points[grown.contains(hits.points)]
+    return rays, entry, torch.where(box_exit > box_entry, torch.minimum(bounds_exit, box_exit), -1.0)
+
+
+def _joined(parts: list[tuple[Rays, Tensor, Tensor]]) -> tuple[Rays, Tensor, Tensor]:
+    rays, entries, exits = zip(*parts, strict=True)
+    joined = Rays(torch.cat([one.origins for one in rays]), torch.cat([one.directions for one in rays]))
+    return joined, torch.cat(entries), torch.cat(exits)
 
 
 def in_detection(points: Tensor, detection: OrientedBox, options: SamplingOptions, up_axis: Axis = "z") -> Tensor:

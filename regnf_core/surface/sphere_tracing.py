@@ -7,6 +7,7 @@ is refined.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,14 +22,24 @@ _STEP_SHARE = 0.9  # of the distance to the surface: neural fields overstate it 
 _MIN_STEPS_ACROSS = 1000  # the shortest step, as a fraction of the region's diagonal: thinner sheets may be missed
 _MAX_MARCH_STEPS = 400
 _REFINEMENTS = 8
+_POINTS_AT_ONCE = 1 << 18
+"""Bounds memory. A multiple of how many points fields evaluate at once: the same points make up each evaluation."""
 
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays first meet the surface: points (M, 3) float32, and the indices (M,) int64 of their rays."""
+    """Where rays first meet the surface: points (M, 3) float32, the indices (M,) int64 of their rays, and the step
+    (M,) int64 of the march that crossed the surface. Ordered by step, then by ray."""
 
     points: Tensor
     rays: Tensor
+    steps: Tensor
+
+
+def points_in_order(parts: Sequence[Hits]) -> Tensor:
+    """The points (M, 3) of rays that were followed in parts, in the order as if all had been followed together."""
+    order = torch.cat([part.steps for part in parts]).argsort(stable=True)
+    return torch.cat([part.points for part in parts])[order]
 
 
 def clip_to_region(rays: Rays, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,38 +61,46 @@ def first_hits(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_st
     Rays that start inside matter are dropped: their first crossing would be a back face. Rays whose zero is not found
     to ``tolerance`` (field units) are dropped too: there the field jumps, and has no surface.
     """
-    bracket = _march(field, rays, entry, exit_, min_step)
-    index, near, far, s_near, s_far = bracket
+    steps, index, near, far, s_near, s_far = _march(field, rays, entry, exit_, min_step)
     t, s = _refine_zero(field, rays, index, near, far, s_near, s_far)
     kept = s.abs() <= tolerance
     index, t = index[kept], t[kept]
-    return Hits(rays.origins[index] + t.unsqueeze(-1) * rays.directions[index], index)
+    return Hits(rays.origins[index] + t.unsqueeze(-1) * rays.directions[index], index, steps[kept])
+
+
+def _distance_along(field: SdfField, rays: Rays, index: Tensor, t: Tensor) -> Tensor:
+    """Signed distance (N,) on the rays with these numbers (N,), at ``t`` (N,) along each."""
+    parts = zip(torch.split(index, _POINTS_AT_ONCE), torch.split(t, _POINTS_AT_ONCE), strict=True)
+    found = [finite_distance(field, rays.origins[i] + along.unsqueeze(-1) * rays.directions[i]) for i, along in parts]
+    return found[0] if len(found) == 1 else torch.cat(found)
 
 
 def _march(
     field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Step until the sign changes. Ray indices, then distances along the ray and field values before and behind it."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Step until the sign changes. Numbers of the steps and of the rays, then distances along the ray and field values
+    before and behind it."""
     index = (exit_ > entry).nonzero().squeeze(-1)
     t = entry[index]
-    s = finite_distance(field, rays.origins[index] + t.unsqueeze(-1) * rays.directions[index])
+    s = _distance_along(field, rays, index, t)
     outside = s > 0
     index, t, s = index[outside], t[outside], s[outside]
     found: list[tuple[Tensor, ...]] = []
-    for _ in range(_MAX_MARCH_STEPS):
+    for step in range(_MAX_MARCH_STEPS):
         if index.numel() == 0:
             break
         ahead = t + (_STEP_SHARE * s).clamp_min(min_step)
-        s_ahead = finite_distance(field, rays.origins[index] + ahead.unsqueeze(-1) * rays.directions[index])
+        s_ahead = _distance_along(field, rays, index, ahead)
         crossed = s_ahead <= 0
-        found.append((index[crossed], t[crossed], ahead[crossed], s[crossed], s_ahead[crossed]))
+        steps = torch.full_like(index[crossed], step)
+        found.append((steps, index[crossed], t[crossed], ahead[crossed], s[crossed], s_ahead[crossed]))
         continuing = ~crossed & (ahead < exit_[index])
         index, t, s = index[continuing], ahead[continuing], s_ahead[continuing]
     if not found:
         empty = torch.empty(0, device=rays.origins.device)
-        return index, empty, empty, empty, empty
-    index, near, far, s_near, s_far = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return index, near, far, s_near, s_far
+        return index, index, empty, empty, empty, empty
+    steps, index, near, far, s_near, s_far = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return steps, index, near, far, s_near, s_far
 
 
 def _refine_zero(
@@ -97,7 +116,7 @@ def _refine_zero(
         if index.numel() == 0:
             break
         t = near + (far - near) * (s_near / (s_near - s_far).clamp_min(1e-30)).clamp(0.02, 0.98)
-        s = finite_distance(field, rays.origins[index] + t.unsqueeze(-1) * rays.directions[index])
+        s = _distance_along(field, rays, index, t)
         better = s.abs() < best_s.abs()
         best_t, best_s = torch.where(better, t, best_t), torch.where(better, s, best_s)
         out = s > 0

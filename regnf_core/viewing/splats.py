@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ _AMBIENT = 0.45
 _MIN_SLANT = 0.12  # a disc seen at a grazing angle is drawn as if its normal leaned this much towards the viewer
 
 _DEPTH_STEPS = 256.0  # steps of the depth buffer a pixel
+_PIXELS_AT_ONCE = 1 << 22
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -102,12 +105,20 @@ def _nearest(seen: Singles, normals: Singles, size: int, radius: float) -> NDArr
         dy = (row - y - 0.5).astype(np.float32)
         first, count = _spans(column, dy, slope, radius, size)
         count[(y < 0) | (y >= size)] = 0
-        source = np.repeat(np.arange(len(seen)), count)
-        x = np.arange(len(source)) - np.repeat(np.cumsum(count) - count - first, count)
         level = near - slope[:, 1] * dy + slope[:, 0] * (column - np.float32(0.5))  # the depth at x = 0
-        depth = ((level[source] - slope[source, 0] * x.astype(np.float32)) * _DEPTH_STEPS).astype(np.int64)
-        np.maximum.at(keys, y[source] * size + x, (depth << 32) | source)
+        for part in _parts(count):
+            source = np.repeat(np.arange(part.start, part.stop), count[part])
+            x = np.arange(len(source)) - np.repeat(np.cumsum(count[part]) - count[part] - first[part], count[part])
+            depth = ((level[source] - slope[source, 0] * x.astype(np.float32)) * _DEPTH_STEPS).astype(np.int64)
+            np.maximum.at(keys, y[source] * size + x, (depth << 32) | source)
     return np.where(keys >= 0, keys & 0xFFFFFFFF, -1)
+
+
+def _parts(count: NDArray[np.int64]) -> Iterator[slice]:
+    """Slices of the discs whose spans have about so many pixels together: bounds memory."""
+    ends = np.searchsorted(np.cumsum(count) // _PIXELS_AT_ONCE, np.arange(count.sum() // _PIXELS_AT_ONCE), side="right")
+    bounds = [0, *ends.tolist(), len(count)]
+    yield from (slice(first, last) for first, last in pairwise(bounds) if last > first)
 
 
 def _spans(

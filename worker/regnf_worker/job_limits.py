@@ -1,8 +1,8 @@
 """What one job's process may use: memory and disk space, limited within the process and watched from outside.
 
 Within, the kernel refuses private memory beyond the limit (RLIMIT_DATA), so that an allocation fails there and the job
-ends with a reason of its own. Address space (RLIMIT_AS) would be the wrong measure: CUDA reserves far more of it than it
-uses. From outside, the worker looks at the pages that are the process' own: that also counts shared memory, which
+ends with a reason of its own. Address space (RLIMIT_AS) would be the wrong measure: CUDA reserves far more of it than
+it uses. From outside, the worker looks at the pages that are the process' own: that also counts shared memory, which
 RLIMIT_DATA does not. Pages that a fork shares with its worker count for neither.
 """
 
@@ -97,7 +97,8 @@ def open_reserve() -> None:
 
 
 def data_bytes(pid: int | str = "self") -> int:
-    """Private writable memory of a process, touched or not: what RLIMIT_DATA counts. 0 where the system does not say."""
+    """Private writable memory of a process, touched or not, as RLIMIT_DATA counts it. 0 where the system does not
+    say."""
     return _KIB * _kib_of(Path(f"/proc/{pid}/status"), ("VmData:",))
 
 

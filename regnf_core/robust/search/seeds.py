@@ -13,6 +13,9 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
 
+_POINTS_AT_ONCE = 1 << 22
+"""Turned points: bounds memory, at about 200 MB. The default options stay far below."""
+
 
 def seed_poses(
     scene_points: Tensor, object_points: Tensor, box_axes: Tensor, box_size: Tensor, rotations: Tensor, scales: Tensor
@@ -65,7 +68,10 @@ def _from_extents(
 
 def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest coordinates (K, 3) of the object along the box's axes, for every rotation."""
-    return _extremes(object_points @ (rotations @ box_axes))
+    parts = -(-len(rotations) * len(object_points) // _POINTS_AT_ONCE)
+    found = [_extremes(object_points @ (part @ box_axes)) for part in rotations.tensor_split(max(1, parts))]
+    low, high = (torch.cat(ends) for ends in zip(*found, strict=True))
+    return low, high
 
 
 def _extremes(points: Tensor) -> tuple[Tensor, Tensor]:

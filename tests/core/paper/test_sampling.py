@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +14,7 @@ from regnf_core.errors import InvalidDetectionError, InvalidInputError, NoSurfac
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import Axis, SamplingOptions
 from regnf_core.paper.sampling import sample_object, sample_scene
+from regnf_core.surface.cameras import Rays, cast_rays
 from regnf_core.surface.surface_bounds import surface_bounds
 from tests.core.analytic import AnalyticField, chair, chair_box, chair_pose, room, sphere
 
@@ -102,3 +106,27 @@ def test_a_field_that_is_not_finite_is_refused(value: float) -> None:
         with pytest.raises(InvalidInputError) as caught:
             attempt()
         assert reason_of(caught) == "FIELD_NOT_FINITE"
+
+
+@pytest.mark.parametrize(("most", "parts_of_a_group"), [(1000, 16), (1000, 2), (3000, 1)])
+def test_points_are_the_same_in_the_same_order_when_rays_are_followed_in_parts(
+    most: int, parts_of_a_group: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    T = chair_pose()
+    field = room(T)
+    whole = sample_scene(field, chair_box(T), OPTIONS)
+    traced: list[int] = []
+    in_parts = partial(cast_rays, most=most)
+
+    def counted(*arguments: Any) -> Iterator[Rays]:
+        for rays in in_parts(*arguments):
+            traced.append(len(rays.origins))
+            yield rays
+
+    monkeypatch.setattr("regnf_core.paper.sampling.cast_rays", counted)
+    monkeypatch.setattr("regnf_core.paper.sampling._PARTS_OF_A_GROUP", parts_of_a_group)
+    monkeypatch.setattr("regnf_core.surface.sphere_tracing._POINTS_AT_ONCE", 1024)
+    parts = sample_scene(field, chair_box(T), OPTIONS)
+    assert len(traced) > 1
+    assert torch.equal(parts.points, whole.points)
+    assert torch.equal(parts.normals, whole.normals)

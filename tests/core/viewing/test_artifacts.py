@@ -230,3 +230,16 @@ def test_the_ramp_runs_from_dark_to_yellow_and_clips() -> None:
 )
 def test_the_picture_stands_on_the_axis_that_the_options_name(options: dict[str, object], up: str) -> None:
     assert _up_axis(RegistrationOptions.from_dict(options).to_dict()) == up
+
+
+def test_a_picture_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = Surfels(rng.normal(size=(400, 3)), normals, np.ones((400, 3)))
+    view = View(np.eye(3), np.zeros(3), 15.0)
+    whole = nearest_surfels(cloud, view, 96, 0.4)
+    for most in (1, 97, 10_000):
+        monkeypatch.setattr("regnf_core.viewing.splats._PIXELS_AT_ONCE", most)
+        assert np.array_equal(nearest_surfels(cloud, view, 96, 0.4), whole)
+    assert (whole >= 0).sum() > 1000
