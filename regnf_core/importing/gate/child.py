@@ -12,11 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
 
+from regnf_core.importing.gate.watch import Trespass, Watch
+
+_LOOK_S = 0.1
 _MAX_OUTPUT = 64 * 1024
 """Bytes of standard output and of standard error that are kept; a child that says more is ended."""
 
 
-Stopped = Literal["late", "talkative"]
+Stopped = Literal["late", "talkative"] | Trespass
 
 
 @dataclass(frozen=True)
@@ -32,11 +35,17 @@ class ChildOutcome:
 
 
 def run_child(
-    command: list[str], request: bytes, folder: Path, environment: dict[str, str], wall_s: float
+    command: list[str],
+    request: bytes,
+    folder: Path,
+    environment: dict[str, str],
+    wall_s: float,
+    folder_bytes: int = 1 << 32,
 ) -> ChildOutcome:
     """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds.
 
-    The child leads a process group of its own; at the end the whole group is killed, whatever became of the child.
+    It is stopped too when it has many threads, or more than ``folder_bytes`` in ``folder``: see ``Watch``. The child
+    leads a process group of its own; at the end the whole group is killed, whatever became of the child.
     ``request`` must fit into a pipe (64 KiB).
     """
     deadline = time.monotonic() + wall_s
@@ -51,14 +60,13 @@ def run_child(
         close_fds=True,
     )
     stopped: Stopped | None = "late"
+    watch = Watch(folder, folder_bytes)
     said = (bytearray(), bytearray())
     try:
         with contextlib.suppress(BrokenPipeError):
             _pipe(process.stdin).write(request)
             _pipe(process.stdin).close()
-        stopped = _listen((_pipe(process.stdout), _pipe(process.stderr)), said, deadline)
-        if stopped is None and not _exits_by(process.pid, deadline):
-            stopped = "late"
+        stopped = _listen(process, said, watch, deadline) or _stays(process.pid, watch, deadline)
     finally:
         code, cpu_seconds = _end(process)
     return ChildOutcome(
@@ -83,15 +91,19 @@ def _end(process: subprocess.Popen[bytes]) -> tuple[int, float]:
     return process.returncode, usage.ru_utime + usage.ru_stime
 
 
-def _listen(streams: tuple[IO[bytes], IO[bytes]], said: tuple[bytearray, bytearray], deadline: float) -> Stopped | None:
+def _listen(
+    process: subprocess.Popen[bytes], said: tuple[bytearray, bytearray], watch: Watch, deadline: float
+) -> Stopped | None:
     """Collect in ``said`` what the child says until it closes both streams; otherwise tell why it should be stopped."""
     with selectors.DefaultSelector() as selector:
-        for stream, words in zip(streams, said, strict=True):
+        for stream, words in zip((_pipe(process.stdout), _pipe(process.stderr)), said, strict=True):
             selector.register(stream.fileno(), selectors.EVENT_READ, words)
         while selector.get_map():
-            ready = selector.select(max(deadline - time.monotonic(), 0.0))
-            if not ready:
+            ready = selector.select(min(max(deadline - time.monotonic(), 0.0), _LOOK_S))
+            if time.monotonic() > deadline:
                 return "late"
+            if trespass := watch.look(process.pid):
+                return trespass
             for key, _ in ready:
                 chunk = os.read(key.fd, _MAX_OUTPUT)
                 key.data.extend(chunk)
@@ -102,13 +114,18 @@ def _listen(streams: tuple[IO[bytes], IO[bytes]], said: tuple[bytearray, bytearr
     return None
 
 
-def _exits_by(pid: int, deadline: float) -> bool:
-    """Whether the child, which has closed its streams, ends by itself in time. Its status stays to be collected."""
+def _stays(pid: int, watch: Watch, deadline: float) -> Stopped | None:
+    """Why the child, which has closed its streams, should be stopped; None when it ends by itself in time.
+
+    Its status stays to be collected.
+    """
     while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
         if time.monotonic() > deadline:
-            return False
+            return "late"
+        if trespass := watch.look(pid):
+            return trespass
         time.sleep(0.005)
-    return True
+    return None
 
 
 def _pipe(stream: IO[bytes] | None) -> IO[bytes]:

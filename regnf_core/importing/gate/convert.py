@@ -37,6 +37,8 @@ _SIGN_UNCERTAIN = (
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
+_THREADED_FORMATS = ("ply",)
+"""May be clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
@@ -84,9 +86,10 @@ def convert_file(
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
     """A picture, if one can be made: it is not a condition of the import."""
+    from regnf_core.importing.gate.plausibility import without_new_code
     from regnf_core.viewing.field_picture import field_picture
 
-    with contextlib.suppress(RegnfError, MemoryError):
+    with contextlib.suppress(RegnfError, MemoryError), without_new_code():
         field_picture(field, up_axis).save(path)
 
 
@@ -188,7 +191,8 @@ def main(arguments: list[str]) -> int:
     out_dir = Path(arguments[1])
     # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
     upload = os.open(arguments[0], os.O_RDONLY)
-    isolation = confine(limits, request["parent_pid"], upload, out_dir)
+    threads = sniff_format(os.pread(upload, HEAD_BYTES, 0)) in _THREADED_FORMATS
+    isolation = confine(limits, request["parent_pid"], upload, out_dir, threads)
     report = run(Path(f"/proc/self/fd/{upload}"), out_dir, request["description"], limits, request["picture"])
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")

@@ -42,6 +42,7 @@ _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
 _MAX_DETAIL = 500
 _OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
 _MAX_DESCRIPTION = 16_384
+_PICTURE_BYTES = 16 << 20
 _log = logging.getLogger(__name__)
 
 
@@ -69,7 +70,7 @@ def import_field(
     try:
         started = time.monotonic()
         command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
-        outcome = run_child(command, request, work, _environment(limits), limits.wall_s)
+        outcome = run_child(command, request, work, _environment(), limits.wall_s, limits.file_bytes + _PICTURE_BYTES)
         values = _values_of(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
@@ -91,16 +92,18 @@ def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: 
     return text
 
 
-def _environment(limits: ImportLimits) -> dict[str, str]:
-    """All the child gets to see of the environment: no secret lives in these names."""
-    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-    return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, str(limits.threads))}
+def _environment() -> dict[str, str]:
+    """All the child gets to see of the environment: no secret lives in these names. It may not have threads."""
+    counts = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "IGL_NUM_THREADS")
+    return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, "1")}
 
 
 def _values_of(outcome: ChildOutcome) -> dict[str, Any]:
     """The report's values, or the error that the child's end stands for."""
     if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
         raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
+    if outcome.stopped == "output":
+        raise FieldFormatError("the import writes more than it may", reason="IMPORT_OUTPUT_TOO_LARGE")
     if outcome.stopped is None and outcome.signal == signal.SIGKILL:  # not ours: the kernel's, for want of memory
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY")
     values = _parse(outcome.stdout) if outcome.exit_status == 0 else None

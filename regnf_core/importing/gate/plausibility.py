@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
@@ -21,6 +24,14 @@ _GRADIENT_RANGE = (0.5, 2.0)
 _MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zero is left out; the steps are bounded
 
 
+@contextmanager
+def without_new_code() -> Iterator[None]:
+    """Keep torch from oneDNN, which writes machine code for the processor at hand: the filter refuses such pages."""
+    with torch.backends.mkldnn.flags(enabled=False):
+        yield
+
+
+@without_new_code()
 def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
     """Measurements of the field, and warnings.
 

@@ -16,14 +16,13 @@ class ImportLimits:
     wall_s: float = 120.0
     """Seconds from start to end; then IMPORT_TIMEOUT."""
     cpu_s: int = 240
-    """Processor seconds of all threads together; then IMPORT_TIMEOUT."""
+    """Processor seconds; then IMPORT_TIMEOUT."""
     memory_bytes: int = 8192 * MIB
     """Address space, the mapped upload (and about 1 GiB of libraries) included; then IMPORT_OUT_OF_MEMORY."""
     tensor_bytes: int = 4096 * MIB
     """All tensors of the field together, as float32; then TENSOR_TOO_LARGE."""
     file_bytes: int = 4096 * MIB
     """Largest file the import may write; then IMPORT_OUTPUT_TOO_LARGE."""
-    threads: int = 1
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ import ctypes
 import errno
 import os
 import resource
+import signal
 import socket
+import struct
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +22,7 @@ Where = dict[str, Any]
 file of it), home (the child's own folder)."""
 Attempt = Callable[[Where], object]
 _libc = ctypes.CDLL(None, use_errno=True)
-_PTRACE_SEIZE = 0x4206
+_PTRACE_SEIZE, _AT_FDCWD = 0x4206, -100
 
 
 def outcome(attempt: Attempt, where: Where) -> str:
@@ -128,8 +130,11 @@ def own_user_namespace(_: Where) -> None:
             ended.append(error)
 
     thread = threading.Thread(target=leave)
-    thread.start()
-    thread.join()
+    try:
+        thread.start()
+        thread.join()
+    except RuntimeError:  # no threads here
+        leave()
     if ended and ended[0].errno != errno.EINVAL:
         raise ended[0]
 
@@ -140,6 +145,62 @@ def shared_memory(_: Where) -> None:
 
 def message_queue(_: Where) -> None:
     call(71, call(68, 0, 0o1600), 0, None)
+
+
+def outlive_the_parent(_: Where) -> None:
+    """Take back what ends this process with its parent, and put it there again."""
+    call(157, 1, 0, 0, 0, 0)
+    call(157, 1, signal.SIGKILL, 0, 0, 0)
+
+
+def file_in_memory(_: Where) -> None:
+    os.close(os.memfd_create("regnf"))
+
+
+def other_segments(_: Where) -> None:
+    call(154, 0, ctypes.create_string_buffer(8), 8)  # modify_ldt, to read
+
+
+def open_a_tree(where: Where) -> None:
+    os.close(call(428, _AT_FDCWD, where["store"].encode(), 0))
+
+
+def asynchronous_requests(_: Where) -> None:
+    context = ctypes.c_ulong()
+    call(206, 1, ctypes.byref(context))
+    call(207, context)
+
+
+def watch_a_folder(where: Where) -> None:
+    watching = call(253)
+    try:
+        call(254, watching, where["store"].encode(), 2)
+    finally:
+        os.close(watching)
+
+
+def set_attribute(where: Where) -> None:
+    """By the call of 2025, with an attribute that root and others may set."""
+    value = ctypes.create_string_buffer(b"x")
+    arguments = struct.pack("=QII", ctypes.addressof(value), 1, 0)
+    call(463, _AT_FDCWD, where["secret"].encode(), 0, b"user.regnf", arguments, len(arguments))
+    call(466, _AT_FDCWD, where["secret"].encode(), 0, b"user.regnf")
+
+
+def change_flags(where: Where) -> None:
+    """By the call of 2025: the file's flags as they are."""
+    attributes = ctypes.create_string_buffer(24)
+    call(468, _AT_FDCWD, where["secret"].encode(), attributes, 24, 0)
+    call(469, _AT_FDCWD, where["secret"].encode(), attributes, 24, 0)
+
+
+def start_a_thread(_: Where) -> None:
+    thread = threading.Thread(target=int)
+    try:
+        thread.start()
+    except RuntimeError as error:  # what Python makes of any refusal
+        raise OSError(errno.EPERM, str(error)) from error
+    thread.join()
 
 
 def read(path: str | Path) -> bytes:
@@ -208,6 +269,13 @@ PROCESSES: dict[str, Attempt] = {
     "share memory by a key": shared_memory,
     "make a message queue": message_queue,
     "make a user namespace": own_user_namespace,
+    "start a thread": start_a_thread,
+    "outlive the parent": outlive_the_parent,
+    "make a file in memory": file_in_memory,
+    "look at memory segments": other_segments,
+    "open a tree of files": open_a_tree,
+    "make asynchronous requests": asynchronous_requests,
+    "watch a folder": watch_a_folder,
 }
 LOOKING: dict[str, Attempt] = {
     "trace the parent": trace_parent,
@@ -238,6 +306,8 @@ ATTRIBUTES: dict[str, Attempt] = {
     "change a mode": lambda w: os.chmod(w["secret"], os.stat(w["secret"]).st_mode & 0o777),
     "change an owner": lambda w: os.chown(w["secret"], -1, -1),
     "change a time": lambda w: os.utime(w["secret"]),
+    "set an attribute": set_attribute,
+    "change a file's flags": change_flags,
 }
 ATTEMPTS = NETWORK | PROCESSES | LOOKING | PEEPING | FILES | ATTRIBUTES
 BY_LAYER: dict[str, set[str]] = {
@@ -246,8 +316,8 @@ BY_LAYER: dict[str, set[str]] = {
     "everything": set(ATTEMPTS),
 }
 """Which attempts fail with the layer alone: "filter" the system call filter, "landlock" Landlock, "everything" all."""
-NOT_EVERYWHERE = set(LOOKING)
-"""What some systems forbid without any confinement of ours."""
+NOT_EVERYWHERE = {*LOOKING, *ATTRIBUTES, "look at memory segments"}
+"""What some systems forbid without any confinement of ours, or do not have yet."""
 
 
 def run_all(where: Where) -> dict[str, str]:

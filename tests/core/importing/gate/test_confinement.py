@@ -18,6 +18,7 @@ import pytest
 from regnf_core.importing.gate import gate
 from regnf_core.importing.gate.child import run_child
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.gate.watch import MAX_THREADS
 
 ROOT = Path(__file__).resolve().parents[4]
 PRELUDE = f"""
@@ -25,6 +26,7 @@ import ctypes, errno, json, os, resource, signal, socket, sys, threading
 sys.path.insert(0, {str(ROOT)!r})
 from regnf_core.importing.gate import sandbox
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.gate.watch import MAX_THREADS
 request = json.load(sys.stdin)
 
 def attempt(action):
@@ -46,7 +48,7 @@ def tell(folder: Path, program: str, limits: ImportLimits | None = None, **reque
     limits = limits or ImportLimits()
     values = {"limits": limits.__dict__, "parent": os.getpid(), **request}
     command = [sys.executable, "-I", "-c", PRELUDE + program]
-    outcome = run_child(command, json.dumps(values).encode(), folder, gate._environment(limits), 60)
+    outcome = run_child(command, json.dumps(values).encode(), folder, gate._environment(), 60)
     assert outcome.exit_status == 0, outcome
     return json.loads(outcome.stdout)
 
@@ -101,17 +103,60 @@ def test_refused_system_calls(tmp_path: Path, action: str) -> None:
     held, result = tell(tmp_path, FILTER + f"print(json.dumps([held, attempt(lambda: {action})]))")
     if not held:
         pytest.skip("this kernel has no system call filter")
-    assert result == ["refused", "EPERM"]
+    assert result in (["refused", "EPERM"], ["refused", "ENOSYS"])
 
 
-def test_threads_and_files_still_work_under_the_filter(tmp_path: Path) -> None:
+def test_files_still_work_under_the_filter(tmp_path: Path) -> None:
     program = """
-seen = []
-worker = threading.Thread(target=seen.append, args=(1,)); worker.start(); worker.join()
 with open("note", "w") as file: file.write("x")
-print(json.dumps([seen, os.path.getsize("note")]))
+os.replace("note", "told")
+print(json.dumps([os.path.getsize("told"), os.listdir()]))
 """
-    assert tell(tmp_path, FILTER + program) == [[1], 1]
+    assert tell(tmp_path, FILTER + program) == [1, ["told"]]
+
+
+THREAD = """
+def start():
+    seen = []
+    worker = threading.Thread(target=seen.append, args=(1,)); worker.start(); worker.join()
+    return seen
+"""
+
+
+def test_threads_work_where_they_are_asked_for(tmp_path: Path) -> None:
+    program = NO_NEW_PRIVILEGES + THREAD + "sandbox.refuse_system_calls(threads=True)\nprint(json.dumps(start()))"
+    assert tell(tmp_path, program) == [1]
+
+
+def test_threads_are_refused_otherwise(tmp_path: Path) -> None:
+    program = FILTER + THREAD + "try: print(start())\nexcept RuntimeError: print(json.dumps(held))"
+    assert tell(tmp_path, program) is True
+
+
+def test_a_child_with_many_threads_is_ended(tmp_path: Path) -> None:
+    """Those that the filter allows are counted from outside."""
+    program = (
+        CONFINE.replace("Path.cwd())", "Path.cwd(), threads=True)")
+        + """
+for _ in range(request['threads']): threading.Thread(target=threading.Event().wait, daemon=True).start()
+threading.Event().wait()
+"""
+    )
+    values = {"limits": ImportLimits().__dict__, "parent": os.getpid(), "threads": MAX_THREADS + 1}
+    command = [sys.executable, "-I", "-c", PRELUDE + program]
+    outcome = run_child(command, json.dumps(values).encode(), tmp_path, gate._environment(), 60)
+    assert (outcome.stopped, outcome.signal) == ("threads", signal.SIGKILL)
+
+
+def test_a_child_that_writes_many_files_is_ended(tmp_path: Path) -> None:
+    """Each within the limit of one file."""
+    program = """
+import itertools, os
+for number in itertools.count():
+    with open(f"file-{number % 32}-{number}", "wb") as file: file.write(bytes(1 << 16))
+"""
+    outcome = run_child([sys.executable, "-I", "-c", program], b"", tmp_path, {}, 60, folder_bytes=1 << 20)
+    assert (outcome.stopped, outcome.signal) == ("output", signal.SIGKILL)
 
 
 def test_a_process_under_the_filter_may_still_abort(tmp_path: Path) -> None:
@@ -125,7 +170,14 @@ def test_no_secret_is_handed_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("PYTHONPATH", "/somewhere")
     seen = tell(tmp_path, "print(json.dumps([dict(os.environ), open('/proc/self/environ').read()]))")
     assert "hunter2" not in json.dumps(seen)
-    assert set(seen[0]) <= {"PATH", "LANG", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LC_CTYPE"}
+    assert set(seen[0]) <= {
+        "PATH",
+        "LANG",
+        "OMP_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "LC_CTYPE",
+    } | {"IGL_NUM_THREADS"}
 
 
 def test_no_open_file_is_handed_down(tmp_path: Path) -> None:
@@ -143,9 +195,10 @@ def test_the_child_works_in_a_folder_of_its_own(tmp_path: Path) -> None:
 
 def test_resources_are_limited(tmp_path: Path) -> None:
     limits = ImportLimits(cpu_s=7, memory_bytes=1 << 30, file_bytes=1000)
-    names = ("RLIMIT_CPU", "RLIMIT_AS", "RLIMIT_FSIZE", "RLIMIT_CORE", "RLIMIT_NOFILE")
+    limited = ("CPU", "AS", "FSIZE", "CORE", "NOFILE", "NPROC", "MEMLOCK", "MSGQUEUE", "SIGPENDING")
+    names = tuple(f"RLIMIT_{name}" for name in limited)
     program = CONFINE + f"print(json.dumps([resource.getrlimit(getattr(resource, n))[0] for n in {names!r}]))"
-    assert tell(tmp_path, program, limits) == [7, 1 << 30, 1000, 0, 256]
+    assert tell(tmp_path, program, limits) == [7, 1 << 30, 1000, 0, 64, 0, 0, 0, 0]
 
 
 def test_there_are_no_privileges_and_none_can_be_gained(tmp_path: Path) -> None:
@@ -177,8 +230,12 @@ def test_the_upload_may_lie_where_only_privileges_lead(tmp_path: Path) -> None:
 
 
 def test_the_child_dies_with_its_parent(tmp_path: Path) -> None:
-    """A parent that confines a sleeping child and is killed; the grandchild's end closes the pipe we listen to."""
-    child = PRELUDE + CONFINE + "print('ready', flush=True)\nthreading.Event().wait()"
+    """A parent that confines a child and is killed; the child's end closes the pipe that we listen to.
+
+    The child does what it can to live on, and sleeps.
+    """
+    last = "[ctypes.CDLL(None).prctl(1, 0, 0, 0, 0), ctypes.CDLL(None).setsid(), ctypes.CDLL(None).setpgid(0, 0)]"
+    child = PRELUDE + CONFINE + f"{last}\nprint('ready', flush=True)\nthreading.Event().wait()"
     parent = f"""
 import json, os, subprocess, sys
 values = json.dumps({{"limits": {{}}, "parent": os.getpid()}}).encode()
