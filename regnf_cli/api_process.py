@@ -5,28 +5,15 @@ from __future__ import annotations
 import socket
 import sys
 
-import uvicorn
-
+from regnf_service.http.guarded_server import GuardedServer
 from regnf_state.logs import configure_logging
 from regnf_state.settings import Settings
 
-_APPLICATION = "regnf_service.app:create_app"
-_DRAIN_S = 5
-"""How long open requests may go on once the process is told to stop."""
-
 
 def main(descriptor: int) -> None:
-    configure_logging(Settings().log_format)
-    config = uvicorn.Config(
-        _APPLICATION,
-        factory=True,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        lifespan="on",
-        timeout_graceful_shutdown=_DRAIN_S,
-    )
-    server = uvicorn.Server(config)
+    settings = Settings()
+    configure_logging(settings.log_format)
+    server = GuardedServer(settings)
     server.run(sockets=[socket.socket(fileno=descriptor)])
     if not server.started:
         sys.exit(3)

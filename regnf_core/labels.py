@@ -1,4 +1,6 @@
-"""Names that users give to objects, fields and detections."""
+"""Names that users give to objects, fields and detections, and what of any text must not reach a line of a log."""
 
-LABEL_PATTERN = r"^[^\x00-\x1f\x7f\u202a-\u202e\u2066-\u2069]*$"
-"""Labels are shown as they are: no control characters, and none that turn the text around them."""
+UNSHOWN = r"\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ufff9-\ufffb"
+"""Characters of control, of line breaks and of the direction of writing, as ranges of a regular expression."""
+LABEL_PATTERN = rf"^[^{UNSHOWN}]*$"
+"""Labels are shown as they are: nothing in them breaks a line or turns the text around them."""

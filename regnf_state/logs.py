@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,9 +12,13 @@ from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from regnf_core.labels import UNSHOWN
+from regnf_state.log_limits import RepeatLimit
+
 ACCESS_LOGGER = "regnf_service.access"
 _context: ContextVar[dict[str, Any]] = ContextVar("log_context")
 _PLAIN = "%(asctime)s %(levelname)-7s %(name)s %(message)s"
+_BREAKS = re.compile(f"[{UNSHOWN}]")
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}
 
 
@@ -45,11 +50,19 @@ class JsonFormatter(logging.Formatter):
         return json.dumps(entry, default=str)
 
 
+class PlainFormatter(logging.Formatter):
+    """One line an entry, but for its traceback: whatever breaks or turns a line is escaped."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 -- the base class's name
+        return _BREAKS.sub(lambda found: f"\\u{ord(found[0]):04x}", super().formatMessage(record))
+
+
 def configure_logging(log_format: Literal["text", "json"], level: int = logging.INFO) -> None:
     """Send every logger's entries to stderr in one format, once; what libraries had set up is taken down."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonFormatter() if log_format == "json" else logging.Formatter(_PLAIN))
+    handler.setFormatter(JsonFormatter() if log_format == "json" else PlainFormatter(_PLAIN))
     root = logging.getLogger()
+    handler.addFilter(RepeatLimit())
     root.handlers = [handler]
     root.setLevel(level)
     # a line for every request is for collectors; people look at what goes wrong

@@ -68,6 +68,14 @@ class Settings(BaseSettings):
     """Largest JSON body."""
     upload_stall_s: float = Field(default=30.0, gt=0)
     """An upload that sends nothing for this long is refused with 408."""
+    min_bytes_per_s: float = Field(default=4096.0, gt=0)
+    """Slower uploads, and slower readers of answers, are cut off after the time above."""
+    header_timeout_s: float = Field(default=10.0, gt=0)
+    """How long a request's head may take, from the connection or the answer before it."""
+    max_connections: int = Field(default=4096, ge=1)
+    """Less where the system allows fewer open files. Beyond it the connections that wait for their clients go."""
+    max_connections_per_address: int | None = Field(default=None, ge=1)
+    """Unset: half of all. Behind a proxy every caller has the proxy's address."""
     max_queued_jobs: int = Field(default=1000, ge=1)
     rate_limit_per_s: float | None = Field(default=None, ge=0)
     """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""

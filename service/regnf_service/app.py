@@ -12,6 +12,7 @@ from starlette.staticfiles import StaticFiles
 
 from regnf_core import __version__
 from regnf_service.http import problems
+from regnf_service.http.connections import Connections
 from regnf_service.http.contract import build_contract
 from regnf_service.http.hosts import allowed_hosts
 from regnf_service.http.middleware import RequestContext, TokenGate
@@ -32,9 +33,12 @@ _STRICT = [Depends(refuse_unknown_parameters)]
 
 
 def create_app(
-    settings: Settings | None = None, stores: Stores | None = None, limiter: RateLimiter | None = None
+    settings: Settings | None = None,
+    stores: Stores | None = None,
+    limiter: RateLimiter | None = None,
+    connections: Connections | None = None,
 ) -> FastAPI:
-    """The application over the given stores, or over those that the settings name.
+    """The application over the given stores, or over those that the settings name; ``connections`` are its server's.
 
     Raises NoRedisError when no Redis is named, TokensError when the tokens are unusable, HostsError likewise.
     """
@@ -45,7 +49,7 @@ def create_app(
         limiter = RedisRateLimiter(stores.redis, settings.calls_per_s, settings.rate_limit_burst)
     webhooks = webhooks_of(settings, stores.redis)
     services = Services(settings, stores.redis, stores.records, stores.blobs, stores.queue, webhooks)
-    metrics = Metrics(services)
+    metrics = Metrics(services, connections)
     app = FastAPI(
         title="regnf",
         version=__version__,

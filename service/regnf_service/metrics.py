@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from collections import Counter as Tally
 from collections.abc import Iterable, Iterator
@@ -13,6 +14,8 @@ from prometheus_client.registry import Collector
 from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from regnf_service.descriptors import open_descriptors
+from regnf_service.http.connections import Connections
 from regnf_service.http.middleware import route_of
 from regnf_service.services import Services
 from regnf_state.redis.counters import Counters
@@ -36,7 +39,7 @@ _TIMES = {
 class Metrics:
     """The registry of one application. Routes are counted by their templates, never by the ids in them."""
 
-    def __init__(self, services: Services) -> None:
+    def __init__(self, services: Services, connections: Connections | None = None) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "regnf_http_requests", "Requests answered.", ("method", "route", "status"), registry=self.registry
@@ -48,7 +51,27 @@ class Metrics:
         self.redis_errors = Counter(
             "regnf_redis_errors", "Answers and scrapes for which Redis was away.", registry=self.registry
         )
+        self.registry.register(_Process(connections))
         self.registry.register(_Held(self, services))
+
+
+class _Process(Collector):
+    """Connections and descriptors of this process."""
+
+    def __init__(self, connections: Connections | None) -> None:
+        self._connections = connections
+
+    def collect(self) -> Iterator[Metric]:
+        yield _gauge("open_file_descriptors", "Files and connections that are open.", open_descriptors())
+        yield _gauge("file_descriptor_limit", "How many may be open.", resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+        if self._connections is not None:
+            yield _gauge("connections", "Open connections.", len(self._connections))
+            refused = CounterMetricFamily(
+                "regnf_connections_refused", "Connections that were refused or closed early.", labels=("cause",)
+            )
+            for cause, count in sorted(self._connections.ended.items()):
+                refused.add_metric((cause,), count)
+            yield refused
 
 
 class _Held(Collector):

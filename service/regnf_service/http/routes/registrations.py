@@ -163,7 +163,7 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
 
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     settings = services.settings
-    text = await body.read_small(request, settings.max_request_bytes, settings.upload_stall_s)
+    text = await body.read_small(request, settings)
     spec = read_model(RegisterRequest, text)
     asked = spec.to_request(spec.scene, spec.object, spec.candidates)
     named = {"/scene": spec.scene}
@@ -181,7 +181,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
     async with AsyncExitStack() as stack:
         files = {name: await stack.enter_async_context(open_upload(services, caller)) for name in ("scene", "object")}
-        data = body.chunks(request, limit, settings.upload_stall_s)
+        data = body.chunks(request, limit, settings)
         parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:

@@ -135,7 +135,7 @@ async def post_field(
 async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
     body.refuse_encoding(request)
     settings = services.settings
-    async for data in body.chunks(request, settings.max_upload_bytes, settings.upload_stall_s):
+    async for data in body.chunks(request, settings.max_upload_bytes, settings):
         await upload.feed(data)
     return await upload.finish()
 
@@ -146,7 +146,7 @@ async def _receive_parts(
     body.refuse_encoding(request)
     settings = services.settings
     limit = settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
-    data = body.chunks(request, limit, settings.upload_stall_s)
+    data = body.chunks(request, limit, settings)
     if digest is not None:
         data = _compared(data, digest)
     parts = await read_parts(data, boundary_of(request), {"file": upload}, {"description": DESCRIPTION_BYTES})

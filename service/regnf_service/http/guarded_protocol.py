@@ -1,0 +1,142 @@
+"""The server's protocol with limits in time and number, which it has not itself: for slow clients, and for many."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import select
+import socket
+from typing import Any
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from regnf_service.http.bounded_parser import BoundedParser
+from regnf_service.http.connections import ClientClock, Connections, site_of
+from regnf_service.http.raw_answers import raw_answer
+
+_SLICE_BYTES = 16 * 1024
+_LINGER_S = 10.0
+"""How long what was answered last may take to be read, and what a client still sends to come to its end."""
+_VANISHED_MS = 60_000
+_FAULTS = {431: "HEADERS_TOO_LARGE"}
+
+
+class GuardedProtocol(H11Protocol):
+    """One connection. It watches no time itself: ``connections`` asks it by when its client must be done."""
+
+    conn: BoundedParser
+
+    def __init__(self, *arguments: Any, connections_held: Connections, clock: ClientClock, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.conn = BoundedParser(self.loop.time)
+        self.site = ""
+        self._held = connections_held
+        self._clock = clock
+        self._admitted = False
+        self._inbox = bytearray()
+        self._waiting_since = self._paused_at = 0.0
+        self._paused_with = 0
+        self._closing_since: float | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        self.site = site_of(str((transport.get_extra_info("peername") or ("",))[0]))
+        self._waiting_since = self.loop.time()
+        self.transport = transport
+        self._admitted = self._held.admit(self)
+        if not self._admitted:
+            transport.write(raw_answer("TOO_MANY_CONNECTIONS"))
+            transport.close()
+            return
+        _notice_vanished_peers(transport.get_extra_info("socket"))
+        super().connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._held.remove(self)
+        self._inbox.clear()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """In slices, so that the parser never holds more than one of what it cannot use yet."""
+        if self._admitted:
+            self._inbox += data
+            self._feed()
+
+    def _feed(self) -> None:
+        while self._inbox and not self.conn.is_paused and not self.transport.is_closing():
+            piece = bytes(self._inbox[:_SLICE_BYTES])
+            del self._inbox[:_SLICE_BYTES]
+            super().data_received(piece)
+
+    def on_response_complete(self) -> None:
+        self._waiting_since = self.loop.time()
+        super().on_response_complete()
+        self._feed()
+
+    def pause_writing(self) -> None:
+        self._paused_at = self.loop.time()
+        self._paused_with = self.unread()
+        super().pause_writing()
+
+    def send_400_response(self, msg: str) -> None:  # noqa: ARG002 -- the base class's signature
+        """What follows cannot be understood. An answer of the application that has begun is left as it is."""
+        if self.cycle is None or self.cycle.response_complete or not self.cycle.response_started:
+            self.transport.write(raw_answer(_FAULTS.get(self.conn.fault, "MALFORMED_REQUEST")))
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        self._close()
+
+    def _unsupported_upgrade_warning(self) -> None:
+        """No line in the log for each: the request is answered as if it had not asked."""
+
+    def due(self) -> float:
+        """The loop's time by which the client must be done; infinite while it is served."""
+        if self.transport.is_closing():
+            self._closing_since = self._closing_since or self.loop.time()
+            return self._closing_since + _LINGER_S
+        if self.flow.write_paused:
+            return self._clock.due(self._paused_at, max(0, self._paused_with - self.unread()))
+        if self.cycle is None or self.cycle.response_complete:
+            return self._waiting_since + self._clock.head_s
+        if self.cycle.more_body and not self.flow.read_paused:
+            # the application answers 408 before: this is for what it does not read, and for making room
+            return self._clock.due(self.conn.request_at, self.conn.body_bytes) + self._clock.stall_s
+        return math.inf
+
+    def has_sent(self) -> bool:
+        """Whether something of the client waits to be read: many connections come in before the first is read."""
+        if self.flow.read_paused or self.transport.is_closing():
+            return False
+        look = select.poll()
+        look.register(self.transport.get_extra_info("socket").fileno(), select.POLLIN)
+        return bool(look.poll(0))
+
+    def unread(self) -> int:
+        """Bytes of answers that the client has not read."""
+        return self.transport.get_write_buffer_size()
+
+    def end(self, *, politely: bool) -> None:
+        """Close the connection; politely: with an answer to a head that has not come to its end."""
+        idle = self.cycle is None or self.cycle.response_complete
+        if not politely or not idle or self.transport.is_closing() or self.flow.write_paused:
+            self.transport.abort()
+            return
+        if self.conn.trailing_data[0]:
+            self.transport.write(raw_answer("REQUEST_STALLED"))
+        self._close()
+
+    def _close(self) -> None:
+        self._closing_since = self.loop.time()
+        self.transport.close()
+
+
+def _notice_vanished_peers(connection: socket.socket | None) -> None:
+    """A peer that is gone without a word is noticed within a minute or two, also while nothing is sent."""
+    if connection is None or connection.family not in (socket.AF_INET, socket.AF_INET6):
+        return
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    if hasattr(socket, "TCP_USER_TIMEOUT"):
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _VANISHED_MS)
