@@ -21,14 +21,24 @@ from tests.restartable_redis import RestartableRedis, restartable_redis
 from tests.worker.bench import children_of, eventually
 
 
+@dataclass(frozen=True)
+class Release:
+    """Code to run: an interpreter that finds it, and its folder; without these, this code."""
+
+    name: str
+    interpreter: str = sys.executable
+    code: Path | None = None
+
+
 @dataclass
 class House:
-    """The running processes."""
+    """The running processes, of the code in ``release``."""
 
     folder: Path
     redis: RestartableRedis
     listener: socket.socket
     settings: dict[str, object]
+    release: Release = field(default_factory=lambda: Release("this"))
     api: subprocess.Popen[bytes] | None = None
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
     token: str | None = None
@@ -113,6 +123,12 @@ class House:
     def log(self) -> str:
         return "\n".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("*.log")))
 
+    def kill(self) -> None:
+        """Kill the API and the workers at once, as a failing machine would."""
+        for process in (*self.workers, *([self.api] if self.api is not None else [])):
+            process.kill()
+            process.wait()
+
     def end(self) -> None:
         for process in (*self.workers, *([self.api] if self.api is not None else [])):
             process.terminate()
@@ -133,7 +149,8 @@ class House:
         environment = plain | {f"REGNF_{key.upper()}": str(value) for key, value in chosen.items()}
         with (self.folder / f"{name}.log").open("ab") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", *module],
+                [self.release.interpreter, "-m", *module],
+                cwd=self.release.code,
                 env=environment,
                 stdout=log,
                 stderr=log,
@@ -162,13 +179,20 @@ def _entry(pid: int, entry: str) -> int:
 
 
 @contextmanager
-def running_house(folder: Path, workers: int, token: str | None = None, **settings: object) -> Iterator[House]:
+def running_house(folder: Path, workers: int, **settings: object) -> Iterator[House]:
     """Start everything below ``folder``; ready once this yields."""
+    with standing_house(folder, **settings) as house:
+        house.start(workers)
+        yield house
+
+
+@contextmanager
+def standing_house(folder: Path, **settings: object) -> Iterator[House]:
+    """The same with Redis alone; what was started is ended."""
     (folder / "state").mkdir(parents=True, exist_ok=True)
     with restartable_redis(folder / "redis") as redis, socket.create_server(("127.0.0.1", 0)) as listener:
-        house = House(folder, redis, listener, dict(settings), token=token)
+        house = House(folder, redis, listener, dict(settings))
         try:
-            house.start(workers)
             yield house
         finally:
             house.end()
