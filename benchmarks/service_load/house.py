@@ -179,9 +179,10 @@ def _entry(pid: int, entry: str) -> int:
 
 
 @contextmanager
-def running_house(folder: Path, workers: int, **settings: object) -> Iterator[House]:
-    """Start everything below ``folder``; ready once this yields."""
+def running_house(folder: Path, workers: int, token: str | None = None, **settings: object) -> Iterator[House]:
+    """Start everything below ``folder``; ready once this yields. ``token``: where the settings name callers."""
     with standing_house(folder, **settings) as house:
+        house.token = token
         house.start(workers)
         yield house
 
