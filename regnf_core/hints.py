@@ -70,6 +70,7 @@ RENAMED: dict[str, str] = {
     "max_hidden_share": "max_occluded_share",
 }
 """Names of earlier versions, and what they are called now."""
+_LONGEST_COMPARED = 64
 _MIN_SIMILARITY = 0.6
 
 
@@ -86,5 +87,7 @@ def nearest_name(name: str, known: Iterable[str]) -> str | None:
     if renamed in names:
         return renamed
     by_lower = {one.lower(): one for one in reversed(names)}
+    if len(name) > _LONGEST_COMPARED:
+        return None
     near = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=_MIN_SIMILARITY)
     return by_lower[near[0]] if near else None

@@ -15,7 +15,7 @@ from regnf_state.reasons import REASONS
 RETRY_LATER = {"Retry-After": "5"}
 CLOSE = {"Connection": "close"}
 """The connection cannot be used again when the body was not read to its end."""
-_MAX_ERRORS = 32
+MAX_ERRORS = 32
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
@@ -37,7 +37,7 @@ class Problem(Exception):  # noqa: N818 -- RFC 9457's own word
         self.reason = reason
         self.status = entry.status
         self.detail = detail or entry.meaning
-        self.errors = list(errors)[:_MAX_ERRORS]
+        self.errors = list(errors)[:MAX_ERRORS]
         self.headers = dict(headers or {})
         self.hint = hint
         self.extra = dict(extra or {})

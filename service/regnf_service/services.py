@@ -36,6 +36,7 @@ class Services:
     waiters: Waiters = field(default_factory=Waiters)
     # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
+    parse_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
     look_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_LOOK_THREADS))
 
     @cached_property

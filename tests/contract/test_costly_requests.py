@@ -1,59 +1,142 @@
-"""Requests whose options multiply to more memory or time than a job may have."""
+"""Small requests that would cost much: JSON of many values, tokens by the thousand, parameters by the thousand."""
 
 from __future__ import annotations
 
+import json
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from redis import Redis
 
-from tests.contract.bad_input import post
-from tests.contract.world import World, assert_refused, make_world
+from regnf_service.http import parsing
+from regnf_service.http.json_size import MOST_VALUES, count_values
+from regnf_service.http.schemas import reading
+from regnf_service.http.wrong_tokens import WrongTokens
+from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world
 
-COSTLY: list[tuple[dict[str, Any], set[str]]] = [
-    (
-        {"preset": "paper", "sampling": {"views": 64, "image_size": 4096, "pixel_stride": 1}},
-        {"/options/sampling/views", "/options/sampling/image_size", "/options/sampling/pixel_stride"},
-    ),
-    (
-        {"preset": "paper", "initialization": {"draws": 256, "ransac_iterations": 10_000_000}},
-        {"/options/initialization/draws", "/options/initialization/ransac_iterations"},
-    ),
-    (
-        {
-            "preset": "paper",
-            "optimization": {"iterations": 10_000, "samples_per_iteration": 1_000_000},
-            "resampling": {"max_samples": 1_000_000, "every": 10_000},
-        },
-        {"/options/optimization/iterations", "/options/optimization/samples_per_iteration"},
-    ),
-    (
-        {
-            "preset": "paper",
-            "optimization": {"iterations": 10_000},
-            "resampling": {"every": 1, "max_samples": 1_000_000},
-        },
-        {"/options/optimization/iterations", "/options/resampling/every", "/options/resampling/max_samples"},
-    ),
-]
+ALICE = {"Authorization": "Bearer open-sesame-open-sesame"}
+SEARCH = {"scene": "a" * 64, "detection": BOX, "candidates": [{"field": f"{n:064x}"} for n in range(512)]}
 
 
-@pytest.mark.parametrize(("options", "pointers"), COSTLY)
-def test_options_whose_product_is_too_costly(world: World, options: dict[str, Any], pointers: set[str]) -> None:
-    body = world.valid_request() | {"options": options}
-    for path in ("/register", "/register?dry_run=true"):
-        answer = world.client.post(path, json=body)
-        problem = assert_refused(answer, 422, "OPTIONS_TOO_COSTLY")
-        assert {fault["pointer"] for fault in problem["errors"]} == pointers
-        assert all("limit" in fault["detail"] for fault in problem["errors"])
-    assert world.queue.registrations == []
+@pytest.fixture
+def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"alice:open-sesame-open-sesame"}))
+    with made.client:
+        yield made
 
 
-def test_default_options_are_never_too_costly(redis: Redis, tmp_path: Path) -> None:
-    world = make_world(tmp_path, redis, job_timeout_s=1, job_memory_bytes=512 << 20)
-    for preset in ("paper", "robust"):
-        body = world.valid_request() | {"options": {"preset": preset}}
-        assert post(world, body).status_code == 202
-    dearer = world.valid_request() | {"options": {"robust": {"rotations": 20_000}}}
-    assert_refused(post(world, dearer), 422, "OPTIONS_TOO_COSTLY")
+@pytest.mark.parametrize(
+    "body",
+    [
+        json.dumps({f"member{n}": n for n in range(80_000)}),
+        "[" + ",".join(["[]"] * 5000) + "]",
+        '{"a":' * 5000 + "1" + "}" * 5000,
+        json.dumps({"detection": BOX | {f"m{n}": 1 for n in range(300)}}),
+        json.dumps({"options": {"refinement": {f"m{n}": 1 for n in range(300)}}}),
+    ],
+    ids=["members", "lists", "depth", "detection", "options"],
+)
+def test_json_of_too_many_values_is_not_looked_at(world: World, body: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading, "_adapter", None)
+    assert_refused(post(world, body), 413, "REQUEST_TOO_LARGE")
+
+
+def post(world: World, body: str) -> Any:
+    return world.client.post("/register", content=body, headers={"Content-Type": "application/json"})
+
+
+def test_the_largest_request_of_the_contract_fits(world: World) -> None:
+    text = json.dumps(SEARCH | {"options": {"preset": "robust"}}, indent=4)
+    assert count_values(text.encode()) < MOST_VALUES / 2
+    assert_refused(post(world, text), 404, "FIELD_NOT_FOUND")
+
+
+def test_few_of_many_faults_are_worked_out(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked = []
+    meant = reading._meant
+    monkeypatch.setattr(reading, "_meant", lambda place, model: looked.append(place) or meant(place, model))
+    problem = assert_refused(post(world, json.dumps({f"m{n}": 1 for n in range(250)})), 422, "INVALID_DETECTION")
+    assert len(problem["errors"]) == 32
+    assert len(looked) <= 32
+
+
+def test_a_large_body_is_read_beside_the_event_loop(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = []
+    read = parsing.read_model
+    monkeypatch.setattr(
+        parsing, "read_model", lambda *given: names.append(threading.current_thread().name) or read(*given)
+    )
+    assert_refused(post(world, json.dumps(SEARCH)), 404, "FIELD_NOT_FOUND")
+    assert_refused(post(world, json.dumps(SEARCH | {"candidates": SEARCH["candidates"][:1]})), 404, "FIELD_NOT_FOUND")
+    assert "worker" in names[0]
+    assert "worker" not in names[1]
+
+
+def test_an_option_in_a_description_is_unknown_there(world: World) -> None:
+    """Its place has one step alone, which the search for what was meant did not expect."""
+    files = {"file": ("f", field_bytes("described")), "description": (None, json.dumps({"options": {}}))}
+    assert_refused(world.client.post("/fields", files=files), 422, "INVALID_OPTIONS")
+
+
+def test_many_parameters_are_not_looked_at(world: World) -> None:
+    query = "&".join(f"p{n}=1" for n in range(2000))
+    assert "At most" in assert_refused(world.client.get(f"/fields?{query}"), 400, "INVALID_QUERY")["detail"]
+
+
+@pytest.mark.parametrize("kind", ["text/plain", "text/plain;charset=UTF-8", "TEXT/xml"])
+def test_what_a_form_can_send_without_asking_is_refused(world: World, kind: str) -> None:
+    answer = world.client.post("/fields", content=field_bytes("form"), headers={"Content-Type": kind})
+    assert_refused(answer, 415, "UNSUPPORTED_MEDIA_TYPE")
+    assert_refused(
+        world.client.post("/register", content=b"{}", headers={"Content-Type": kind}), 415, "UNSUPPORTED_MEDIA_TYPE"
+    )
+
+
+@pytest.mark.parametrize("label", ["a\u0085b", "a\u2028b", "a\u2029b", "a\x9fb", "a\u200fb", "\u061ca", "a\ufeff"])
+def test_labels_break_no_lines_and_turn_no_text(world: World, label: str) -> None:
+    request = world.valid_request() | {"detection": BOX | {"label": label}}
+    assert_refused(world.client.post("/register", json=request), 422, "INVALID_DETECTION")
+    files = {"file": ("f", field_bytes("labeled")), "description": (None, json.dumps({"label": label}))}
+    assert_refused(world.client.post("/fields", files=files), 422, "INVALID_DESCRIPTION")
+
+
+# wrong tokens
+
+
+def test_wrong_tokens_become_429_and_right_ones_stay_right(guarded: World) -> None:
+    def guess(token: str) -> Any:
+        return guarded.client.get("/jobs", headers={"Authorization": f"Bearer {token}"})
+
+    statuses = [guess(f"guess-{n}").status_code for n in range(60)]
+    assert statuses[:20] == [401] * 20
+    assert statuses[-1] == 429
+    refused = guess("another")
+    assert_refused(refused, 429, "TOO_MANY_WRONG_TOKENS")
+    assert 1 <= int(refused.headers["retry-after"]) <= 5
+    assert refused.headers["connection"] == "close"
+    assert guarded.client.get("/jobs", headers=ALICE).status_code == 200
+    # no token at all is no guess
+    assert_refused(guarded.client.get("/jobs"), 401, "UNAUTHENTICATED")
+
+
+def test_buckets_are_of_addresses_and_few() -> None:
+    now = 0.0
+    wrong = WrongTokens(lambda: now)
+
+    def send(address: str, times: int = 1) -> int:
+        return [wrong.wait_s({"client": (address, 1)}) for _ in range(times)][-1]
+
+    assert send("10.0.0.1", 20) == 0
+    assert send("10.0.0.1") == 5
+    assert send("10.0.0.2") == 0
+    assert send("2001:db8::1", 20) == 0
+    assert send("2001:db8::ffff") == 5
+    now = 5.0
+    assert send("10.0.0.1") == 0
+    assert send("10.0.0.1") == 5
+    for number in range(10_000):
+        send(f"10.1.{number // 256}.{number % 256}")
+    assert len(wrong._sites) == 4096

@@ -13,7 +13,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.http.problems import problem_response
 from regnf_service.http.security_headers import secure
-from regnf_service.problem import Problem
+from regnf_service.http.wrong_tokens import WrongTokens
+from regnf_service.problem import CLOSE, Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
@@ -109,6 +110,7 @@ class TokenGate:
         self._callers = callers
         self._needs_token = needs_token
         self._allow_unauthenticated = allow_unauthenticated
+        self._wrong = WrongTokens()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -121,12 +123,14 @@ class TokenGate:
         else:
             known = self._allow_unauthenticated or not _came_from_outside(scope)
         scope.setdefault("state", {})["caller"] = caller
-        problem = None if known or is_open(scope) else self._refusal()
+        problem = None if known or is_open(scope) else self._refusal(scope)
         with log_context(caller=caller):
             if problem is not None:
                 await problem_response(problem, scope)(scope, receive, send)
             else:
                 await self._app(scope, receive, send)
 
-    def _refusal(self) -> Problem:
+    def _refusal(self, scope: Scope) -> Problem:
+        if self._needs_token and "authorization" in Headers(scope=scope) and (wait := self._wrong.wait_s(scope)):
+            return Problem("TOO_MANY_WRONG_TOKENS", headers={"Retry-After": str(wait)} | CLOSE)
         return Problem("UNAUTHENTICATED", None if self._needs_token else _NO_TOKENS, headers=_CHALLENGE)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from regnf_core.json_faults import json_fault
+from regnf_service.http.json_size import MOST_MEMBERS, MOST_VALUES, count_values
 from regnf_service.problem import Problem
 
 _MAX_DEPTH = 32
@@ -18,8 +19,10 @@ def parse_json(body: bytes) -> Any:
 
     NaN and Infinity are accepted here; the schema refuses them with their place.
 
-    Raises Problem MALFORMED_JSON.
+    Raises Problem MALFORMED_JSON, REQUEST_TOO_LARGE for more values than any request needs.
     """
+    if count_values(body) > MOST_VALUES:
+        raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {MOST_VALUES} members and values is taken.")
     try:
         value = json.loads(body.decode("utf-8"), object_pairs_hook=_object, parse_float=_number)
     except UnicodeDecodeError as error:
@@ -39,6 +42,8 @@ def _number(text: str) -> float | int:
 
 
 def _object(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    if len(pairs) > MOST_MEMBERS:
+        raise Problem("REQUEST_TOO_LARGE", f"An object of at most {MOST_MEMBERS} members is taken.")
     members = dict(pairs)
     if len(members) != len(pairs):
         raise Problem("MALFORMED_JSON", "An object names a member twice.")

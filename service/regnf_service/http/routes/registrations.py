@@ -16,6 +16,7 @@ from regnf_service.fields.uploads import open_upload
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
+from regnf_service.http.parsing import read_body
 from regnf_service.http.routes.documentation import (
     FILE,
     JOB_LINKS,
@@ -28,7 +29,6 @@ from regnf_service.http.routes.documentation import (
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
 from regnf_service.http.schemas.jobs import JobDocument
-from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 from regnf_service.http.waiting import wait_for
@@ -164,7 +164,7 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     settings = services.settings
     text = await body.read_small(request, settings)
-    spec = read_model(RegisterRequest, text)
+    spec = await read_body(services, RegisterRequest, text)
     asked = spec.to_request(spec.scene, spec.object, spec.candidates)
     named = {"/scene": spec.scene}
     if spec.object is not None:
@@ -186,7 +186,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
-        spec = read_model(RegistrationSpec, parts["request"])
+        spec = await read_body(services, RegistrationSpec, parts["request"])
         received = {name: await upload.finish() for name, upload in files.items()}
         asked = spec.to_request(received["scene"].sha256, received["object"].sha256)
         await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held

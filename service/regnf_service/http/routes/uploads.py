@@ -120,6 +120,8 @@ async def post_field(
     ] = None,
 ) -> JSONResponse:
     """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
+    if body.media_type(request).startswith("text/"):
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
     digest = announced_digest(content_digest)
     async with open_upload(services, caller) as upload:
         if body.media_type(request) == "multipart/form-data":

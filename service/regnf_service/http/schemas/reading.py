@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from functools import cache
+from typing import Any, NamedTuple, TypeVar, cast
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -15,7 +16,7 @@ from regnf_service.http.schemas.members import members_at
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
 from regnf_service.http.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
 from regnf_service.http.strict_json import parse_json
-from regnf_service.problem import Problem, json_pointer
+from regnf_service.problem import MAX_ERRORS, Problem, json_pointer
 
 _REASONS = {
     "detection": "INVALID_DETECTION",
@@ -50,9 +51,15 @@ def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUE
     """
     text = json.dumps(parse_json(body))
     try:
-        return TypeAdapter(model).validate_json(text, strict=True)
+        validated: _Model = _adapter(cast(Any, model)).validate_json(text, strict=True)
     except ValidationError as error:
         raise refusal(error, otherwise, model) from error
+    return validated
+
+
+@cache
+def _adapter(model: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(model)
 
 
 def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
@@ -60,7 +67,7 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     raw = error.errors(include_url=False)
     if any(fault["type"] == "json_invalid" for fault in raw):
         return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
-    faults = [_fault(entry, model) for entry in raw]
+    faults = [_fault(entry, model) for entry in raw[:MAX_ERRORS]]
     reasons = [_REASONS_OF_FAULTS.get(one.kind) or _REASONS.get(str((*one.place, "")[0])) for one in faults]
     reason = next(filter(None, reasons), otherwise)
     of_box = next((one.detail for one in faults if one.kind == DETECTION_FAULT), None)
@@ -79,7 +86,7 @@ def _fault(entry: Any, model: Any) -> _Fault:
     if kind == DETECTION_FAULT:
         context = entry["ctx"]
         return _Fault(kind, (*place, *context["place"]), str(context["message"]), context["hint"])
-    if kind == UNKNOWN_OPTION and place[0] == "options":
+    if kind == UNKNOWN_OPTION and place[0] == "options" and len(place) > 1:
         meant = did_you_mean(place[1:])
         return _Fault(kind, place, "No such option" + meant, meant.replace("; did", "Did", 1) or _meant(place, model))
     if kind in ("extra_forbidden", UNKNOWN_OPTION):
