@@ -100,6 +100,7 @@ class Settings(BaseSettings):
     job_scratch_bytes: int = Field(default=4096 * MIB, ge=64 * MIB)
     """Temporary files of one job, and the largest single file that it may write."""
     import_timeout_s: int = Field(default=120, ge=1)
+    import_work_s: float = Field(default=60.0, gt=0)
     import_memory_bytes: int = Field(default=8192 * MIB, ge=256 * MIB)
     heartbeat_s: float = Field(default=5.0, gt=0)
     lost_after_s: float = Field(default=90.0, gt=0)

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+MAX_ELEMENTS = 1 << 24
+"""Elements that any value of the graph may have, for one batch."""
 _MANY = 64
 
 

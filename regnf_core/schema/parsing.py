@@ -15,6 +15,8 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds import KINDS
 
+_MAX_DEPTH = 32
+
 
 def parse_description(values: Any) -> FieldDescription:
     """The description from plain (JSON) values, of the kind that its ``kind`` names.
@@ -23,6 +25,8 @@ def parse_description(values: Any) -> FieldDescription:
     """
     if not isinstance(values, dict):
         raise FieldFormatError("the field's description is not a JSON object", reason="SAFE_FORMAT_INVALID")
+    if not _is_flat(values):
+        raise FieldFormatError(f"the description nests deeper than {_MAX_DEPTH}", reason="SAFE_FORMAT_INVALID")
     name = values.get("kind")
     described = KINDS.get(name) if isinstance(name, str) else None
     if described is None:
@@ -38,6 +42,17 @@ def parse_description(values: Any) -> FieldDescription:
     if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lower, upper, strict=True)):
         raise FieldFormatError("description.bounds: not a finite, non-empty box", reason="SAFE_FORMAT_INVALID")
     return description
+
+
+def _is_flat(values: dict[str, Any]) -> bool:
+    """Whether no value lies deeper than ``_MAX_DEPTH``: what is parsed must be written again, and read by others."""
+    level: list[Any] = [values]
+    for _ in range(_MAX_DEPTH):
+        inner = (value.values() if isinstance(value, dict) else value for value in level)
+        level = [value for values in inner for value in values if isinstance(value, dict | list | tuple)]
+        if not level:
+            return True
+    return False
 
 
 def description_to_dict(description: FieldDescription) -> dict[str, Any]:

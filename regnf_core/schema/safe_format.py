@@ -41,7 +41,7 @@ def write_safe_field(
     FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
     """
     parsed = parse_description(description)
-    specs = {name: TensorSpec(array.shape, _type_name(name, array)) for name, array in tensors.items()}
+    specs = tensor_specs(tensors)
     parsed.check(specs)
     for name, array in tensors.items():
         if not np.isfinite(array).all():
@@ -55,6 +55,11 @@ def write_safe_field(
             file.write(
                 np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<"), copy=False).data
             )
+
+
+def tensor_specs(tensors: Mapping[str, NDArray[Any]]) -> dict[str, TensorSpec]:
+    """Shapes and types of arrays. Raises FieldFormatError (SAFE_FORMAT_INVALID) for a type that no field file holds."""
+    return {name: TensorSpec(array.shape, _type_name(name, array)) for name, array in tensors.items()}
 
 
 def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -26,7 +26,11 @@ def run_import(sha256: str) -> None:
     from regnf_worker.imports import run_import_attempt
 
     settings = Settings()
-    limits = ImportLimits(wall_s=settings.import_timeout_s, memory_bytes=settings.import_memory_bytes)
+    limits = ImportLimits(
+        wall_s=settings.import_timeout_s,
+        work_s=settings.import_work_s,
+        memory_bytes=settings.import_memory_bytes,
+    )
     context = Context.from_settings(settings, existing=True)
     run_import_attempt(context, sha256, *delivery(), core_importer(limits))
 

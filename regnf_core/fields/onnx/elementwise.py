@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from regnf_core.schema.onnx_operators import MAX_ELEMENTS
+
 Attributes = dict[str, Any]
 Operator = Callable[[Attributes, "list[Tensor | None]"], "Tensor | tuple[Tensor, ...]"]
 
 _FLOAT_TYPES, _INT_TYPES, _BOOL_TYPE = (1, 10, 11, 16), (2, 3, 4, 5, 6, 7, 12, 13), 9
 """ONNX's numbers of types; here all real numbers are float32 and all whole ones int64."""
-MAX_ELEMENTS = 1 << 24
-"""Elements that any value of the graph may have, for one batch."""
 
 
 def needed(value: Tensor | None) -> Tensor:
@@ -84,7 +84,14 @@ def _clip(_: Attributes, inputs: list[Tensor | None]) -> Tensor:
 
 
 def _div(a: Tensor, b: Tensor) -> Tensor:
-    return a / b if a.is_floating_point() else torch.div(a, b, rounding_mode="trunc")
+    if a.is_floating_point():
+        return a / b
+    if b.is_floating_point():
+        return torch.div(a, b, rounding_mode="trunc")
+    # The processor traps where the lowest number is divided by -1; its opposite wraps as all whole numbers here do.
+    opposite = b == -1
+    quotient = torch.div(a, torch.where(opposite, 1, b), rounding_mode="trunc")
+    return torch.where(opposite, -a, quotient)
 
 
 def _mod(attributes: Attributes, inputs: list[Tensor | None]) -> Tensor:

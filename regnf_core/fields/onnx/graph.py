@@ -12,10 +12,11 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.onnx.elementwise import ELEMENTWISE, MAX_ELEMENTS, Operator
+from regnf_core.fields.onnx.elementwise import ELEMENTWISE, Operator
 from regnf_core.fields.onnx.linear import LINEAR
 from regnf_core.fields.onnx.shaping import SHAPING
 from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.onnx_operators import MAX_ELEMENTS
 
 OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
 _TYPES = {"float32": torch.float32, "int64": torch.int64, "bool": torch.bool}
@@ -83,7 +84,10 @@ class OnnxFunction:
     def _slope(distance: Tensor, leaf: Tensor) -> Tensor:
         if not distance.requires_grad:  # constant, or made of steps alone
             return torch.zeros_like(leaf)
-        (gradient,) = torch.autograd.grad(distance.sum(), leaf, allow_unused=True)
+        try:
+            (gradient,) = torch.autograd.grad(distance.sum(), leaf, allow_unused=True)
+        except _FAULTS as error:
+            raise _fault("the gradient", error) from error
         return torch.zeros_like(leaf) if gradient is None else gradient
 
     def _run(self, points: Tensor) -> Tensor:
@@ -106,14 +110,19 @@ def run_step(step: Step, values: Mapping[str, Tensor | None]) -> dict[str, Tenso
     try:
         found = step.function(step.attributes, [values[name] for name in step.inputs])
     except _FAULTS as error:
-        if _NO_MEMORY in str(error):
-            raise MemoryError(str(error)) from error
-        raise FieldFormatError(f"{step.where}: {str(error)[:200]}", reason="ONNX_GRAPH_INVALID") from error
+        raise _fault(step.where, error) from error
     outputs = found if isinstance(found, tuple) else (found,)
     if len(outputs) < len(step.outputs) or any(value.numel() > MAX_ELEMENTS for value in outputs):
         message = f"{step.where}: fewer outputs than named, or more than {MAX_ELEMENTS} numbers"
         raise FieldFormatError(message, reason="ONNX_GRAPH_INVALID")
     return dict(zip(step.outputs, outputs, strict=False))
+
+
+def _fault(where: str, error: Exception) -> Exception:
+    """What torch's error stands for: too little memory, or a graph that contradicts itself."""
+    if _NO_MEMORY in str(error):
+        return MemoryError(str(error))
+    return FieldFormatError(f"{where}: {str(error)[:200]}", reason="ONNX_GRAPH_INVALID")
 
 
 def build_onnx(description: OnnxDescription, tensors: Mapping[str, Tensor]) -> FunctionField[OnnxFunction]:

@@ -24,6 +24,9 @@ _WORK_STEP, _MAX_WORK_STEPS = 100_000, 10_000
 _FAULTS = (sqlite3.Error, UnicodeError)
 """The second where SQLite's own words on a fault quote bytes that are not text."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
+_PLAIN_STATEMENTS = {"table": ("CREATE TABLE",), "index": ("CREATE INDEX", "CREATE UNIQUE INDEX")}
+_COMPUTED = -2
+"""In place of a column's number, in SQLite's list of an index's columns."""
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: _MAX_VALUE_BYTES,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 10_000,
@@ -60,6 +63,8 @@ class TableSource:
             self._connection.set_authorizer(_allow_reading)
             self._connection.set_progress_handler(self._too_much_work, _WORK_STEP)
             self.tables = self._read_schema()
+            for table in sorted(self.tables):
+                self._require_plain(table)
         except _FAULTS as error:
             self.close()
             raise _malformed(error) from error
@@ -85,19 +90,33 @@ class TableSource:
             raise _malformed(error) from error
 
     def _read_schema(self) -> frozenset[str]:
-        """The tables' names. What could compute while it is read (views, triggers, virtual tables) is refused."""
+        """The tables' names: each entry makes a table or an index of one, by what it says and by what it is."""
         tables = set()
         for count, (kind, name, statement) in enumerate(
             self._connection.execute("SELECT type, name, sql FROM sqlite_master")
         ):
+            made = _PLAIN_STATEMENTS.get(kind, ()) if isinstance(kind, str) else ()
             text = statement.upper() if isinstance(statement, str) else ""
-            plain = kind == "index" or (kind == "table" and text.startswith("CREATE TABLE") and "GENERATED" not in text)
-            if count >= _MAX_TABLES or not plain:
-                message = f"the file holds a {str(kind)[:20]} that is not a plain table, or too many tables"
-                raise FieldFormatError(message, reason="SQLITE_NOT_PLAIN")
+            own_index = kind == "index" and statement is None  # of a key; SQLite makes it
+            if count >= _MAX_TABLES or not (own_index or text.startswith(made or ("-",))):
+                raise _not_plain(f"a {str(kind)[:20]}, or too many tables")
             if kind == "table" and isinstance(name, str) and _NAME.fullmatch(name):
                 tables.add(name)
         return frozenset(tables)
+
+    def _require_plain(self, table: str) -> None:
+        """Nothing of the table is computed, however that is spelled: no column, and no entry or condition of an index.
+
+        Raises FieldFormatError (SQLITE_NOT_PLAIN).
+        """
+        hidden = [row[6] for row in self._connection.execute(f'PRAGMA table_xinfo("{table}")')]
+        if any(hidden):
+            raise _not_plain("a computed column")
+        for _, name, _, _, partial in self._connection.execute(f'PRAGMA index_list("{table}")').fetchall():
+            quoted = str(name).replace('"', '""')
+            columns = [row[1] for row in self._connection.execute(f'PRAGMA index_xinfo("{quoted}")')]
+            if partial or _COMPUTED in columns:
+                raise _not_plain("an index of what is computed")
 
     def _too_much_work(self) -> bool:
         self._work -= 1
@@ -121,9 +140,14 @@ def _check_header(data: memoryview) -> None:
         raise FieldFormatError("the database was cut short", reason="FILE_TRUNCATED")
 
 
-def _allow_reading(action: int, *_names: str | None) -> int:
+def _allow_reading(action: int, first: str | None, *_: str | None) -> int:
     allowed = action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
-    return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
+    looking = action == sqlite3.SQLITE_PRAGMA and first in ("table_xinfo", "index_list", "index_xinfo")
+    return sqlite3.SQLITE_OK if allowed or looking else sqlite3.SQLITE_DENY
+
+
+def _not_plain(what: str) -> FieldFormatError:
+    return FieldFormatError(f"the file holds more than plain tables: {what}", reason="SQLITE_NOT_PLAIN")
 
 
 def _malformed(cause: object) -> FieldFormatError:

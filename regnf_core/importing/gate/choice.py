@@ -15,9 +15,9 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.plausibility import check_plausibility
+from regnf_core.importing.work.calls import TRIAL_SAMPLES
 from regnf_core.schema.parsing import parse_description
 
-_SAMPLES = 4_096
 _CLEARLY_BETTER = 0.05
 """A reading must beat the most usual one by this much in its gradient's norm to be preferred."""
 
@@ -66,7 +66,7 @@ def _misfit(reading: Reading) -> float:
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # the map of the upload; only read
         tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
     try:
-        measured, _ = check_plausibility(build_field(description, tensors), _SAMPLES)
+        measured, _ = check_plausibility(build_field(description, tensors), TRIAL_SAMPLES)
     except FieldFormatError:  # no surface, or numbers that are not finite
         return math.inf
     norms = [measured[f"gradient_{quantile}"] for quantile in ("p10", "median", "p90")]

@@ -50,10 +50,13 @@ def convert_file(
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
     from regnf_core.fields.build import open_field
+    from regnf_core.importing.work.estimate import require_affordable
     from regnf_core.schema.safe_format import write_safe_field
 
-    converted = _settled(_convert(upload, description, limits.tensor_bytes))
+    converted = _convert(upload, description, limits.tensor_bytes)
     _require_text(converted.description)
+    require_affordable(converted, limits.work_s)
+    converted = _settled(converted)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
     parameters = sum(array.size for name, array in converted.tensors.items() if name != OBSERVATION)

@@ -10,12 +10,9 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
+from regnf_core.importing.work.calls import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
 from regnf_core.surface.projection import newton_step
 
-SAMPLES = 16_384
-_NEAREST_SHARE = 16
-_STEPS = 8
-_ASKED_AGAIN = 64
 _SAME = 1e-3
 """Sums in another order give other last digits: by less than this share of the largest distance."""
 _SURFACE_SHARE = 1e-3
@@ -27,8 +24,11 @@ _MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zer
 @contextmanager
 def without_new_code() -> Iterator[None]:
     """Keep torch from oneDNN, which writes machine code for the processor at hand: the filter refuses such pages."""
-    with torch.backends.mkldnn.flags(enabled=False):
+    before = torch.backends.mkldnn.set_flags(_enabled=False)  # type: ignore[no-untyped-call]
+    try:
         yield
+    finally:
+        torch.backends.mkldnn.set_flags(_enabled=before[0])  # type: ignore[no-untyped-call]
 
 
 @without_new_code()
@@ -49,7 +49,7 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
     distance = field.signed_distance(points)
     _require_finite(distance)
     _require_function(field, points, distance)
-    nearest = points[distance.abs().argsort()[: samples // _NEAREST_SHARE]]
+    nearest = points[distance.abs().argsort()[: samples // NEAREST_SHARE]]
     norms, signs = _walk_to_surface(field, nearest, (lower, upper))
     inside = distance < 0
     both_sides = bool(inside.any() or (signs < 0).any()) and bool((~inside).any() or (signs > 0).any())
@@ -69,9 +69,9 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
 
 def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None:
     """A few of the points once more, in another order and without the rest."""
-    again = field.signed_distance(points[:_ASKED_AGAIN].flip(0)).flip(0)
+    again = field.signed_distance(points[:ASKED_AGAIN].flip(0)).flip(0)
     _require_finite(again)
-    if (again - distance[:_ASKED_AGAIN]).abs().max() > _SAME * distance.abs().max():
+    if (again - distance[:ASKED_AGAIN]).abs().max() > _SAME * distance.abs().max():
         message = "a point's distance depends on which other points are evaluated"
         raise FieldFormatError(message, reason="FIELD_NOT_A_FUNCTION")
 
@@ -80,9 +80,9 @@ def _share_inside_at_bounds(
     field: SdfField, box: tuple[Tensor, Tensor], samples: int, generator: torch.Generator
 ) -> float:
     """Share of the bounds' faces, each counting alike, that lies inside matter."""
-    each = samples // 64
-    points = torch.rand(6, each, 3, generator=generator)
-    for face in range(6):
+    each = samples // FACE_SHARE
+    points = torch.rand(FACES, each, 3, generator=generator)
+    for face in range(FACES):
         points[face, :, face // 2] = float(face % 2)
     distance = field.signed_distance(box[0] + (box[1] - box[0]) * points.view(-1, 3))
     _require_finite(distance)
@@ -96,7 +96,7 @@ def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]
     """
     diagonal = float((box[1] - box[0]).norm())
     signs = []
-    for _ in range(_STEPS):
+    for _ in range(STEPS):
         distance, gradient = _evaluate(field, points)
         signs.append(distance.sign())
         step = newton_step(distance, gradient, _MIN_SLOPE)

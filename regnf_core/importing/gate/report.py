@@ -17,6 +17,8 @@ class ImportLimits:
     """Seconds from start to end; then IMPORT_TIMEOUT."""
     cpu_s: int = 240
     """Processor seconds; then IMPORT_TIMEOUT."""
+    work_s: float = 60.0
+    """Seconds of one core that the field's evaluation is estimated to take; then IMPORT_TOO_COSTLY, at once."""
     memory_bytes: int = 8192 * MIB
     """Address space, the mapped upload (and about 1 GiB of libraries) included; then IMPORT_OUT_OF_MEMORY."""
     tensor_bytes: int = 4096 * MIB

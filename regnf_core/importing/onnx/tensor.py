@@ -30,7 +30,8 @@ def read_tensor(data: memoryview) -> tuple[str, Array]:
     if message.get(_EXTERNAL) or wire.integer(message, _LOCATION) != 0:
         text = "the model keeps weights in another file: export it whole (external_data=False)"
         raise FieldFormatError(text, reason="ONNX_EXTERNAL_DATA")
-    if len(shape) > _MAX_DIMENSIONS or any(n < 0 for n in shape) or math.prod(shape) > _MAX_ITEMS:
+    # An axis of no length does not make the others harmless: numpy counts it as one.
+    if len(shape) > _MAX_DIMENSIONS or any(n < 0 for n in shape) or math.prod(max(n, 1) for n in shape) > _MAX_ITEMS:
         raise wire.malformed("a tensor of a shape that no weight has")
     if kind not in _RAW_TYPES:
         raise FieldFormatError(f"an ONNX tensor of type {kind}; real numbers are needed", reason="TENSOR_DTYPE")

@@ -16,7 +16,10 @@ from regnf_service.tokens import TokensError
 
 _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000
-_TRANSLATED = ipaddress.ip_network("64:ff9b::/96")
+_UNICAST = ipaddress.ip_network("2000::/3")
+"""All of IPv6 that is given out to the Internet: what lies beyond is local, translated, or not in use."""
+_SPECIAL = tuple(map(ipaddress.ip_network, ("2001::/23", "2001:db8::/32", "2002::/16", "3fff::/20")))
+"""Within it: protocols' own (Teredo among them), examples, addresses that carry IPv4 ones, and examples again."""
 
 
 class Target(NamedTuple):
@@ -80,6 +83,8 @@ def _plain(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
 def is_public(address: str) -> bool:
     """Whether an address belongs to the public Internet, those that carry another address inside aside."""
     found = _plain(address)
-    if isinstance(found, ipaddress.IPv6Address) and (found.sixtofour or found.teredo or found in _TRANSLATED):
+    if isinstance(found, ipaddress.IPv6Address) and (
+        found not in _UNICAST or any(found in network for network in _SPECIAL)
+    ):
         return False
-    return found.is_global and not found.is_multicast
+    return found.is_global and not found.is_multicast and not found.is_reserved

@@ -141,6 +141,17 @@ def test_faulty_maps_are_refused(tmp_path: Path, rows: Any, block_size: Any, rea
         ("CREATE TRIGGER t AFTER INSERT ON color_layer_data BEGIN SELECT 1; END;", "SQLITE_NOT_PLAIN"),
         ("CREATE VIRTUAL TABLE f USING fts5(body);", "SQLITE_NOT_PLAIN"),
         ("CREATE TABLE g (a INT, b INT GENERATED ALWAYS AS (a + 1));", "SQLITE_NOT_PLAIN"),
+        ("ALTER TABLE tsdf_layer_data ADD COLUMN c AS (1 + 1);", "SQLITE_NOT_PLAIN"),
+        ("CREATE TABLE g (a INT, b INT AS (a + 1) STORED);", "SQLITE_NOT_PLAIN"),
+        ("CREATE TABLE g (a, b as(abs(a)));", "SQLITE_NOT_PLAIN"),
+        ("CREATE TABLE g (a, 'b' AS (a)) WITHOUT ROWID;".replace("a,", "a PRIMARY KEY,"), "SQLITE_NOT_PLAIN"),
+        ("CREATE INDEX i ON tsdf_layer_data (index_x + 1);", "SQLITE_NOT_PLAIN"),
+        ("CREATE INDEX i ON tsdf_layer_data (index_x) WHERE index_x > 1;", "SQLITE_NOT_PLAIN"),
+        (
+            "PRAGMA writable_schema = ON; INSERT INTO sqlite_master VALUES"
+            " ('index', 'v', 'tsdf_layer_data', 0, 'CREATE VIEW v AS SELECT 1');",
+            "SQLITE_MALFORMED",
+        ),
         ("".join(f"CREATE TABLE t{i} (a);" for i in range(70)), "SQLITE_NOT_PLAIN"),
         ("CREATE TABLE more_tsdf_data (a); CREATE TABLE more_tsdf_metadata (a);", "FAMILY_NOT_SUPPORTED"),
         (

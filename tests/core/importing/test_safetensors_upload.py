@@ -126,6 +126,22 @@ def test_labels_that_no_file_can_hold_or_no_page_show_are_refused(field_file: Pa
     assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
 
 
+@pytest.mark.parametrize("depth", [40, 300, 900, 5_000, 90_000])
+@pytest.mark.parametrize(("opening", "closing"), [('{"a":', "}"), ("[", "]")])
+def test_a_description_that_nests_deep_is_refused(
+    field_file: Path, tmp_path: Path, depth: int, opening: str, closing: str
+) -> None:
+    """What can be read but not be written again, by this program or another's."""
+    data = field_file.read_bytes()
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length])
+    described = json.loads(header["__metadata__"]["field"]) | {"source": {"of": "@"}}
+    deep = json.dumps(described).replace('"@"', opening * depth + "1" + closing * depth)
+    header["__metadata__"]["field"] = deep
+    path = saved(tmp_path, layout(header, data[8 + length :]))
+    assert_refused(lambda: convert_file(path, tmp_path / "out", None, ImportLimits()), "SAFE_FORMAT_INVALID")
+
+
 def test_the_budget_holds(field_file: Path, tmp_path: Path) -> None:
     limits = ImportLimits(tensor_bytes=1000)
     assert_refused(lambda: convert_file(field_file, tmp_path, None, limits), "TENSOR_TOO_LARGE")

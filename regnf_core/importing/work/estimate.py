@@ -1,0 +1,47 @@
+"""The work of an import, estimated before anything is evaluated, and the limit on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.work.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
+from regnf_core.importing.work.mesh_work import mesh_work
+from regnf_core.importing.work.network_work import network_work
+from regnf_core.importing.work.onnx_work import onnx_work
+from regnf_core.schema.description import FieldDescription
+from regnf_core.schema.kinds.mesh import MeshDescription
+from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import tensor_specs
+
+
+def require_affordable(converted: ConvertedField, work_s: float) -> float:
+    """The estimated seconds of one core for every evaluation of the import.
+
+    Raises FieldFormatError: IMPORT_TOO_COSTLY beyond ``work_s``, and what the description is refused for.
+    """
+    trials = [(reading.description, reading.tensors) for reading in converted.readings]
+    seconds = sum(_seconds(*trial, calls_of_check(TRIAL_SAMPLES)) for trial in trials)
+    seconds += _seconds(converted.description, converted.tensors, calls_of_check(SAMPLES))
+    if seconds > work_s:
+        message = f"the field's checks would take an estimated {seconds:.0f} s of a core; {work_s:g} s are allowed"
+        raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
+    return seconds
+
+
+def _seconds(description: dict[str, object], tensors: Mapping[str, StoredArray], calls: Calls) -> float:
+    parsed = parse_description(description)
+    parsed.check(tensor_specs(tensors))
+    return _work(parsed, tensors, calls)
+
+
+def _work(description: FieldDescription, tensors: Mapping[str, StoredArray], calls: Calls) -> float:
+    match description:
+        case OnnxDescription():
+            return onnx_work(description, tensors, calls)
+        case MeshDescription():
+            return mesh_work(tensors, calls)
+    return network_work(description, tensors, calls)

@@ -1,0 +1,233 @@
+"""The work of a graph is told before it is run: shapes as evaluated, and costly graphs refused at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.onnx.graph import OPERATOR_FUNCTIONS, Step, run_step
+from regnf_core.importing.families.onnx import convert_onnx
+from regnf_core.importing.gate.convert import convert_file
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.work.onnx_shapes import RULES
+from regnf_core.importing.work.onnx_work import walk
+from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.onnx_operators import OPERATORS
+from regnf_core.schema.parsing import parse_description
+from tests.core.fields.test_onnx import GRAPHS
+from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.onnx_models import Initializers, model
+
+HALF: Initializers = {"axes": np.array([1]), "half": np.array(0.5, np.float32)}
+SPHERE = "r = ReduceL2 x axes keepdims:1; s = Sub r half; "
+LAST = "; k = ReduceSum {0} axes keepdims:1; t = Tanh k; y = Add s t"
+TYPES = {"b": torch.bool, "i": torch.int64, "f": torch.float32}
+
+
+def ints(*values: int) -> np.ndarray[Any, Any]:
+    return np.array(values, np.int64)
+
+
+def described(proto: onnx.ModelProto) -> tuple[OnnxDescription, dict[str, Any]]:
+    found = convert_onnx(memoryview(proto.SerializeToString()), 1 << 30, UploadDescription())
+    description = parse_description(found.description)
+    assert isinstance(description, OnnxDescription)
+    return description, dict(found.tensors)
+
+
+def chain(operator: str, times: int, first: str) -> str:
+    """``operator`` with {0} for what went before, so often; the last value is e<times>."""
+    steps = (f"e{n + 1} = {operator.format(f'e{n}')}" for n in range(times))
+    return f"{SPHERE}e0 = {first}; {'; '.join(steps)}"
+
+
+def test_every_operator_has_a_rule() -> None:
+    assert RULES.keys() == OPERATORS.keys()
+
+
+def values_as_evaluated(description: OnnxDescription, tensors: dict[str, Any]) -> dict[str, torch.Tensor]:
+    points = torch.rand(description.batch, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    values: dict[str, torch.Tensor | None] = {"": None, description.input: points}
+    for name, array in tensors.items():
+        values[name] = torch.from_numpy(array).float() if array.dtype.kind == "f" else torch.from_numpy(array).long()
+    types = {"float32": torch.float32, "int64": torch.int64, "bool": torch.bool}
+    for name, constant in description.constants.items():
+        values[name] = torch.tensor(constant.values, dtype=types[constant.type]).reshape(constant.shape)
+    for node in description.nodes:
+        attributes = {**node.attributes, "outputs": len(node.outputs)}
+        values |= run_step(Step(node.op, OPERATOR_FUNCTIONS[node.op], attributes, node.inputs, node.outputs), values)
+    return {name: value for name, value in values.items() if value is not None}
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_shapes_types_and_numbers_are_those_of_the_evaluation(name: str) -> None:
+    text, initializers = GRAPHS[name]
+    description, tensors = described(model(text, initializers | {"axes": np.array([1])}))
+    values = values_as_evaluated(description, tensors)
+    for node, _, results in walk(description, tensors):
+        for output, result in zip(node.outputs, results, strict=False):
+            assert result.shape == tuple(values[output].shape), node
+            if result.numbers is not None:
+                assert values[output].dtype == TYPES[result.kind]
+                np.testing.assert_allclose(result.numbers, values[output].numpy(), rtol=1e-6)
+
+
+COSTLY: dict[str, tuple[str, Initializers]] = {
+    "large products one after the other": (
+        chain("MatMul {0} w", 60, "MatMul x b").replace(
+            SPHERE, SPHERE + "u = ConstantOfShape sh; w = Add u half; b = ConstantOfShape first; "
+        )
+        + LAST.format("e60"),
+        {"sh": ints(2048, 2048), "first": ints(3, 2048)},
+    ),
+    "products that no point is needed for": (
+        chain("MatMul {0} {0}", 100, "ConstantOfShape sh") + "; k = ReduceSum e100 keepdims:0; t = Tanh k; y = Add s t",
+        {"sh": ints(4000, 4000)},
+    ),
+    "products of whole numbers": (
+        chain("MatMul {0} w", 20, "MatMul c b").replace(
+            SPHERE,
+            SPHERE
+            + "c = Cast x to:7; u = ConstantOfShape sh; w = Cast u to:7; v = ConstantOfShape first; b = Cast v to:7; ",
+        )
+        + "; f = Cast e20 to:1"
+        + LAST.format("f"),
+        {"sh": ints(1000, 1000), "first": ints(3, 1000)},
+    ),
+    "a value made wide": (chain("Sin {0}", 40, "Expand r wide") + LAST.format("e40"), {"wide": ints(1024, 16000)}),
+    "a value tiled": (chain("Pow {0} half", 30, "Tile r wide") + LAST.format("e30"), {"wide": ints(1, 16000)}),
+    "a value joined with itself": (
+        chain("Concat {0} {0} axis:1", 11, "Concat x x axis:1")
+        + "; "
+        + "; ".join(f"g{n} = Softmax e11 axis:0" for n in range(60))
+        + LAST.format("g59"),
+        {},
+    ),
+    "a long range": (
+        SPHERE
+        + "a = Range zero many one; "
+        + "; ".join(f"q{n} = Sin a" for n in range(300))
+        + "; c = ReduceSum q7 keepdims:0; t = Tanh c; y = Add s t",
+        {name: np.array(value, np.float32) for name, value in (("zero", 0), ("many", 1.6e7), ("one", 1))},
+    ),
+    "many small matrices": (
+        SPHERE
+        + "a = ConstantOfShape many; "
+        + "; ".join(f"q{n} = MatMul a a" for n in range(300))
+        + "; c = ReduceSum q7 keepdims:0; t = Tanh c; y = Add s t",
+        {"many": ints(1 << 22, 2, 2)},
+    ),
+    "a normalization that widens": (
+        SPHERE
+        + "w = ConstantOfShape wide; "
+        + "; ".join(f"n{n} = BatchNormalization r w w w w" for n in range(30))
+        + LAST.format("n29"),
+        {"wide": ints(16000)},
+    ),
+}
+
+
+def costly(name: str) -> onnx.ModelProto:
+    text, initializers = COSTLY[name]
+    return model(text, HALF | initializers)
+
+
+@pytest.mark.parametrize("name", COSTLY)
+def test_costly_graphs_are_refused_before_anything_is_evaluated(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each is a small file that would take minutes."""
+    monkeypatch.setattr("regnf_core.fields.build.open_field", lambda _: pytest.fail("it was opened"))
+    path = saved(tmp_path, costly(name).SerializeToString())
+    assert path.stat().st_size < 12_000
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "IMPORT_TOO_COSTLY")
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_costly_graph_through_the_gate_says_both_numbers(tmp_path: Path) -> None:
+    path = saved(tmp_path, costly("large products one after the other").SerializeToString())
+    assert path.stat().st_size < 2_000
+    with pytest.raises(FieldFormatError, match=r"estimated \d+ s of a core; 60 s are allowed") as caught:
+        import_field(path, tmp_path / "out")
+    assert caught.value.reason == "IMPORT_TOO_COSTLY"
+
+
+def test_the_limit_is_the_callers(tmp_path: Path) -> None:
+    text, initializers = GRAPHS["Gemm"]
+    path = saved(tmp_path, model(text, initializers | HALF).SerializeToString())
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(work_s=1e-3)), "IMPORT_TOO_COSTLY")
+
+
+UNTOLD: dict[str, tuple[str, Initializers]] = {
+    "a number of elements that a large array decides": (
+        "b = ConstantOfShape many; n = ArgMax b axis:0 keepdims:1; e = Expand r n; y = Add s e",
+        {"many": ints(100_000)},
+    ),
+    "a range without an end": ("a = Range half half zero; y = Add s a", {"zero": np.array(0, np.float32)}),
+    "a length beyond all": ("a = Tile r many; y = Add s a", {"many": ints(2**62, 2**62)}),
+    "a length below zero": ("a = ConstantOfShape many; y = Add s a", {"many": ints(-5)}),
+    "a filling beyond all": ("a = ConstantOfShape many; y = Add s a", {"many": ints(2**31, 2**31, 2**31)}),
+    "a difference of truth values": ("a = Greater r half; b = Sub a a; c = Cast b to:1; y = Add s c", {}),
+    "the opposite of a truth value": ("a = Greater r half; b = Neg a; c = Cast b to:1; y = Add s c", {}),
+    "a division by zero": ("a = Div i zero; b = Cast a to:1; y = Add s b", {"i": ints(1), "zero": ints(0)}),
+    "a rest of a division by zero": ("a = Mod i zero; b = Cast a to:1; y = Add s b", {"i": ints(1), "zero": ints(0)}),
+    "an index beyond the end": ("a = Gather x i axis:1; y = Add s a", {"i": ints(2**62)}),
+    "an axis beyond all": ("a = Unsqueeze x i; y = Add s a", {"i": ints(2**62)}),
+    "an axis that is text": ('a = Split x axis:"k" num_outputs:3; y = Add s a', {}),
+    "a step of zero": ("a = Slice x i j i i; y = Add s a", {"i": ints(0), "j": ints(1)}),
+    "parts below zero": ("a b = Split x i axis:1; y = Add s a", {"i": ints(-1, 4)}),
+    "an empty grid": (
+        "v = ConstantOfShape e; g = ConstantOfShape h; a = GridSample v g; b = Reshape a half; y = Add s b",
+        {"e": ints(1, 1, 0, 0), "h": ints(1, 32, 32, 2)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNTOLD)
+def test_graphs_whose_values_cannot_be_told_are_refused(name: str, tmp_path: Path) -> None:
+    text, initializers = UNTOLD[name]
+    path = saved(tmp_path, model(SPHERE + text, HALF | initializers).SerializeToString())
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "ONNX_GRAPH_INVALID")
+
+
+LOWEST = np.iinfo(np.int64).min
+TRAPS: dict[str, tuple[str, Initializers]] = {
+    "known": ("a = Div low minus", {"low": ints(LOWEST), "minus": ints(-1)}),
+    "of a real number": (
+        "i = Cast low to:7; a = Div i minus",
+        {"low": np.array([-1e30], np.float32), "minus": ints(-1)},
+    ),
+    "at every point": (
+        "i = Cast r to:7; z = Sub i i; k = Add z low; a = Div k minus",
+        {"low": ints(LOWEST), "minus": ints(-1)},
+    ),
+    "the rest": ("a = Mod low minus", {"low": ints(LOWEST), "minus": ints(-1)}),
+    "the other rest": ("a = Mod low minus fmod:1", {"low": ints(LOWEST), "minus": ints(-1)}),
+}
+
+
+@pytest.mark.parametrize("name", TRAPS)
+def test_the_lowest_whole_number_by_minus_one_does_not_end_the_process(name: str, tmp_path: Path) -> None:
+    text, initializers = TRAPS[name]
+    zero = "; b = Mul a none; c = Cast b to:1; y = Add s c"
+    path = saved(tmp_path, model(SPHERE + text + zero, HALF | initializers | {"none": ints(0)}).SerializeToString())
+    assert import_field(path, tmp_path / "out").family == "onnx"
+
+
+@pytest.mark.parametrize("shape", [(2**62,), (2**62, 0), (2**31, 2**31, 0, 4), (0, 2**62), (2**32, 2)])
+@pytest.mark.parametrize("kind", [onnx.TensorProto.FLOAT, onnx.TensorProto.INT64, onnx.TensorProto.BOOL])
+def test_weights_of_impossible_shapes(shape: tuple[int, ...], kind: int, tmp_path: Path) -> None:
+    proto = model(SPHERE + "y = Identity s", HALF)
+    weight = proto.graph.initializer.add()
+    weight.name, weight.data_type = "w", kind
+    weight.dims.extend(shape)
+    path = saved(tmp_path, proto.SerializeToString())
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "ONNX_MALFORMED")
