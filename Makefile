@@ -1,5 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Each sets up what it needs.
-.PHONY: setup demo test lint clean
+.PHONY: setup demo test lint sbom clean
 
 setup:
 	@scripts/setup.sh
@@ -13,6 +13,9 @@ test: setup
 
 lint: setup
 	@scripts/lint.sh
+
+sbom: setup
+	@scripts/sbom.sh
 
 clean:
 	rm -rf .venv .demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache
