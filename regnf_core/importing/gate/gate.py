@@ -66,11 +66,30 @@ def import_field(
     request = _request(description, limits, picture)
     upload = upload.resolve(strict=True)
     out_dir.mkdir(parents=True, exist_ok=True)
-    work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
+    started = time.monotonic()
     try:
-        started = time.monotonic()
+        return _import_once(upload, out_dir, request, limits, started, picture)
+    except _KilledError:
+        _log.warning("the import's process was killed from outside; it is started once more")
+    try:
+        return _import_once(upload, out_dir, request, limits, started, picture)
+    except _KilledError as error:
+        raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
+
+
+class _KilledError(Exception):
+    """Somebody else than this side killed the child: the kernel for want of memory, or a person."""
+
+
+def _import_once(
+    upload: Path, out_dir: Path, request: bytes, limits: ImportLimits, started: float, picture: bool
+) -> ImportReport:
+    """One child, within what is left of the time since ``started``. Raises _KilledError, and as ``import_field``."""
+    work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
+    left_s = max(0.0, limits.wall_s - (time.monotonic() - started))
+    try:
         command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
-        outcome = run_child(command, request, work, _environment(), limits.wall_s, limits.file_bytes + _PICTURE_BYTES)
+        outcome = run_child(command, request, work, _environment(), left_s, limits.file_bytes + _PICTURE_BYTES)
         values = _values_of(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
@@ -104,8 +123,8 @@ def _values_of(outcome: ChildOutcome) -> dict[str, Any]:
         raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
     if outcome.stopped == "output":
         raise FieldFormatError("the import writes more than it may", reason="IMPORT_OUTPUT_TOO_LARGE")
-    if outcome.stopped is None and outcome.signal == signal.SIGKILL:  # not ours: the kernel's, for want of memory
-        raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY")
+    if outcome.stopped is None and outcome.signal == signal.SIGKILL:
+        raise _KilledError
     values = _parse(outcome.stdout) if outcome.exit_status == 0 else None
     if values is None:
         if any(sign in outcome.stderr for sign in _OUT_OF_MEMORY_SIGNS):

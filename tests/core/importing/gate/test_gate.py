@@ -212,6 +212,15 @@ def test_whatever_the_child_does_the_gate_holds(
     assert_nothing_left(tmp_path)
 
 
+def test_a_child_that_was_killed_from_outside_gets_a_second_try(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = tmp_path / "seen"
+    killed_once = f"import os; new = not os.path.exists({str(seen)!r}); open({str(seen)!r}, 'w').close()\n"
+    in_child(monkeypatch, f"{killed_once}if new: os.kill(os.getpid(), 9)\n{claim(parameters=7)}")
+    assert import_field(upload, tmp_path / "out", None, SHORT).parameters == 7
+
+
 def test_a_full_disk_is_no_fault_of_the_file(upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     in_child(monkeypatch, 'print(\'{"reason": "STORAGE_FULL", "detail": "no space"}\')')
     with pytest.raises(OSError, match="no space") as caught:
