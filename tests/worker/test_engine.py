@@ -28,3 +28,13 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
     assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start
+
+
+def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares: list[float] = []
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.set_per_process_memory_fraction", shares.append)
+    assert CoreEngine.on("auto", 4) == CoreEngine("cuda")
+    assert CoreEngine.on("cuda", 1) == CoreEngine("cuda")
+    assert CoreEngine.on("cpu", 4) == CoreEngine("cpu")
+    assert shares == [0.25]

@@ -82,11 +82,15 @@ class CoreEngine:
     device: str
 
     @classmethod
-    def on(cls, choice: Literal["auto", "cpu", "cuda"]) -> CoreEngine:
-        """``auto``: the GPU if torch can use one, else the CPU."""
+    def on(cls, choice: Literal["auto", "cpu", "cuda"], sharing: int = 1) -> CoreEngine:
+        """``auto``: the GPU if torch can use one, else the CPU. Of a GPU's memory this process may use the part that is
+        left to each of ``sharing`` processes; beyond that torch raises OutOfMemoryError."""
         import torch
 
-        return cls(("cuda" if torch.cuda.is_available() else "cpu") if choice == "auto" else choice)
+        device = ("cuda" if torch.cuda.is_available() else "cpu") if choice == "auto" else choice
+        if device == "cuda" and sharing > 1:
+            torch.cuda.set_per_process_memory_fraction(1.0 / sharing)
+        return cls(device)
 
     def describe(self) -> dict[str, Any]:
         return {"version": __version__, "revision": ENGINE_REVISION, "device": self.device}

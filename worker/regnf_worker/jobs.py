@@ -16,7 +16,7 @@ def run_registration(job_id: str) -> None:
 
     settings = Settings()
     context = Context.from_settings(settings, existing=True)
-    run_attempt(context, job_id, *delivery(), lambda: CoreEngine.on(settings.device))
+    run_attempt(context, job_id, *delivery(), lambda: CoreEngine.on(settings.device, settings.workers))
 
 
 def run_import(sha256: str) -> None:
