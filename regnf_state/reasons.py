@@ -147,7 +147,7 @@ REASONS: dict[str, Reason] = {
     "QUOTA_ACTIVE_JOBS": Reason(
         429, "Quota of jobs used up", "You have the maximum number of active jobs. Wait for one to end."
     ),
-    "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks already. Ask for its state."),
+    "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks, or 4 kB. Ask for its state."),
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
@@ -184,6 +184,9 @@ REASONS: dict[str, Reason] = {
     ),
     # the service itself
     "NOT_READY": Reason(503, "Not ready", "`checks` says which part of the service is missing."),
+    "RECORDS_FULL": Reason(
+        507, "Records full", "The record store keeps its last room for what goes on. Delete jobs, or retry later."
+    ),
     "RECORD_UNREADABLE": Reason(
         503,
         "Record unreadable",

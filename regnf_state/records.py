@@ -35,6 +35,12 @@ class QuotaError(RecordError):
         self.reason = reason
 
 
+class RecordsFullError(RecordError):
+    """The store keeps the room that it has left for what goes on already."""
+
+    reason = "RECORDS_FULL"
+
+
 class StaleAttemptError(RecordError):
     """The change came from an attempt that is no longer the current one, or from a state that forbids it."""
 
@@ -165,8 +171,11 @@ class RecordStore(Protocol):
         """The store's clock, seconds since the epoch."""
         ...
 
-    def set_if_absent(self, key: str, value: str, ttl_s: int) -> str:
-        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic."""
+    def set_if_absent(self, key: str, value: str, ttl_s: int, owner: str = ANONYMOUS) -> str:
+        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic.
+
+        It counts as one of the owner's, who has ten thousand at most: beyond that the oldest is forgotten.
+        """
         ...
 
     # jobs
@@ -285,4 +294,6 @@ class RecordStore(Protocol):
         """Ids of active jobs that need this field."""
         ...
 
-    def ping(self) -> bool: ...
+    def probe(self) -> None:
+        """Returns when the store takes a write."""
+        ...

@@ -84,7 +84,13 @@ class Settings(BaseSettings):
     max_uploads_per_caller: int = Field(default=64, ge=2)
     max_streams_per_caller: int = Field(default=100, ge=1)
     quota_active_jobs: int | None = Field(default=None, ge=1)
-    quota_fields: int | None = Field(default=None, ge=1)
+    quota_finished_jobs: int = Field(default=10_000, ge=1)
+    """Of each caller; beyond this its oldest finished jobs go before their time."""
+    max_finished_jobs: int = Field(default=50_000, ge=1)
+    """Of all callers; beyond this the oldest ones of the caller that has most go."""
+    redis_reserve: float = Field(default=0.1, ge=0, le=0.5)
+    """Share of Redis' memory that new jobs and fields must leave free."""
+    quota_fields: int | None = Field(default=10_000, ge=1)
     quota_stored_bytes: int | None = Field(default=None, ge=1)
     """Of each caller's uploads; what the service makes of them is not counted."""
     webhook_hosts: frozenset[str] = frozenset()

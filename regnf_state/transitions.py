@@ -9,6 +9,9 @@ from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, QuotaE
 
 MAX_WEBHOOKS = 16
 """How many addresses one job tells of its end."""
+MAX_WEBHOOK_CHARACTERS = 4096
+"""Of all of them together: a record of a finished job holds them."""
+_KEPT_OF_REQUEST = frozenset({"scene", "webhook", "version"})
 
 _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
@@ -53,7 +56,17 @@ def changed_job(record: JobRecord, attempt: int, changes: dict[str, Any], now: f
             derived["finished"] = now
         if status == "successful":
             derived["progress"] = 1.0
-    return replace(record, version=record.version + 1, updated=now, **(changes | derived))
+    changed = replace(record, version=record.version + 1, updated=now, **(changes | derived))
+    return finished_job(changed) if changed.status in FINISHED else changed
+
+
+def finished_job(record: JobRecord) -> JobRecord:
+    """The job without what only its run needs of the request; the journal has all of it.
+
+    What is left is bounded: some two kilobytes, and what its webhooks take.
+    """
+    kept = {name: value for name, value in record.request.items() if name in _KEPT_OF_REQUEST}
+    return replace(record, request=kept)
 
 
 def with_heartbeat(record: JobRecord, attempt: int, now: float) -> JobRecord:
@@ -69,7 +82,9 @@ def cancelled_job(record: JobRecord, now: float) -> JobRecord:
     if record.status not in ACTIVE or record.cancel_requested:
         return record
     asked = replace(record, version=record.version + 1, updated=now, cancel_requested=True)
-    return replace(asked, status="dismissed", finished=now) if record.status == "accepted" else asked
+    if record.status != "accepted":
+        return asked
+    return finished_job(replace(asked, status="dismissed", finished=now))
 
 
 def _next_attempt(record: JobRecord, now: float, requeues: int) -> JobRecord:
@@ -123,7 +138,7 @@ def joined_job(record: JobRecord, new: JobRecord) -> JobRecord:
 
 def _with_webhooks(record: JobRecord, more: list[str]) -> JobRecord:
     changed = replace(record, more_webhooks=more)
-    if len(changed.webhooks) > MAX_WEBHOOKS:
+    if len(changed.webhooks) > MAX_WEBHOOKS or sum(map(len, changed.webhooks)) > MAX_WEBHOOK_CHARACTERS:
         raise QuotaError("QUOTA_WEBHOOKS")
     return changed
 

@@ -51,9 +51,17 @@ class Journal:
     # jobs
 
     def accept(self, job: JobRecord) -> None:
-        if not self._write(job, "accepted") and not self._holds(job):
+        if self._write(job, "accepted"):
+            self._forget_before(job)
+        elif not self._holds(job):
             self.forget(job.id)  # a job of this id that has outlived its retention, or that cannot be read
             self._write(job, "accepted")
+
+    def _forget_before(self, job: JobRecord) -> None:
+        """Drop what is said of attempts before this one: a job that is asked for again and again must not grow."""
+        for key in list(self._blobs.list(_folder(job.id))) if job.attempt > 1 else ():
+            if int(key.rpartition("/")[2].partition("-")[0]) < job.attempt:
+                self._blobs.delete(key)
 
     def _holds(self, job: JobRecord) -> bool:
         """Whether what is written of this attempt is of this job. Raises UnreadableRecordError: of a later release."""
@@ -71,6 +79,7 @@ class Journal:
 
     def begin(self, job_id: str, attempt: int) -> None:
         self._blobs.put_if_absent(f"{_folder(job_id)}/{attempt:06d}-begun", b"")
+        self._blobs.delete(f"{_folder(job_id)}/{attempt - 1:06d}-begun")  # the highest number is all that counts
 
     def end(self, job: JobRecord) -> None:
         self._write(job, "ended")

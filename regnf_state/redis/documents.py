@@ -19,12 +19,14 @@ from regnf_state.redis.keys import PREFIX
 from regnf_state.redis.unreadable import UNREADABLE, Stored, UnreadableRecords
 
 _PAGE = 100
+_PROBE_KEPT_S = 60
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
 # A document is a hash of ``document`` (JSON), ``version``, ``format`` and ``token``; other members of the hash stay as
 # they are. The token names the write that made it: when a connection breaks after the script ran and the client runs
-# it again, the second run finds its own token. An index that is no index is set aside, and begun anew.
+# it again, the second run finds its own token. An index that is no index is set aside, and begun anew. COMPACT is no
+# command of Redis: a stream has four kilobytes set apart with its first event, which are given back here.
 _WRITE = """
 local shape = redis.call('TYPE', KEYS[1]).ok
 if shape ~= 'hash' and shape ~= 'none' then return 'CONFLICT' end
@@ -41,7 +43,13 @@ for _, cap in ipairs(cjson.decode(ARGV[3])) do
 end
 for i = 4, #ARGV do
   local command = cjson.decode(ARGV[i])
-  local done = redis.pcall(unpack(command))
+  local done
+  if command[1] == 'COMPACT' then
+    local dumped = redis.pcall('DUMP', command[2])
+    if type(dumped) == 'string' then redis.pcall('RESTORE', command[2], 0, dumped, 'REPLACE') end
+  else
+    done = redis.pcall(unpack(command))
+  end
   if type(done) == 'table' and done.err then
     if not string.find(done.err, 'WRONGTYPE') then return done end
     redis.call('RENAME', command[2], 'regnf:quarantine:' .. command[2])
@@ -80,8 +88,9 @@ class RedisDocuments:
         seconds, microseconds = self._redis.time()
         return seconds + microseconds / 1e6
 
-    def ping(self) -> bool:
-        return bool(self._redis.ping())
+    def probe(self) -> None:
+        """Returns when Redis takes a write. Raises RedisError."""
+        self._redis.set(f"{PREFIX}probe", "1", ex=_PROBE_KEPT_S)
 
     # reading
 

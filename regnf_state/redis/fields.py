@@ -6,12 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from redis import Redis
+
 from regnf_state import transitions
 from regnf_state.ownership import owner_of
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, text
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.owners import OWNERS, Owners
 from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}fields:created"
@@ -33,6 +36,11 @@ def _stored_key(owner: str) -> str:
     return f"{PREFIX}owner:{owner}:stored"
 
 
+def _rejected_key(owner: str) -> str:
+    """An owner's rejected fields, by time."""
+    return f"{PREFIX}owner:{owner}:rejected"
+
+
 def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
     key, caps = _stored_key(record.owner), []
     if quota.fields is not None:
@@ -49,18 +57,26 @@ def _attempts_key(sha256: str) -> str:
 class RedisFieldRecords(RedisDocuments):
     """The half of the record store that is about fields."""
 
+    def __init__(self, redis: Redis) -> None:
+        super().__init__(redis)
+        self.owners = Owners(redis)
+
     def _save_field(
         self, expected_version: int, record: FieldRecord, more: Sequence[Command] = (), caps: Sequence[Cap] = ()
     ) -> str:
+        indexes: list[Command] = [("SADD", OWNERS, record.owner)]
         index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
-        indexes = [
+        indexes += [
             index,
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
         ]
         indexes += more
+        rejected = _rejected_key(record.owner)
         if record.state == "rejected":
+            indexes.append(("ZADD", rejected, repr(record.updated), record.sha256))
             indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
+            indexes.append(("ZREM", rejected, record.sha256))
             indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.bytes)))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
@@ -153,8 +169,15 @@ class RedisFieldRecords(RedisDocuments):
                 ("DEL", FIELD.key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
                 ("SREM", _VALIDATING, sha256),
+                ("ZREM", _rejected_key(owner_of(sha256)), sha256),
                 ("HDEL", _stored_key(owner_of(sha256)), sha256),
                 ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
             ]
             if self._compare_and_set(FIELD.key(sha256), known.version, commands) == "OK":
+                self.owners.bound(owner_of(sha256), "deleted", _attempts_key(sha256), int(_ATTEMPTS_KEPT_S))
                 return True
+
+    def rejected_beyond(self, owner: str, kept: int, most: int) -> list[str]:
+        """An owner's rejected fields beyond so many, the oldest first, ``most`` at most."""
+        beyond: Any = self._redis.zrange(_rejected_key(owner), 0, -kept - 1)
+        return [text(name) for name in beyond[:most]]

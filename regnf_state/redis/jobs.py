@@ -31,9 +31,11 @@ from regnf_state.records import (
 )
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
-from regnf_state.redis.documents import Cap, Command, Kind, ask, is_wrong_type, stored_in, text
+from regnf_state.redis.documents import Cap, Command, Kind, ask, stored_in, text
+from regnf_state.redis.events import events_in, start_of
 from regnf_state.redis.fields import RedisFieldRecords
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.owners import OWNERS
 from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}jobs:created"
@@ -41,6 +43,8 @@ _ACTIVE = f"{PREFIX}jobs:active"
 _WAITING = f"{PREFIX}jobs:waiting"
 _EXPIRING = f"{PREFIX}jobs:expiring"
 _EVENTS_KEPT = "1000"
+_EVENTS_KEPT_AT_END = "8"
+"""Whoever asks late is told of the end and of what came just before it."""
 
 _EXPIRE = """
 local expires = redis.call('ZSCORE', KEYS[1], ARGV[1])
@@ -82,8 +86,11 @@ class RedisRecordStore(RedisFieldRecords):
         self._retention_s = retention_s
         self._expire = redis.register_script(_EXPIRE)
 
-    def set_if_absent(self, key: str, value: str, ttl_s: int) -> str:
-        known = self._redis.set(f"{PREFIX}once:{key}", value, nx=True, get=True, ex=ttl_s)
+    def set_if_absent(self, key: str, value: str, ttl_s: int, owner: str = ANONYMOUS) -> str:
+        name = f"{PREFIX}once:{key}"
+        known = self._redis.set(name, value, nx=True, get=True, ex=ttl_s)
+        if known is None:
+            self.owners.bound(owner, "once", name, ttl_s)
         return value if known is None else text(known)  # type: ignore[arg-type]
 
     def _commands(self, before: JobRecord | None, after: JobRecord) -> list[Command]:
@@ -91,6 +98,7 @@ class RedisRecordStore(RedisFieldRecords):
         key, events = JOB.key(after.id), _events_key(after.id)
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
+            ("SADD", OWNERS, after.owner),
             *(("SADD" if after.status in ACTIVE else "SREM", each, after.id) for each in (_ACTIVE, _active_key(after))),
         ]
         if after.status != "accepted":
@@ -102,11 +110,14 @@ class RedisRecordStore(RedisFieldRecords):
         if event is not None:
             name, data = event
             commands.append(("XADD", events, "MAXLEN", "~", _EVENTS_KEPT, "*", "name", name, "data", json.dumps(data)))
+        if after.status == "accepted":
+            commands.append(("COMPACT", events))  # it may wait for long
         if after.finished is not None:
             expires = after.finished + self._retention_s
             commands.append(("ZADD", _EXPIRING, repr(expires), after.id))
             gone = str(int((expires + self._retention_s) * 1000))
             commands.append(("SET", _gone_key(after.id), after.owner, "PXAT", gone))
+            commands += [("XTRIM", events, "MAXLEN", _EVENTS_KEPT_AT_END), ("COMPACT", events)]
             commands += [("PEXPIREAT", each, str(int(expires * 1000))) for each in (key, events)]
             commands += outbox.entering(before, after, expires)
         else:
@@ -189,7 +200,9 @@ class RedisRecordStore(RedisFieldRecords):
             pipeline.exists(JOB.key(job_id))
             pipeline.get(_gone_key(job_id))
             held, gone = pipeline.execute()
-        return not held and gone is not None and text(gone) == owner
+        if held:
+            return False
+        return (gone is not None and text(gone) == owner) or self.owners.was_evicted(owner, job_id)
 
     def list_jobs(
         self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
@@ -253,43 +266,18 @@ class RedisRecordStore(RedisFieldRecords):
 
     def events(self, job_id: str, after: str | None) -> list[JobEvent]:
         with self._redis.pipeline(transaction=False) as pipeline:
-            pipeline.xread({_events_key(job_id): _start(after)})
+            pipeline.xread({_events_key(job_id): start_of(after)})
             (answer,) = pipeline.execute(raise_on_error=False)
-        return _events(answer)
+        return events_in(answer)
 
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
         with self._redis.pipeline(transaction=False) as pipeline:
             for job_id, after in positions:
                 ask(pipeline, JOB.key(job_id))
-                pipeline.xread({_events_key(job_id): _start(after)})
+                pipeline.xread({_events_key(job_id): start_of(after)})
             answers = pipeline.execute(raise_on_error=False)
         found = zip(positions, map(stored_in, answers[::2]), answers[1::2], strict=True)
-        return [JobNews(self._readable(JOB, name, held), _events(entries)) for (name, _), held, entries in found]
+        return [JobNews(self._readable(JOB, name, held), events_in(entries)) for (name, _), held, entries in found]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
-
-
-def _start(after: str | None) -> str:
-    """Where XREAD begins. Raises ValueError when ``after`` is no event id."""
-    return "{}-{}".format(*transitions.parse_event_id(after)) if after is not None else "0-0"
-
-
-def _events(answer: Any) -> list[JobEvent]:
-    """The events in an answer to XREAD about one stream, in either protocol's shape; none where it is no stream."""
-    if is_wrong_type(answer):
-        return []
-    if isinstance(answer, Exception):
-        raise answer
-    chunks = (
-        [chunk for chunks in answer.values() for chunk in chunks]
-        if isinstance(answer, dict)
-        else [chunk for _, chunk in answer or []]
-    )
-    return [_event(entry) for chunk in chunks for entry in chunk]
-
-
-def _event(entry: tuple[bytes | str, dict[bytes | str, bytes | str]]) -> JobEvent:
-    identifier, fields = entry
-    values = {text(name): text(value) for name, value in fields.items()}
-    return JobEvent(text(identifier), values["name"], json.loads(values["data"]))

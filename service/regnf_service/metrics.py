@@ -25,6 +25,7 @@ _COUNTS = {
     "job_attempts": ("Times that a job was handed to the workers.", ()),
     "jobs_finished": ("Jobs that have ended.", ("status", "verdict", "reason")),
     "imports": ("Imports that have ended.", ("state", "reason")),
+    "jobs_evicted": ("Finished jobs that went before their time, to make room.", ()),
     "records_unreadable": ("Records that could not be read, by what they were of.", ("kind",)),
     "webhook_sends": ("Messages about jobs that were sent, or not.", ("outcome",)),
 }

@@ -16,6 +16,7 @@ from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
 from regnf_state.records import Quota
+from regnf_state.room import Room
 from regnf_state.settings import Settings
 
 _UPLOAD_THREADS = 4
@@ -44,6 +45,11 @@ class Services:
         """What each caller may have."""
         chosen = self.settings
         return Quota(chosen.quota_active_jobs, chosen.quota_fields, chosen.quota_stored_bytes)
+
+    @cached_property
+    def room(self) -> Room:
+        """Room for new records."""
+        return Room(self.records, self.blobs, self.redis, self.settings)
 
     @cached_property
     def uploads(self) -> Slots:

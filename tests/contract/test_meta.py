@@ -47,13 +47,15 @@ def test_not_ready_when_something_is_missing(world: World, monkeypatch: pytest.M
         raise OSError("broken")
 
     with monkeypatch.context() as patch:
-        patch.setattr(world.records, "ping", away if missing == "records" else lambda: True)
+        patch.setattr(world.records, "probe", away if missing == "records" else lambda: None)
         if missing == "storage":
             patch.setattr(world.blobs, "probe", broken)
         patch.setattr(world.queue, "workers", 0 if missing == "worker" else 1)
         answer = world.client.get("/readyz")
     problem = assert_refused(answer, 503, "NOT_READY")
     assert [name for name, there in problem["checks"].items() if not there] == [missing]
+    reasons = {"records": "STORE_UNAVAILABLE", "storage": "STORAGE_UNAVAILABLE", "worker": "NO_WORKER"}
+    assert problem["reasons"] == {missing: reasons[missing]}
 
 
 def test_the_index_names_every_address(world: World) -> None:
@@ -105,10 +107,14 @@ def test_the_page_of_a_job(world: World) -> None:
 
 def test_what_takes_requests_needs_no_worker(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(world.queue, "workers", 0)
-    assert assert_refused(world.client.get("/readyz"), 503, "NOT_READY")["detail"] == "Missing: worker."
+    assert assert_refused(world.client.get("/readyz"), 503, "NOT_READY")["detail"] == "Missing: worker (NO_WORKER)."
     answer = world.client.get("/readyz", params={"worker": "false"})
     assert (answer.status_code, answer.json()["checks"]["worker"]) == (200, False)
-    monkeypatch.setattr(world.records, "ping", lambda: False)
+
+    def refuse() -> None:
+        raise RedisConnectionError("away")
+
+    monkeypatch.setattr(world.records, "probe", refuse)
     answer = world.client.get("/readyz", params={"worker": "false"})
-    assert assert_refused(answer, 503, "NOT_READY")["detail"] == "Missing: records."
+    assert assert_refused(answer, 503, "NOT_READY")["detail"] == "Missing: records (STORE_UNAVAILABLE)."
     assert_refused(world.client.get("/readyz", params={"worker": "maybe"}), 400, "INVALID_QUERY")

@@ -100,14 +100,14 @@ def test_redis_emptied(house: House) -> None:
 
 
 def test_redis_out_of_memory(house: House) -> None:
-    """New requests are told 503; what runs waits with its result until Redis takes it."""
+    """New requests are told 507; what runs waits with its result until Redis takes it."""
     _, worker = house.start_both()
     job_id = house.running()
     request = house.request(seed=1)
     with fault() as one:
         house.redis.config_set("maxmemory", 1)
         refused = house.client.post("/register", json=request)
-        assert (refused.status_code, refused.json()["reason"]) == (503, "STORE_UNAVAILABLE")
+        assert (refused.status_code, refused.json()["reason"]) == (507, "RECORDS_FULL")
         assert "Retry-After" in refused.headers
         house.let_go()
         time.sleep(house.pace.lasting(2.6, 120.0))

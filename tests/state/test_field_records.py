@@ -94,7 +94,7 @@ def test_remembering_binds_once(store: RecordStore) -> None:
     assert store.set_if_absent("key", "first", 60) == "first"
     assert store.set_if_absent("key", "second", 60) == "first"
     assert store.set_if_absent("other", "second", 60) == "second"
-    assert store.ping()
+    store.probe()
 
 
 def test_a_script_run_twice_by_a_broken_connection_counts_once(redis_url: str, monkeypatch: pytest.MonkeyPatch) -> None:

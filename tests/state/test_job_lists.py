@@ -145,6 +145,7 @@ def test_finished_jobs_expire_and_leave_a_tombstone(redis_url: str) -> None:
             b"regnf:jobs:created:anonymous",
             b"regnf:owner:anonymous:active",
             b"regnf:counters",
+            b"regnf:owners",
             b"regnf:jobs:active",
             b"regnf:jobs:waiting",
         }

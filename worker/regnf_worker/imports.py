@@ -14,6 +14,7 @@ from rq.timeouts import JobTimeoutException
 from regnf_core.errors import RegnfError
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.ownership import owner_of
 from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
@@ -27,7 +28,8 @@ logger = logging.getLogger(__name__)
 
 def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bool:
     """Whether this attempt at the import is this worker's: of several that ask, the first one's."""
-    return context.records.set_if_absent(f"import:{sha256}:{attempt}", worker, _CLAIM_KEPT_S) == worker
+    name = f"import:{sha256}:{attempt}"
+    return context.records.set_if_absent(name, worker, _CLAIM_KEPT_S, owner_of(sha256)) == worker
 
 
 def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:

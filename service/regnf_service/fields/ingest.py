@@ -71,6 +71,7 @@ async def store_upload(
     known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
         return await in_thread(_keep, services, known, description)
+    await in_thread(services.room.make, caller)
     await upload.commit(original_key(reference))
     return await in_thread(_record, services, reference, received.bytes, description)
 

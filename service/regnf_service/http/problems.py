@@ -12,7 +12,7 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
-from redis.exceptions import RedisError
+from redis.exceptions import OutOfMemoryError, RedisError
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse
@@ -23,7 +23,7 @@ from regnf_service.http.security_headers import SECURITY_HEADERS
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.reasons import REASONS
-from regnf_state.records import QueueFullError, QuotaError, RecordError, UnreadableRecordError
+from regnf_state.records import QueueFullError, QuotaError, RecordError, RecordsFullError, UnreadableRecordError
 
 logger = logging.getLogger(__name__)
 MEDIA_TYPE = "application/problem+json"
@@ -44,12 +44,16 @@ def problem_of(error: Exception) -> Problem:
             return Problem("QUEUE_FULL", headers=RETRY_LATER)
         case QuotaError():
             return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
+        case RecordsFullError():
+            return Problem(error.reason, headers=RETRY_LATER)
         case UnreadableRecordError():
             return Problem(error.reason, headers={"Retry-After": "60"})
         case RecordError():
             return Problem("CONFLICT")
         case RegnfError():
             return Problem(error.reason if error.reason in REASONS else "INVALID_REQUEST", str(error), hint=error.hint)
+        case OutOfMemoryError():
+            return Problem("RECORDS_FULL", headers=RETRY_LATER)
         case RedisError():
             return Problem("STORE_UNAVAILABLE", headers=RETRY_LATER)
         case StorageFullError():

@@ -11,7 +11,7 @@ from regnf_service.jobs.cost_limits import check_cost
 from regnf_service.jobs.identity import digest, job_id_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.ownership import ANONYMOUS, reference_of
+from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.registration_request import RegistrationRequest
 
@@ -74,10 +74,11 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
-    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError.
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
     job_id = job_id_of(request)
+    services.room.make(caller)
     if idempotency_key is not None:
         key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]
         existing = _earlier_answer(services, digest(key), job_id, request)
@@ -107,7 +108,7 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: Registra
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
     asked = digest(request.values())  # of all of it: another webhook is another request
     mine = f"{asked} {services.records.now()!r}"
-    bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S)
+    bound = services.records.set_if_absent(f"idempotency:{key}", mine, _KEY_LIFETIME_S, owner_of(request.scene))
     bound_request, _, bound_at_text = bound.partition(" ")
     try:
         bound_at = float(bound_at_text)

@@ -19,6 +19,7 @@ from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
+from regnf_state.room import Room
 from regnf_state.settings import Settings
 from regnf_state.transitions import fields_of
 
@@ -59,12 +60,17 @@ class Housekeeper:
         self._keep_unused_s = settings.unused_field_retention_s
         self._keep_rejected_s = settings.retention_s
         self._cap = settings.storage_cap_bytes
+        self._room = Room(records, blobs, redis, settings)
 
     def run_if_due(self, term: Term) -> Removed:
         """A round, if the last one is an hour ago."""
         if not self._redis.set(_DONE_KEY, term.number, nx=True, ex=_EVERY_S):
             return Removed()
         return self.run(term)
+
+    def tidy_records(self, term: Term) -> int:
+        """Finished jobs beyond the bounds go: how many. Every round. Raises LeaseLostError, RedisError, OSError."""
+        return self._room.tidy(term.confirm)
 
     def run(self, term: Term) -> Removed:
         """One round. Raises LeaseLostError, RedisError, OSError."""

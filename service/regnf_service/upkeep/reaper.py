@@ -110,6 +110,7 @@ class Reaper:
             _note(actions, field.sha256, self._look_after_import, field, now)
         expired = self._expire(term)
         if self._housekeeper is not None:
+            self._housekeeper.tidy_records(term)
             self._housekeeper.run_if_due(term)
         return expired
 

@@ -17,10 +17,12 @@ from regnf_service.concurrency import blocking
 from regnf_service.http.contract import contract_yaml
 from regnf_service.http.dependencies import PrefixDep, ServicesDep
 from regnf_service.http.docs_page import STYLE_POLICY, render_docs
+from regnf_service.http.problems import problem_of
 from regnf_service.http.routes.documentation import get_and_head, refusals
 from regnf_service.http.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
+from regnf_state.records import RecordError, RecordsFullError
 
 router = APIRouter(tags=["service"])
 logger = logging.getLogger(__name__)
@@ -42,32 +44,50 @@ async def healthz() -> dict[str, str]:
 )
 @blocking
 def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
-    """Records, storage and at least one live worker. A 503 has the same `checks`, and its detail names what is missing.
+    """Records and storage, both asked to take a write, and at least one live worker.
 
-    With `worker=false` no worker is asked for: whether uploads and requests would be taken, to wait for one.
+    A 503 has the same `checks`; its detail names what is missing, and its `reasons` say why. With `worker=false` no
+    worker is asked for: whether uploads and requests would be taken, to wait for one.
     """
-    checks = {
-        "records": _answers(services.records.ping),
-        "storage": _answers(lambda: _storage_writes(services)),
-        "worker": _answers(lambda: services.queue.live_workers() > 0),
+    faults = {
+        "records": _fault(lambda: _records_write(services)),
+        "storage": _fault(services.blobs.probe),
+        "worker": _fault(lambda: _require_worker(services)),
     }
-    missing = [name for name, there in checks.items() if not there and (worker or name != "worker")]
+    checks = {name: reason is None for name, reason in faults.items()}
+    missing = {name: reason for name, reason in faults.items() if reason and (worker or name != "worker")}
     if missing:
-        raise Problem("NOT_READY", f"Missing: {', '.join(missing)}.", headers=RETRY_LATER, extra={"checks": checks})
+        told = ", ".join(f"{name} ({reason})" for name, reason in missing.items())
+        extra = {"checks": checks, "reasons": missing}
+        raise Problem("NOT_READY", f"Missing: {told}.", headers=RETRY_LATER, extra=extra)
     return {"status": "ready", "checks": checks}
 
 
-def _answers(check: Callable[[], bool]) -> bool:
+class _NoWorkerError(Exception):
+    """No worker has reported lately."""
+
+
+def _fault(check: Callable[[], object]) -> str | None:
+    """Why a part is not there; None when it is."""
     try:
-        return check()
-    except (RedisError, OSError) as error:
+        check()
+    except _NoWorkerError:
+        return "NO_WORKER"
+    except (RedisError, OSError, RecordError) as error:
         logger.warning("not ready: %s", type(error).__name__)
-        return False
+        return problem_of(error).reason
+    return None
 
 
-def _storage_writes(services: Services) -> bool:
-    services.blobs.probe()
-    return True
+def _records_write(services: Services) -> None:
+    services.records.probe()
+    if services.room.is_full:
+        raise RecordsFullError("Redis has less than its reserve of memory left")
+
+
+def _require_worker(services: Services) -> None:
+    if services.queue.live_workers() == 0:
+        raise _NoWorkerError
 
 
 @get_and_head(router, "/version", summary="What runs here", response_model=VersionDocument)
