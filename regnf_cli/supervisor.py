@@ -20,6 +20,7 @@ from regnf_cli.embedded_redis import answers, server_command
 from regnf_cli.listening import address_of, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
+from regnf_cli.storage_check import check_storage
 from regnf_state.settings import SECRETS, Settings
 
 _LOOK_EVERY_S = 0.2
@@ -59,6 +60,7 @@ class Supervisor:
             stack.callback(os.close, lifeline)
             stack.callback(self._stop_children)
             url = self._settings.redis_url or self._start_redis(lock, lifeline)
+            check_storage(self._settings.model_copy(update={"redis_url": url}))
             self._start_rest(url, listener, lifeline)
             if self._until(lambda: _api_answers(address_of(listener)), self._api, "the API"):
                 ready(address_of(listener))

@@ -28,6 +28,7 @@ def worker(
 
     from regnf_cli.settings import check_redis_url, read_settings
     from regnf_cli.start_errors import StartError
+    from regnf_state.journal.storage_claim import StorageMismatchError
     from regnf_state.stores import NoRedisError
     from regnf_worker.main import run_worker
     from regnf_worker.preload import PreloadError
@@ -41,7 +42,7 @@ def worker(
         message = "no Redis is named: neither --redis-url nor REGNF_REDIS_URL is given"
         hint = "Give --redis-url redis://HOST:6379/0, or start `regnf serve`, which brings its own Redis and worker."
         raise StartError(message, reason=error.reason, hint=hint) from error
-    except PreloadError as error:
+    except (PreloadError, StorageMismatchError) as error:
         raise StartError(str(error), reason=error.reason) from error
     except RedisConnectionError as error:
         hint = "Start Redis, or check the address in --redis-url or REGNF_REDIS_URL."

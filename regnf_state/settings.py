@@ -121,6 +121,8 @@ class Settings(BaseSettings):
     """Beyond this the oldest finished jobs and unused fields go, before their time."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")
     """An object store for several machines; unset: a folder below state_dir."""
+    adopt_storage: str | None = None
+    """Id of the storage that shall have this Redis from now on, in place of the one whose records it holds."""
     field_cache_bytes: int = Field(default=16384 * MIB, ge=0)
     """With an object store: how much of it a worker's machine keeps copies of, beside those in use."""
 

@@ -13,10 +13,9 @@ from uuid import uuid4
 from redis import Redis
 
 from regnf_state.journal.journal import Journal
+from regnf_state.journal.storage_claim import GENERATION_KEY, claim_storage
 from regnf_state.redis.documents import text
-from regnf_state.redis.keys import PREFIX
 
-_KEY = f"{PREFIX}generation"
 _MARK = "if redis.call('GET', KEYS[1]) == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2]) return 1 end return 0"
 
 
@@ -38,15 +37,16 @@ class Generation:
 
     def is_current(self) -> bool:
         """Whether everything in the journal is in Redis."""
-        held: Any = self._redis.get(_KEY)
+        held: Any = self._redis.get(GENERATION_KEY)
         return held is not None and text(held) == self._name()
 
     def begin(self) -> str:
-        """Note that the journal will be read now; returns the token for ``end``."""
+        """Note that the journal will be read now; returns the token for ``end``. Raises StorageMismatchError."""
+        claim_storage(self._redis, self._storage_id)
         token = f"reading:{uuid4().hex}"
-        self._redis.set(_KEY, token)
+        self._redis.set(GENERATION_KEY, token)
         return token
 
     def end(self, token: str) -> bool:
         """Note that all of it is in Redis. False when Redis was emptied or another process began in between."""
-        return bool(self._mark(keys=[_KEY], args=[token, self._name()]))
+        return bool(self._mark(keys=[GENERATION_KEY], args=[token, self._name()]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 
@@ -20,6 +21,7 @@ from regnf_service.upkeep.housekeeping import Housekeeper
 from regnf_service.upkeep.reaper import Reaper
 from regnf_service.webhooks.service import deliver_until_stopped
 from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.journal.storage_claim import StorageMismatchError, claim_storage
 
 logger = logging.getLogger(__name__)
 _REAP_EVERY_S = 15.0
@@ -32,6 +34,7 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.openapi()  # takes a while, so not during the first request
+        await in_thread(_check_storage, services)
         reaping = asyncio.create_task(_reap(services))
         delivering = asyncio.create_task(
             deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
@@ -50,6 +53,17 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
     return lifespan
 
 
+def _check_storage(services: Services) -> None:
+    """Raises StorageMismatchError: the start fails. While a store is away nobody can tell, and the reaper will."""
+    try:
+        claim_storage(services.redis, services.records.journal.storage_id(), services.settings.adopt_storage or None)
+    except (RedisError, OSError) as error:
+        logger.warning("whose records Redis holds is looked up later: %s", type(error).__name__)
+    except StorageMismatchError as error:
+        logger.critical("%s: %s", error.reason, error)
+        raise
+
+
 async def _reap(services: Services) -> None:
     """Look after lost jobs every fifteen seconds until the service stops."""
     records, queue, redis, blobs = services.records, services.queue, services.redis, services.blobs
@@ -59,6 +73,9 @@ async def _reap(services: Services) -> None:
     while not services.stopping.is_set():
         try:
             await in_thread(reaper.run_once)
+        except StorageMismatchError as error:
+            logger.critical("%s: %s", error.reason, error)
+            signal.raise_signal(signal.SIGTERM)  # it would mix the jobs of two services
         except (RedisError, OSError) as error:
             logger.warning("the reaper: a store does not answer: %s", type(error).__name__)
         except Exception:

@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 
+from regnf_state.journal.storage_claim import StorageMismatchError
 from regnf_state.logs import configure_logging
 from regnf_state.settings import Settings
 from regnf_state.stores import NoRedisError
@@ -14,15 +15,19 @@ from regnf_worker.kernel import share_cores
 from regnf_worker.preload import PreloadError, preload
 from regnf_worker.process import RegnfWorker
 from regnf_worker.scratch import Scratch
+from regnf_worker.storage_check import check_storage
 
 logger = logging.getLogger(__name__)
 
 
 def run_worker(settings: Settings) -> None:
-    """Work until told to stop (SIGTERM, SIGINT). Raises NoRedisError when no Redis is configured, PreloadError."""
+    """Work until told to stop (SIGTERM, SIGINT). Raises NoRedisError when no Redis is configured, PreloadError,
+    StorageMismatchError.
+    """
     configure_logging(settings.log_format)
     share_cores(os.environ, settings.threads, settings.workers)
     context = Context.from_settings(settings)
+    check_storage(settings)
     if settings.preload:
         preload()
     scratch = Scratch(settings.scratch_dir)
@@ -35,7 +40,7 @@ def run_worker(settings: Settings) -> None:
 def main() -> int:
     try:
         run_worker(Settings())
-    except (NoRedisError, PreloadError) as error:
+    except (NoRedisError, PreloadError, StorageMismatchError) as error:
         logger.error("%s: %s", error.reason, error)
         return 2
     return 0

@@ -1,0 +1,63 @@
+"""Every process refuses to start over a Redis that holds the records of another storage."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from regnf_state.journal.storage_claim import STORAGE_KEY
+from regnf_state.redis.client import connect
+from tests.faults.house import plain_environment
+from tests.redis_server import private_redis
+
+SERVE = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--workers", "0"]
+WORKER = [sys.executable, "-m", "regnf_worker.main"]
+API = [sys.executable, "-c", "import socket; from regnf_cli.api_process import main; "
+       "main(socket.create_server(('127.0.0.1', 0)).detach())"]  # fmt: skip
+
+
+@pytest.fixture
+def another_s() -> Iterator[str]:
+    """A Redis of another storage."""
+    with private_redis() as url, connect(url) as redis:
+        redis.set(STORAGE_KEY, "0" * 32)
+        yield url
+
+
+def start(command: list[str], url: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    environment = plain_environment() | {"REGNF_REDIS_URL": url, "REGNF_STATE_DIR": str(folder)} | variables
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("command", [SERVE, WORKER, API], ids=["serve", "worker", "api"])
+def test_a_process_with_another_storage_does_not_start(another_s: str, tmp_path: Path, command: list[str]) -> None:
+    done = start(command, another_s, tmp_path)
+    assert done.returncode not in (0, None)
+    assert "STORAGE_MISMATCH" in done.stdout + done.stderr
+    storage_id = (tmp_path / "blobs/journal/storage-id").read_text()
+    said = " ".join((done.stdout + done.stderr).split())
+    assert storage_id in said
+    with connect(another_s) as redis:
+        assert redis.get(STORAGE_KEY) == b"0" * 32
+        assert redis.keys("rq:*") == []
+
+
+def test_the_storage_that_the_operator_names_is_adopted(another_s: str, tmp_path: Path) -> None:
+    start(WORKER, another_s, tmp_path)
+    storage_id = (tmp_path / "blobs/journal/storage-id").read_text()
+    environment = plain_environment() | {"REGNF_REDIS_URL": another_s, "REGNF_STATE_DIR": str(tmp_path)}
+    environment["REGNF_ADOPT_STORAGE"] = storage_id
+    process = subprocess.Popen(WORKER, env=environment, stderr=subprocess.DEVNULL)
+    try:
+        with connect(another_s) as redis:
+            while redis.get(STORAGE_KEY) != storage_id.encode():
+                assert process.poll() is None
+                os.sched_yield()
+    finally:
+        process.kill()
+        process.wait()
