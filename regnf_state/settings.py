@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -43,6 +44,8 @@ class Settings(BaseSettings):
     """Blobs, the embedded Redis' files and temporary uploads live under it."""
     redis_url: str | None = Field(default=None, repr=False)
     """Unset: `regnf serve` starts a private server of its own."""
+    queue_key: str | None = Field(default=None, min_length=16, repr=False)
+    """Signs what the queue in Redis holds; the same for front ends and workers. What is not signed never runs."""
     workers: int = Field(default=1, ge=0, le=64)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where registrations run; auto: on the GPU if torch can use one."""
@@ -84,6 +87,13 @@ class Settings(BaseSettings):
     max_uploads_per_caller: int = Field(default=64, ge=2)
     max_streams_per_caller: int = Field(default=100, ge=1)
     quota_active_jobs: int | None = Field(default=None, ge=1)
+    """Jobs of each caller that wait or run. Unset: with tokens, as many as are left free for others."""
+    max_imports_per_caller: int = Field(default=64, ge=1)
+    """Imports of each caller that wait or run."""
+    quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
+    """What each caller's imports and jobs may cost the workers in an hour."""
+    caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
+    """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
     quota_finished_jobs: int = Field(default=10_000, ge=1)
     """Of each caller; beyond this its oldest finished jobs go before their time."""
     max_finished_jobs: int = Field(default=50_000, ge=1)

@@ -44,4 +44,5 @@ def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: floa
     url = settings.redis_url
     redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
-    return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, RqJobQueue(redis))
+    queue = RqJobQueue(redis, settings.queue_key, settings.caller_weights)
+    return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, queue)

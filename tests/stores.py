@@ -17,10 +17,11 @@ from regnf_service.webhooks.service import webhooks_of
 from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.journal.rebuild import Rebuilder
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.client import connect
-from regnf_state.redis.documents import RedisDocuments
+from regnf_state.redis.documents import RedisDocuments, text
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.queue import RqJobQueue, attempt_of
+from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from regnf_state.stores import Stores
 from tests.redis_server import private_redis
@@ -58,23 +59,30 @@ class WatchedQueue(RqJobQueue):
     @property
     def registrations(self) -> list[tuple[str, int]]:
         """(job, attempt) of what waits, in order."""
-        return [(name.rpartition("-")[0], attempt_of(name)) for name in self._registrations.job_ids]
+        return [(work.argument, work.attempt) for work in self.waiting if work.kind == "registration"]
 
     @property
     def imports(self) -> list[tuple[str, int]]:
         """(field, attempt) of what waits, in order."""
-        names = [name.removeprefix("import-") for name in self._imports.job_ids]
-        return [(name.rpartition("-")[0], attempt_of(name)) for name in names]
+        return [(work.argument, work.attempt) for work in self.waiting if work.kind == "import"]
+
+    @property
+    def waiting(self) -> list[Work]:
+        """What waits, whether in RQ's list or in a line: each owner's in order, what is next first."""
+        lists = [f"rq:queue:{IMPORT_QUEUE_NAME}", f"rq:queue:{QUEUE_NAME}"]
+        lines = [f"regnf:queue:line:{line.owner}" for line in self.lines()]
+        names = [text(name) for key in lists + lines for name in self._redis.lrange(key, 0, -1)]
+        kinds = [IMPORT_QUEUE_NAME if name.startswith("import-") else QUEUE_NAME for name in names]
+        return [Work.named(kind, name) for kind, name in zip(kinds, names, strict=True)]
 
     def lose(self) -> None:
         """Forget everything, as a queue that was never told."""
-        for queue in (self._registrations, self._imports):
-            for name in queue.job_ids:
-                self._forget(queue, name)
+        for work in self.waiting:
+            self.fair.remove(work.name)
 
     def take(self, job_id: str, attempt: int) -> None:
         """What a worker does first with a registration: it leaves the queue."""
-        self._forget(self._registrations, f"{job_id}-{attempt}")
+        self.fair.remove(Work("registration", job_id, attempt).name)
 
     def stop(self, job_id: str, attempt: int) -> None:
         self.stopped.append((job_id, attempt))

@@ -15,17 +15,17 @@ from regnf_state.records import ACTIVE, FieldRecord, JobRecord
 from regnf_state.redis.documents import Command, text
 from regnf_state.redis.keys import PREFIX
 
-_KEY = f"{PREFIX}counters"
+COUNTERS_KEY = f"{PREFIX}counters"
 BOUNDS_S = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 60.0, 120.0, 300.0, 900.0)
 
 
 def counted(name: str, *labels: str, by: int = 1) -> Command:
-    return ("HINCRBY", _KEY, "|".join((name, *labels)), str(by))
+    return ("HINCRBY", COUNTERS_KEY, "|".join((name, *labels)), str(by))
 
 
 def count(redis: Redis, name: str, *labels: str) -> None:
     """Count one that is no part of a change."""
-    redis.hincrby(_KEY, "|".join((name, *labels)), 1)
+    redis.hincrby(COUNTERS_KEY, "|".join((name, *labels)), 1)
 
 
 def timed(name: str, seconds: float, *labels: str) -> list[Command]:
@@ -34,7 +34,7 @@ def timed(name: str, seconds: float, *labels: str) -> list[Command]:
     bound = next((str(bound) for bound in BOUNDS_S if seconds <= bound), "+Inf")
     return [
         counted(name, *labels, bound),
-        ("HINCRBYFLOAT", _KEY, "|".join((name, *labels, "sum")), f"{seconds:.6f}"),
+        ("HINCRBYFLOAT", COUNTERS_KEY, "|".join((name, *labels, "sum")), f"{seconds:.6f}"),
     ]
 
 
@@ -67,7 +67,7 @@ class Counters:
     """All counters as they were at one moment."""
 
     def __init__(self, redis: Redis) -> None:
-        held: Any = redis.hgetall(_KEY)
+        held: Any = redis.hgetall(COUNTERS_KEY)
         self._held = {tuple(text(name).split("|")): _number(text(value)) for name, value in held.items()}
 
     def counts(self, name: str) -> Iterable[tuple[Sequence[str], float]]:

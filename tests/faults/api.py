@@ -17,17 +17,16 @@ from regnf_service import app, lifespan
 from regnf_service.upkeep import reaper
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.logs import configure_logging
+from regnf_state.ownership import ANONYMOUS
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
-
-FUNCTIONS = ("tests.faults.worker.run_registration", "tests.faults.worker.run_import")
 
 
 class DyingQueue(RqJobQueue):
     """A queue that the process does not reach."""
 
-    def enqueue_registration(self, job_id: str, attempt: int) -> None:
+    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -44,7 +43,7 @@ def serve(descriptor: int) -> None:
     settings = Settings()
     kind = DyingQueue if "REGNF_TEST_DIE" in os.environ else RqJobQueue
     stores = app.open_stores(settings, retries=None, storage_wait_s=app._STORAGE_WAIT_S)
-    application = app.create_app(settings, replace(stores, queue=kind(stores.redis, *FUNCTIONS)))
+    application = app.create_app(settings, replace(stores, queue=kind(stores.redis)))
     config = uvicorn.Config(application, log_config=None, access_log=False, lifespan="on", timeout_graceful_shutdown=2)
     uvicorn.Server(config).run(sockets=[socket.socket(fileno=descriptor)])
 

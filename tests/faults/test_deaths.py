@@ -10,7 +10,7 @@ import time
 import httpx
 import pytest
 
-from regnf_state.redis.queue import registration_id
+from regnf_state.queue import Work
 from tests.contract.world import field_bytes, sha256
 from tests.faults.house import House
 from tests.faults.promise import check_promise, fault, leftovers
@@ -182,7 +182,7 @@ def test_two_workers_with_one_job(house: House) -> None:
     workers = [house.start_both()[1], house.start_worker()]
     job_id = house.running()
     with fault():
-        house.redis.rpush("rq:queue:regnf", registration_id(job_id, 1))
+        house.redis.rpush("rq:queue:regnf", Work("registration", job_id, 1).name)
         eventually(lambda: "is not run" in house.log(), house.log)
         house.let_go()
         done = check_promise(house, [job_id])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,21 +17,17 @@ from regnf_state.blobs import object_store as object_blobs
 from regnf_state.blobs.base import BlobStore
 from regnf_state.logs import configure_logging
 from regnf_state.manifest import Manifest
-from regnf_state.redis.client import connect
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.queue import Kind
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker import artifacts, registration
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
-from regnf_worker.jobs import delivery
-from regnf_worker.process import RegnfWorker
+from regnf_worker.process import Function, RegnfWorker
 from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
-
-FUNCTIONS = ("tests.faults.worker.run_registration", "tests.faults.worker.run_import")
 
 
 def wait_while(gate: str) -> None:
@@ -71,27 +68,28 @@ def held_importer(upload: Path, folder: Path, description: dict[str, Any]) -> di
 
 
 def context(existing: bool = True) -> Context:
-    """Everything real but the functions that the queue names."""
-    settings = Settings()
-    assert settings.redis_url is not None
-    return replace(Context.from_settings(settings, existing), queue=RqJobQueue(connect(settings.redis_url), *FUNCTIONS))
+    return Context.from_settings(Settings(), existing)
 
 
-def run_registration(job_id: str) -> None:
+def run_registration(job_id: str, attempt: int, worker: str) -> None:
     shorten_waits()
     registration.publish = publish
-    run_attempt(context(), job_id, *delivery(), HeldEngine)
+    run_attempt(context(), job_id, attempt, worker, HeldEngine)
 
 
-def run_import(sha256: str) -> None:
+def run_import(sha256: str, attempt: int, worker: str) -> None:
     shorten_waits()
-    run_import_attempt(context(), sha256, *delivery(), held_importer)
+    run_import_attempt(context(), sha256, attempt, worker, held_importer)
+
+
+FUNCTIONS: Mapping[Kind, Function] = {"import": run_import, "registration": run_registration}
+"""What these workers run instead of regnf_worker.jobs."""
 
 
 def work() -> None:
     scratch = Scratch(Settings().scratch_dir)
     try:
-        RegnfWorker(context(existing=False), scratch).serve()
+        RegnfWorker(context(existing=False), scratch, functions=FUNCTIONS).serve()
     finally:
         scratch.remove()
 

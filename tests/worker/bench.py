@@ -24,7 +24,6 @@ from regnf_state.settings import Settings
 from regnf_worker.context import Context
 from tests.redis_server import private_redis
 from tests.requests import request_record
-from tests.worker.tiny_worker import FUNCTIONS
 
 SCENE, OBJECT = "a" * 64, "b" * 64
 DEADLINE_S = 60.0
@@ -118,7 +117,7 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
         environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}
         values = Settings(**given)  # type: ignore[arg-type]
-        stores = RedisRecordStore(redis), LocalBlobStore(values.blob_dir), RqJobQueue(redis, *FUNCTIONS)
+        stores = RedisRecordStore(redis), LocalBlobStore(values.blob_dir), RqJobQueue(redis)
         made = Bench(Context(values, *stores), redis, folder, environment)
         try:
             yield made

@@ -1,20 +1,25 @@
 """RQ's loop when its every word to Redis may be refused: what it waits for, what it leaves undone, what ends it."""
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from redis import Redis
 from redis.client import Pipeline
 from redis.exceptions import OutOfMemoryError, ResponseError
-from rq import Queue
 from rq.exceptions import StopRequested
-from rq.serializers import JSONSerializer
 from rq.worker.base import BaseWorker
 
+from regnf_state.queue import Work
 from regnf_state.redis.queue import RqJobQueue
+from regnf_state.settings import Settings
+from regnf_worker import kernel, process
+from regnf_worker.context import Context
+from regnf_worker.process import RegnfWorker
 from regnf_worker.resilient_worker import ResilientWorker
+from regnf_worker.scratch import Scratch
 from tests.worker.refusals import FULL, LASTING, PASSING, Refusals, RefusingRedis
 
 # RQ's calls, one by one
@@ -32,12 +37,10 @@ class Named:
 TRIED: list[tuple[str, tuple[Any, ...]]] = [
     ("subscribe", ()),
     ("check_for_suspension", (False,)),
-    ("dequeue_job_and_maintain_ttl", (5, None)),
     ("prepare_job_execution", (Named, False)),
 ]
 LEFT_UNDONE: list[tuple[str, tuple[Any, ...]]] = [
     ("set_state", ("idle", None)),
-    ("run_maintenance_tasks", ()),
     ("teardown", ()),
 ]
 
@@ -82,6 +85,15 @@ def test_what_need_not_be_is_left_undone(
     assert waits == []
 
 
+@pytest.mark.parametrize("error", [FULL, LASTING], ids=["full", "wrong"])
+def test_sweeping_may_be_left_undone(monkeypatch: pytest.MonkeyPatch, waits: list[float], error: Exception) -> None:
+    refusals = Refusals(1, error)
+    worker = offline_worker()
+    monkeypatch.setattr(worker, "clean_registries", refusals)
+    worker.run_maintenance_tasks()
+    assert (len(refusals.calls), waits) == (1, [])
+
+
 @pytest.mark.parametrize(("horse", "tries"), [(0, 4), (123, 1)])
 def test_a_sign_of_life_waits_unless_a_child_runs(
     monkeypatch: pytest.MonkeyPatch, waits: list[float], horse: int, tries: int
@@ -122,15 +134,17 @@ def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch)
 # the loop, over a real Redis of which every command in turn is refused
 
 
-class ChildlessWorker(ResilientWorker):
-    """Does what a forking worker's parent does around a job, and notes the job instead of forking for it."""
+class ChildlessWorker(RegnfWorker):
+    """Does what a worker does around a job, and notes the job instead of forking for it."""
 
-    def execute_job(self, job: Any, queue: Any) -> None:
-        self.begin_job(job)
+    def _run_child(self, job: Any, queue: Any) -> int | None:
         self.prepare_job_execution(job)
         done.append(job.id)
         self.report_running(job)
-        self.finish_job(job, queue, signal.SIGKILL)
+        return kernel.Exit(signal.SIGKILL)
+
+    def _settle(self, *_: object) -> None:
+        """There are no records here."""
 
 
 done: list[str] = []
@@ -150,14 +164,28 @@ def no_ear(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("redis.client.PubSub.run_in_thread", lambda *_, **__: None)
 
 
-def work_off(redis: RefusingRedis, refuse_at: int, error: Exception) -> int:
-    """Have a fresh worker work off a queue of two jobs with one command refused; how many commands that took."""
+WORK = [Work("import", letter * 64, 1).name for letter in "ab"]
+
+
+@pytest.fixture
+def worker_over(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, redis: RefusingRedis, redis_url: str
+) -> Iterator[Callable[[], ChildlessWorker]]:
+    """Makes workers who have nothing but their own connection refused."""
+    monkeypatch.setattr(process, "connect", lambda *_, **__: redis)
+    context = Context.from_settings(Settings(redis_url=redis_url, state_dir=tmp_path))
+    scratch = Scratch(tmp_path)
+    yield lambda: ChildlessWorker(context, scratch)
+    scratch.remove()
+
+
+def work_off(redis: RefusingRedis, worker_over: Callable[[], ChildlessWorker], refuse_at: int, error: Exception) -> int:
+    """Have a fresh worker work off a queue of two with one command refused; how many commands that took."""
     redis.refuse_at = -1
     redis.flushall()
-    queue = Queue("q", connection=redis, serializer=JSONSerializer)
-    for name in ("a", "b"):
-        queue.enqueue("operator.neg", 1, job_id=name)
-    worker = ChildlessWorker(["q", "other"], connection=redis, serializer=JSONSerializer)
+    for letter in "ab":
+        RqJobQueue(redis).enqueue_import(letter * 64)
+    worker = worker_over()
     done.clear()
     redis.sent, redis.refuse_at, redis.error = 0, refuse_at, error
     assert worker.work(burst=True, logging_level=None)
@@ -166,27 +194,28 @@ def work_off(redis: RefusingRedis, refuse_at: int, error: Exception) -> int:
 
 @pytest.mark.usefixtures("signals_restored", "waits", "no_ear")
 @pytest.mark.parametrize("error", [FULL, PASSING[1], PASSING[2], PASSING[4]], ids=["full", "away", "slow", "disk"])
-def test_no_refused_command_ends_the_loop(
-    redis: RefusingRedis, caplog: pytest.LogCaptureFixture, error: Exception
+def test_no_refused_command_ends_the_loop_or_loses_work(
+    redis: RefusingRedis,
+    worker_over: Callable[[], ChildlessWorker],
+    caplog: pytest.LogCaptureFixture,
+    error: Exception,
 ) -> None:
-    commands = work_off(redis, -1, error)
-    assert done == ["a", "b"]
-    assert commands > 30
-    lost = []
+    commands = work_off(redis, worker_over, -1, error)
+    assert done == WORK
+    assert commands > 25
     for number in range(commands):
-        work_off(redis, number, error)
+        work_off(redis, worker_over, number, error)
         assert redis.sent > number, "the command was reached, and refused"
-        if done != ["a", "b"]:
-            lost.append((redis.refused[0], *sorted({"a", "b"} - set(done))))
-    # read between leaving the queue and being known: the reaper finds an accepted job that no queue holds
-    assert lost == [("HGETALL", "a"), ("HGETALL", "b")]
+        assert done == WORK, redis.refused
     assert "unhandled exception" not in caplog.text
 
 
 @pytest.mark.usefixtures("signals_restored", "waits", "no_ear")
-def test_an_error_that_does_not_pass_still_ends_the_loop(redis: RefusingRedis) -> None:
-    Queue("q", connection=redis, serializer=JSONSerializer).enqueue("operator.neg", 1)
-    worker = ChildlessWorker(["q", "other"], connection=redis, serializer=JSONSerializer)
+def test_an_error_that_does_not_pass_still_ends_the_loop(
+    redis: RefusingRedis, worker_over: Callable[[], ChildlessWorker]
+) -> None:
+    RqJobQueue(redis).enqueue_import("a" * 64)
+    worker = worker_over()
     redis.set(worker.redis_workers_keys, "not a set")
     with pytest.raises(ResponseError, match="WRONGTYPE"):
         worker.work(burst=True, logging_level=None)
@@ -194,14 +223,14 @@ def test_an_error_that_does_not_pass_still_ends_the_loop(redis: RefusingRedis) -
 
 @pytest.mark.usefixtures("waits")
 def test_a_birth_whose_answer_was_lost_is_not_another_workers(redis: RefusingRedis) -> None:
-    worker = ChildlessWorker(["q"], connection=redis)
+    worker = ResilientWorker(["q"], connection=redis)
     worker.register_birth()
     worker.register_birth()
     assert redis.scard("rq:workers:q") == 1
 
 
 def test_a_worker_that_redis_forgot_is_known_again_after_its_next_report(redis: RefusingRedis) -> None:
-    worker = ChildlessWorker(["regnf"], connection=redis)
+    worker = ResilientWorker(["regnf"], connection=redis)
     worker.register_birth()
     for report in (worker.heartbeat, lambda: redis_pipeline_report(redis, worker)):
         redis.flushall()

@@ -22,6 +22,9 @@ OVERRIDDEN = {
     "dequeue_job_and_maintain_ttl": "(self, timeout: 'int | None', max_idle_time: 'int | None' = None)"
     " -> 'tuple[Job, Queue] | None'",
     "execute_job": "(self, job: 'Job', queue: 'Queue')",
+    "clean_registries": "(self)",
+    "handle_payload": "(self, message)",
+    "main_work_horse": "(self, job: 'Job', queue: 'Queue')",
     "heartbeat": "(self, timeout: 'int | None' = None, pipeline: 'Pipeline | None' = None)",
     "prepare_job_execution": "(self, job: 'Job', remove_from_intermediate_queue: 'bool' = False) -> 'None'",
     "register_birth": "(self)",
@@ -34,12 +37,12 @@ OVERRIDDEN = {
     "teardown": "(self)",
 }
 CALLED = {
-    "handle_job_failure": "(self, job: 'Job', queue: 'Queue', started_job_registry=None, exc_string='')",
+    "cleanup_execution": "(self, job: 'Job', pipeline: 'Pipeline')",
     "kill_horse": "(self, sig: 'signal.Signals' = <Signals.SIGKILL: 9>)",
-    "main_work_horse": "(self, job: 'Job', queue: 'Queue')",
     "maintain_heartbeats": "(self, job: 'Job')",
     "prepare_execution": "(self, job: 'Job') -> 'Execution'",
     "serialize": "(self) -> 'dict'",
+    "setup_work_horse_signals": "(self)",
 }
 ATTRIBUTES = ("_horse_pid", "_stop_requested", "connection", "job_monitoring_interval", "key", "log", "name")
 

@@ -18,7 +18,7 @@ from typing import Any
 from regnf_core.errors import NoSurfaceError
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
-from regnf_worker.jobs import delivery
+from regnf_worker.context import Context
 from regnf_worker.registration import run_attempt
 
 Report = Callable[[str, float], None]
@@ -26,6 +26,9 @@ Report = Callable[[str, float], None]
 
 class TinyEngine:
     """The label is a method's name."""
+
+    def __init__(self, attempt: int = 1) -> None:
+        self.attempt = attempt
 
     def describe(self) -> dict[str, Any]:
         return {"version": "tiny", "device": "none"}
@@ -123,23 +126,20 @@ class TinyEngine:
 
     def leave(self, report: Report) -> None:
         """Ends by itself without a word, the first time."""
-        if delivery()[0] == 1:
+        if self.attempt == 1:
             os._exit(0)
 
 
-def run_registration(job_id: str) -> None:
-    """What tests have the queue name instead of regnf_worker.jobs.run_registration."""
-    from tests.worker.tiny_worker import tiny_context
-
-    run_attempt(tiny_context(), job_id, *delivery(), TinyEngine)
+def run_registration(job_id: str, attempt: int, worker: str) -> None:
+    """What tests' workers run instead of regnf_worker.jobs.run_registration."""
+    run_attempt(Context.from_settings(Settings()), job_id, attempt, worker, lambda: TinyEngine(attempt))
 
 
-def run_import(sha256: str) -> None:
+def run_import(sha256: str, attempt: int, worker: str) -> None:
     """An import whose upload says how it ends."""
     from regnf_worker.imports import run_import_attempt
-    from tests.worker.tiny_worker import tiny_context
 
-    run_import_attempt(tiny_context(), sha256, *delivery(), tiny_importer)
+    run_import_attempt(Context.from_settings(Settings()), sha256, attempt, worker, tiny_importer)
 
 
 def tiny_importer(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:

@@ -2,32 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
 
 from regnf_state.logs import configure_logging
-from regnf_state.redis.client import connect
-from regnf_state.redis.queue import RqJobQueue
+from regnf_state.queue import Kind
 from regnf_state.settings import Settings
 from regnf_worker import process
 from regnf_worker.context import Context
 from regnf_worker.scratch import Scratch
+from tests.worker import tiny_engine
 
-FUNCTIONS = ("tests.worker.tiny_engine.run_registration", "tests.worker.tiny_engine.run_import")
-
-
-def tiny_context() -> Context:
-    """Everything real but the functions that the queue names."""
-    settings = Settings()
-    assert settings.redis_url is not None
-    return replace(Context.from_settings(settings), queue=RqJobQueue(connect(settings.redis_url), *FUNCTIONS))
+FUNCTIONS: Mapping[Kind, process.Function] = {
+    "import": tiny_engine.run_import,
+    "registration": tiny_engine.run_registration,
+}
+"""What these workers run instead of regnf_worker.jobs."""
 
 
 if __name__ == "__main__":
     configure_logging("text")
     process._LATE_GRACE_S = 1.0
-    context = tiny_context()
+    context = Context.from_settings(Settings())
     scratch = Scratch(context.settings.scratch_dir)
     try:
-        process.RegnfWorker(context, scratch).serve()
+        process.RegnfWorker(context, scratch, functions=FUNCTIONS).serve()
     finally:
         scratch.remove()

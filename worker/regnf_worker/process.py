@@ -1,35 +1,48 @@
 """The worker process: takes ids from the queue, forks a child for each, limits it, and settles the job's record.
 
-It is RQ's forking worker with these additions: children end with the worker, time limits also stop native code, a Redis
-that is full or away does not end the worker, and after a child's death no record says that the job still runs. The
-worker never loads torch itself: the forked children of a process that has run a torch operation hang.
+It is RQ's forking worker with these additions: only two functions ever run, callers take turns, children end with the
+worker, time limits also stop native code, a Redis that is full or away does not end the worker, and after a child's
+death no record says that the job still runs. The worker never loads torch itself: the forked children of a process that
+has run a torch operation hang.
 """
 
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import partial
 from types import FrameType
 from typing import Any
 
 from redis.exceptions import RedisError
+from rq import Queue
 from rq.exceptions import StopRequested
 from rq.serializers import JSONSerializer
+from rq.timeouts import JobTimeoutException
 from rq.utils import now
+from rq.worker import WorkerStatus
 
-from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
+from regnf_state.redis import payload
 from regnf_state.redis.client import connect
-from regnf_state.redis.queue import attempt_of
-from regnf_worker import kernel
+from regnf_state.redis.fair_queue import FairQueue
+from regnf_worker import jobs, kernel
 from regnf_worker.context import Context
 from regnf_worker.job_limits import JobLimits
 from regnf_worker.resilient_worker import ResilientWorker
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
+from regnf_worker.taking import Taking
 
+Function = Callable[[str, int, str], None]
+"""(job's id or field's reference, attempt, worker)."""
+FUNCTIONS: Mapping[Kind, Function] = {"import": jobs.run_import, "registration": jobs.run_registration}
+"""Everything that a worker runs, whatever the queue says."""
 _IDLE_REPORT_S = 30
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
@@ -39,11 +52,14 @@ _IMPORT_MARGIN_S = 30
 class RegnfWorker(ResilientWorker):
     """One worker of the service. ``monitor_s`` is how often it checks the child that it runs."""
 
-    def __init__(self, context: Context, scratch: Scratch, monitor_s: int = 1) -> None:
+    def __init__(
+        self, context: Context, scratch: Scratch, monitor_s: int = 1, functions: Mapping[Kind, Function] = FUNCTIONS
+    ) -> None:
         assert context.settings.redis_url is not None
+        redis = connect(context.settings.redis_url, retries=20)
         super().__init__(
             [IMPORT_QUEUE_NAME, QUEUE_NAME],
-            connection=connect(context.settings.redis_url, retries=20),
+            connection=redis,
             serializer=JSONSerializer,
             worker_ttl=_IDLE_REPORT_S,
             job_monitoring_interval=monitor_s,
@@ -51,13 +67,16 @@ class RegnfWorker(ResilientWorker):
         )
         self._context = context
         self._scratch = scratch
-        self._settlers: dict[str, Callable[[Context, str, int, str, ChildExit], None]] = {
-            IMPORT_QUEUE_NAME: settle_import,
-            QUEUE_NAME: settle_registration,
+        self._functions = functions
+        self._fair = FairQueue(redis, context.settings.caller_weights)
+        self._taking = Taking(redis, self._fair, context.settings.queue_key)
+        self._settlers: dict[Kind, Callable[[Context, str, int, str, ChildExit], None]] = {
+            "import": settle_import,
+            "registration": settle_registration,
         }
-        self._limits = {
-            IMPORT_QUEUE_NAME: context.settings.import_timeout_s + _IMPORT_MARGIN_S,
-            QUEUE_NAME: context.settings.job_timeout_s,
+        self._limits: dict[Kind, int] = {
+            "import": context.settings.import_timeout_s + _IMPORT_MARGIN_S,
+            "registration": context.settings.job_timeout_s,
         }
         self._job_limits = JobLimits.of(context.settings)
         self._exceeded: str | None = None
@@ -76,13 +95,31 @@ class RegnfWorker(ResilientWorker):
         except StopRequested:
             self.teardown()
 
+    def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:  # noqa: ARG002
+        """The next job and its queue, waited for; None when there is none and no ``timeout`` to wait for."""
+        self.set_state(WorkerStatus.IDLE)
+        while True:
+            self.heartbeat()
+            if self.should_run_maintenance_tasks:
+                self.run_maintenance_tasks()
+            taken = self._until_available("taking a job", lambda: self._taking.pop(timeout))
+            if taken is None and timeout is None:
+                return None
+            if taken is not None:
+                work = self._until_available("looking at what was taken", partial(self._taking.accept, taken))
+                if work is not None:
+                    self.log.info("%s: %s", work.queue_name, work.name)
+                    queue = Queue(work.queue_name, connection=self.connection, serializer=JSONSerializer)
+                    return payload.made(work, self.connection), queue
+
     # one job
 
     def execute_job(self, job: Any, queue: Any) -> None:
         """Run one job in a child, limit it, and settle its record. A job that is taken and not begun is in no queue
         any more: the reaper puts it back.
         """
-        job.timeout = self._limit_s = self._limits[queue.name]
+        work = Work.named(queue.name, job.id)
+        job.timeout = self._limit_s = self._limits[work.kind]
         self._started = time.monotonic()
         self._late = self._given_back = False
         self._exceeded = None
@@ -92,14 +129,39 @@ class RegnfWorker(ResilientWorker):
             end = self._run_child(job, queue)
         finally:
             self._scratch.empty()
+            self._charge(work)
         try:
-            self.finish_job(job, queue, end.status)
+            self.finish_job(job)
         finally:
-            self._settle(job, queue, end, kernel.oom_kills() > oom_kills)
+            self._settle(work, end, kernel.oom_kills() > oom_kills)
+            if work.kind == "import":
+                self._if_possible("queueing what waited", lambda: self._fair.release(work.argument))
+
+    def _charge(self, work: Work) -> None:
+        """Have the caller pay for the time. When Redis refuses, the estimate stands."""
+        seconds = time.monotonic() - self._started
+        self._if_possible("charging for the time", lambda: self._fair.finish(work.name, seconds))
+
+    def main_work_horse(self, job: Any, queue: Any) -> None:
+        """What the child does: it runs one of our functions, never what RQ would import. Does not return."""
+        status = 1
+        try:
+            random.seed()
+            self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
+            self._is_horse = True
+            work = Work.named(queue.name, job.id)
+            self.prepare_job_execution(job)
+            with self.death_penalty_class(job.timeout, JobTimeoutException):
+                self._functions[work.kind](work.argument, work.attempt, self.name)
+            status = 0
+        except BaseException:
+            self.log.exception("job %s: its process ends", job.id)
+        finally:
+            os._exit(status)
 
     def _run_child(self, job: Any, queue: Any) -> kernel.Exit:
         """Fork a child for the job and wait for its end."""
-        limited = _is_limited(queue)
+        limited = queue.name != IMPORT_QUEUE_NAME  # an import's process has limits of its own
         ended, held_by_child = os.pipe()
         parent = os.getpid()
         child = os.fork()
@@ -111,8 +173,9 @@ class RegnfWorker(ResilientWorker):
             if limited:
                 self._job_limits.hold_here()
             self.main_work_horse(job, queue)
-            os._exit(0)
         os.close(held_by_child)
+        with suppress(OSError):
+            os.setpgid(child, child)  # the child does so too: whoever is first, before anybody kills its group
         self._horse_pid = child
         job.started_at = now()
         job.timeout = -1  # the limit is kept here, by the monotonic clock: RQ uses the wall clock
@@ -140,7 +203,7 @@ class RegnfWorker(ResilientWorker):
             if self._exceeded is not None:
                 self.kill_horse()
 
-    def _settle(self, job: Any, queue: Any, ended: kernel.Exit, out_of_memory: bool) -> None:
+    def _settle(self, work: Work, ended: kernel.Exit, out_of_memory: bool) -> None:
         status = ended.status
         end = ChildExit(
             signal=os.WTERMSIG(status) if status is not None and os.WIFSIGNALED(status) else None,
@@ -148,24 +211,24 @@ class RegnfWorker(ResilientWorker):
             out_of_memory=out_of_memory,
             given_back=self._given_back,
             exceeded=self._exceeded,
-            crashed_near_limit=_is_limited(queue) and bool(status) and self._job_limits.is_near(ended.peak_memory),
+            crashed_near_limit=work.kind == "registration" and bool(status) and self._job_limits.is_near(ended.peak_memory),
             limits=self._job_limits,
         )
-        settle = self._settlers[queue.name]
+        settle = self._settlers[work.kind]
 
         def write_down() -> None:
             try:
                 self._until_available(
-                    f"settling job {job.id}",
-                    lambda: settle(self._context, job.args[0], attempt_of(job.id), self.name, end),
+                    f"settling job {work.name}",
+                    lambda: settle(self._context, work.argument, work.attempt, self.name, end),
                 )
             except (RedisError, OSError, UnreadableRecordError) as error:
-                self.log.error("job %s could not be settled: %s", job.id, error)  # the reaper will
+                self.log.error("job %s could not be settled: %s", work.name, error)  # the reaper will
 
         if self._context.settings.storage_url is None:
             write_down()
         elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
-            self.log.error("job %s could not be settled: the process that should have has died", job.id)
+            self.log.error("job %s could not be settled: the process that should have has died", work.name)
 
     # the worker itself
 
@@ -177,8 +240,3 @@ class RegnfWorker(ResilientWorker):
     def request_force_stop(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Told to stop again: at once."""
         self._give_back_at = time.monotonic()
-
-
-def _is_limited(queue: Any) -> bool:
-    """Whether the worker limits a job of this queue: an import's process has limits of its own."""
-    return bool(queue.name != IMPORT_QUEUE_NAME)

@@ -9,22 +9,25 @@ There are three kinds of calls:
 An error that does not pass with time still ends the loop: the supervisor of the worker starts another.
 
 Methods of RQ that are overridden, as read in RQ 2.12 (tests/worker/test_rq_interface.py compares their signatures):
-- repeated until accepted: register_birth, subscribe, check_for_suspension, dequeue_job_and_maintain_ttl,
-  prepare_job_execution, heartbeat;
+- repeated until accepted: register_birth, subscribe, check_for_suspension, prepare_job_execution, heartbeat;
 - skipped when refused: set_state, run_maintenance_tasks, teardown; set_shutdown_requested_date does nothing;
-- in regnf_worker.process: execute_job, request_stop, request_force_stop.
+- narrowed to what the service needs: handle_payload, clean_registries. RQ's own read jobs from Redis, and import the
+  callbacks named there, in the worker itself;
+- in regnf_worker.process: dequeue_job_and_maintain_ttl, execute_job, main_work_horse, request_stop,
+  request_force_stop.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 from redis.exceptions import RedisError
 from rq import Worker, worker_registration
-from rq.exceptions import InvalidJobOperation
-from rq.job import JobStatus
-from rq.utils import now
+from rq.executions import ExecutionRegistry
+from rq.registry import FailedJobRegistry, FinishedJobRegistry, StartedJobRegistry
+from rq.utils import current_timestamp, now
 from rq.worker import WorkerStatus
 
 from regnf_worker.retry import MAX_WAIT_S, retry_until_available
@@ -66,10 +69,6 @@ class ResilientWorker(Worker):
         look = super().check_for_suspension
         self._until_available("looking for a suspension", lambda: look(burst))
 
-    def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:
-        take = super().dequeue_job_and_maintain_ttl
-        return self._until_available("taking a job", lambda: take(timeout, max_idle_time))
-
     def prepare_job_execution(self, job: Any, remove_from_intermediate_queue: bool = False) -> None:
         prepare = super().prepare_job_execution
         self._until_available(f"beginning job {job.id}", lambda: prepare(job, remove_from_intermediate_queue))
@@ -100,8 +99,32 @@ class ResilientWorker(Worker):
         self._if_possible("showing the worker's state", lambda: show(state, pipeline))
 
     def run_maintenance_tasks(self) -> None:
-        """A lock that is left behind expires after a quarter of an hour."""
-        self._if_possible("sweeping RQ's entries", super().run_maintenance_tasks)
+        self._if_possible("sweeping RQ's entries", self.clean_registries)
+
+    def clean_registries(self) -> None:
+        """Drop RQ's entries that have expired, and workers that have. No job is read, and none is brought back."""
+        self.last_cleaned_at = now()  # type: ignore[assignment]
+        with self.connection.pipeline() as pipeline:
+            for queue in self.queues:
+                for registry in (StartedJobRegistry, FinishedJobRegistry, FailedJobRegistry):
+                    pipeline.zremrangebyscore(registry.key_template.format(queue.name), 0, current_timestamp())
+            pipeline.execute()
+        for queue in self.queues:
+            worker_registration.clean_worker_registry(queue)
+
+    def handle_payload(self, message: Any) -> None:
+        """A command over Redis: only the order to stop the job that runs is obeyed."""
+        try:
+            command = json.loads(message["data"])
+        except (ValueError, TypeError, RecursionError):
+            command = None
+        current = self.execution
+        match command:
+            case {"command": "stop-job", "job_id": str(name)} if current is not None and name == current.job_id:
+                if self._horse_pid:
+                    self.kill_horse()
+            case _:
+                self.log.info("a command that is not for the job of this worker is ignored")
 
     def set_shutdown_requested_date(self) -> None:
         """Nobody reads it, and the handler of a signal must not wait for Redis."""
@@ -120,20 +143,13 @@ class ResilientWorker(Worker):
         """Renew the entries of worker and job while a child runs."""
         self._if_possible(f"a sign of life of job {job.id}", lambda: self.maintain_heartbeats(job))
 
-    def finish_job(self, job: Any, queue: Any, status: int | None) -> None:
-        """Close RQ's entries on a job whose child has ended with this status of waitpid.
-
-        The outcome is written to the job's own record elsewhere; RQ's entries are only tidied.
-        """
-        if status != 0:
-            self._if_possible(f"closing RQ's entries on job {job.id}", lambda: self._enter_failure(job, queue))
+    def finish_job(self, job: Any) -> None:
+        """Drop RQ's entries on a job whose child has ended. The outcome is written to the job's own record."""
+        self._if_possible(f"closing RQ's entries on job {job.id}", lambda: self._drop_entries(job))
         self.set_state(WorkerStatus.IDLE)
 
-    def _enter_failure(self, job: Any, queue: Any) -> None:
-        try:
-            entered = job.get_status()
-        except InvalidJobOperation:
-            return  # it has ended, and its entry has expired
-        if entered not in (JobStatus.FINISHED, JobStatus.FAILED):
-            job.ended_at = now()
-            self.handle_job_failure(job, queue=queue, exc_string="the process of the job ended by itself or was killed")
+    def _drop_entries(self, job: Any) -> None:
+        with self.connection.pipeline() as pipeline:
+            self.cleanup_execution(job, pipeline)
+            pipeline.delete(job.key, ExecutionRegistry(job.id, connection=self.connection).key)
+            pipeline.execute()

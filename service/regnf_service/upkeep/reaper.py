@@ -102,6 +102,7 @@ class Reaper:
         """Look after everything; the ids of what has expired. Raises LeaseLostError."""
         now = self._records.now()
         self._staleness.begin_round()
+        self._mend_queue()
         for job in self._records.active_jobs():
             term.confirm()
             _note(actions, job.id, self._look_after_job, job, now)
@@ -114,12 +115,20 @@ class Reaper:
             self._housekeeper.run_if_due(term)
         return expired
 
+    def _mend_queue(self) -> None:
+        """Do what a process that died may have left undone: hand out what is next, queue what waited for an import."""
+        self._queue.turn()
+        for reference in self._queue.awaited():
+            field = self._records.get_field(reference)
+            if field is None or field.state != "validating":
+                self._queue.release(reference)
+
     def _look_after_job(self, job: JobRecord, now: float) -> str | None:
         """Mend one active job; the action's name, None when nothing was amiss. Raises StaleAttemptError."""
         if job.status == "accepted":
             if self._queue.holds_registration(job.id, job.attempt) or not self._is_unheld(job.id, job.attempt):
                 return None
-            self._queue.enqueue_registration(job.id, job.attempt)
+            self._queue.enqueue_registration(job.id, job.attempt, job.owner)
             return "enqueued"
         if not self._is_lost(job, now):
             return None
@@ -128,7 +137,7 @@ class Reaper:
             return "dismissed"
         if job.requeues == 0:
             again = self._records.requeue_job(job.id, job.attempt)
-            self._queue.enqueue_registration(again.id, again.attempt)
+            self._queue.enqueue_registration(again.id, again.attempt, again.owner)
             return "requeued"
         self._records.update_job(job.id, job.attempt, status="failed", error=problem_document("WORKER_LOST"))
         return "failed"

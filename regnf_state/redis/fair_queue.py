@@ -1,0 +1,155 @@
+"""The fair queue: callers take turns at the workers by the worker seconds that their work has cost.
+
+Start-time fair queueing (Goyal, Vin and Cheng, 1996) over RQ's lists, see docs/adr/0009-fair-queue.md. The costs of a
+piece of work are estimated when it is taken, as those of its caller's last work of its kind, and put right when it has
+ended. A caller who was idle gains nothing for that time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from redis import Redis
+
+from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
+from regnf_state.redis.counters import COUNTERS_KEY
+from regnf_state.redis.documents import text
+from regnf_state.redis.fair_script import SCRIPT
+from regnf_state.redis.keys import PREFIX
+
+_PREFIX = f"{PREFIX}queue:"
+_FIRST_COST_S = 10.0
+"""What a caller's first work of a kind is taken to cost until it has run."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a caller has waiting. ``lead_s``: how far the caller has been served beyond the one served last."""
+
+    owner: str
+    waiting: int
+    oldest_s: float
+    lead_s: float
+
+
+class FairQueue:
+    """The waiting work of all callers. ``weights``: the shares of callers who have another one than 1."""
+
+    def __init__(self, redis: Redis, weights: Mapping[str, float] | None = None) -> None:
+        self._redis = redis
+        self._weights = dict(weights or {})
+        self._script = redis.register_script(SCRIPT)
+
+    def _step(self, step: str, name: str = "", *arguments: Any) -> int:
+        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY]
+        return int(self._script(keys=[_PREFIX], args=[*fixed, *arguments]))
+
+    def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any]) -> bool:
+        """Put work at the end of its owner's line; False when it waits or runs already."""
+        fields = [part for pair in payload.items() for part in pair]
+        return bool(self._step("enqueue", work.name, owner, work.kind, self._weights.get(owner, 1.0), *fields))
+
+    def turn(self) -> None:
+        """See to it that the next in turn lies where workers take from."""
+        self._step("turn")
+
+    def holds(self, name: str) -> bool:
+        """Whether work waits, or is being run by a worker that still reports."""
+        return bool(self._step("holds", name))
+
+    def remove(self, name: str) -> bool:
+        """Take waiting work out; False when it does not wait."""
+        return bool(self._step("remove", name))
+
+    def finish(self, name: str, seconds: float) -> None:
+        """Work that was taken has ended, and has cost so many worker seconds."""
+        self._step("finish", name, f"{max(0.0, seconds):.6f}")
+
+    def park(self, work: Work, owner: str, reference: str) -> None:
+        """Have work that was taken wait for the import of a field, for nothing."""
+        self._step("park", work.name, owner, work.kind, reference)
+
+    def release(self, reference: str) -> None:
+        """Put what waited for this field at the front of its line."""
+        self._step("release", reference)
+
+    def awaited(self) -> list[str]:
+        """The fields that something waits for."""
+        return sorted(text(reference) for reference in self._redis.smembers(f"{_PREFIX}parkings"))
+
+    def spent(self, owner: str) -> dict[int, float]:
+        """An owner's worker seconds of the last hour by minute. What runs counts as the estimate says."""
+        held: Any = self._redis.hgetall(f"{_PREFIX}spent:{owner}")
+        oldest = int(self._redis.time()[0]) // 60 - 60
+        minutes = {int(minute): float(seconds) for minute, seconds in held.items()}
+        return {minute: seconds for minute, seconds in sorted(minutes.items()) if minute > oldest}
+
+    def lines(self) -> list[Line]:
+        """Every caller with work that waits, those whose turn is next first."""
+        owners, ready, clock, now = self._look()
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for owner, _ in owners:
+                pipeline.llen(f"{_PREFIX}line:{owner}")
+                pipeline.lindex(f"{_PREFIX}line:{owner}", 0)
+            answers = pipeline.execute()
+            for name in answers[1::2]:
+                pipeline.hget(f"{_PREFIX}entry:{text(name or '')}", "since")
+            since = pipeline.execute()
+        return [
+            Line(owner, count + (owner == ready), now - float(begun or now), tag - clock)
+            for (owner, tag), count, begun in zip(owners, answers[::2], since, strict=True)
+        ]
+
+    def _look(self) -> tuple[list[tuple[str, float]], str | None, float, float]:
+        """The owners with their tags, the owner of what lies ready, the virtual clock, the server's time."""
+        with self._redis.pipeline() as pipeline:
+            pipeline.zrange(f"{_PREFIX}owners", 0, -1, withscores=True)
+            pipeline.hmget(f"{_PREFIX}clock", "owner", "now")
+            pipeline.llen(f"rq:queue:{IMPORT_QUEUE_NAME}")
+            pipeline.llen(f"rq:queue:{QUEUE_NAME}")
+            pipeline.time()
+            owners, (ready, clock), imports, registrations, (seconds, _) = pipeline.execute()
+        lies = ready is not None and imports + registrations > 0
+        tags = [(text(owner), float(tag)) for owner, tag in owners]
+        return tags, text(ready) if lies else None, float(clock or 0), float(seconds)
+
+    def position(self, work: Work) -> int | None:
+        """The place of work in the order that is expected of what waits now; None when it is in no line."""
+        held: Any = self._redis.hget(f"{_PREFIX}entry:{work.name}", "owner")
+        if held is None:
+            return None
+        mine = text(held)
+        with self._redis.pipeline(transaction=False) as pipeline:
+            pipeline.lpos(f"{_PREFIX}line:{mine}", work.name)
+            pipeline.lpos(f"rq:queue:{work.queue_name}", work.name)
+            answers: list[int | None] = pipeline.execute()
+        place, lies = answers
+        if lies is not None:
+            return lies + 1
+        if place is None:
+            return None
+        owners, ready, _, _ = self._look()
+        costs, lengths = self._costs([owner for owner, _ in owners])
+        tags = dict(owners)
+        mark = tags.get(mine, 0.0) + place * costs.get(mine, _FIRST_COST_S)
+        others = (
+            min(lengths[owner], max(0, math.ceil((mark - tag) / costs[owner])))
+            for owner, tag in owners
+            if owner != mine
+        )
+        return 1 + place + (ready is not None) + sum(others)
+
+    def _costs(self, owners: list[str]) -> tuple[dict[str, float], dict[str, int]]:
+        """What one registration of each owner moves its tag by, and the length of its line."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for owner in owners:
+                pipeline.hget(f"{_PREFIX}costs", f"{owner}|registration")
+                pipeline.hget(f"{_PREFIX}weights", owner)
+                pipeline.llen(f"{_PREFIX}line:{owner}")
+            answers = pipeline.execute()
+        rows = zip(owners, answers[::3], answers[1::3], strict=True)
+        costs = {owner: max(float(cost or _FIRST_COST_S), 1e-3) / float(weight or 1) for owner, cost, weight in rows}
+        return costs, dict(zip(owners, answers[2::3], strict=True))

@@ -1,0 +1,191 @@
+"""The script of the fair queue, in Lua: one step of it is one call, and Redis runs each call whole or not at all.
+
+A caller's waiting work is a line, first come first served. The callers with a line are sorted by their tags: a tag is
+the time, in worker seconds by weight, up to which the caller has been served. The first of the line with the least tag
+lies in RQ's list, where the workers block; nothing else of ours does. Every call begins with ``settle``: what lay in
+RQ's list and does not any more was taken by a worker, and its caller's tag rises by the estimate; what still lies there
+goes back to the front of its line. Every call ends with ``advance``, which chooses anew. So no call relies on the one
+before it: after the death of any process the next call of any other puts the state in order.
+
+Keys, below the prefix:  line:{owner}   list of names        owners        sorted set: callers with a line, by tag
+                         entry:{name}   hash, see below      tags, weights, costs   hashes, by owner
+                         parked:{ref}   list of names        parkings      set: fields that something waits for
+                         spent:{owner}  hash: worker seconds by minute     clock   hash: now; ready, owner
+An entry: owner, kind, since; once taken: cost, taken; while it waits for a field: parked.
+"""
+
+SCRIPT = """
+local P, op, name = KEYS[1], ARGV[1], ARGV[2]
+local FIRST, DAY = tonumber(ARGV[3]), 86400
+local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
+local time = redis.call('TIME')
+local now = time[1] + time[2] / 1e6
+
+local function entry_of(id) return P .. 'entry:' .. id end
+local function line_of(owner) return P .. 'line:' .. owner end
+local function tag_of(owner) return tonumber(redis.call('HGET', P .. 'tags', owner) or '0') end
+local function weight_of(owner) return tonumber(redis.call('HGET', P .. 'weights', owner) or '1') end
+local function clock() return tonumber(redis.call('HGET', P .. 'clock', 'now') or '0') end
+local function text(number) return string.format('%.6f', number) end
+
+local function cost_of(owner, kind)
+  return tonumber(redis.call('HGET', P .. 'costs', owner .. '|' .. kind) or FIRST)
+end
+
+local function set_tag(owner, tag)
+  redis.call('HSET', P .. 'tags', owner, text(tag))
+  if redis.call('EXISTS', line_of(owner)) == 1 then
+    redis.call('ZADD', P .. 'owners', text(tag), owner)
+  else
+    redis.call('ZREM', P .. 'owners', owner)
+  end
+end
+
+local function charge(owner, seconds)
+  set_tag(owner, tag_of(owner) + seconds / weight_of(owner))
+  local key, minute = P .. 'spent:' .. owner, math.floor(now / 60)
+  redis.call('HINCRBYFLOAT', key, string.format('%d', minute), text(seconds))
+  for _, each in ipairs(redis.call('HKEYS', key)) do
+    if tonumber(each) <= minute - 60 then redis.call('HDEL', key, each) end
+  end
+  redis.call('EXPIRE', key, 7200)
+end
+
+-- a caller who had no line and none of whose work is in RQ's list gains nothing for the time without
+local function join(owner, id, push)
+  local idle = redis.call('EXISTS', line_of(owner)) == 0
+  redis.call(push, line_of(owner), id)
+  set_tag(owner, idle and math.max(clock(), tag_of(owner)) or tag_of(owner))
+end
+
+local function settle()
+  local ready = redis.call('HMGET', P .. 'clock', 'ready', 'owner')
+  local id, owner = ready[1], ready[2]
+  if not id then return end
+  redis.call('HDEL', P .. 'clock', 'ready', 'owner')
+  local kind = redis.call('HGET', entry_of(id), 'kind')
+  if not kind then return end
+  if redis.call('LREM', LISTS[kind], 1, id) == 1 then
+    redis.call('LPUSH', line_of(owner), id)
+    set_tag(owner, tag_of(owner))
+    return
+  end
+  local cost = cost_of(owner, kind)
+  redis.call('HSET', P .. 'clock', 'now', text(math.max(clock(), tag_of(owner))))
+  redis.call('HSET', entry_of(id), 'cost', text(cost), 'taken', text(now))
+  redis.call('EXPIRE', entry_of(id), DAY)
+  charge(owner, cost)
+end
+
+local function advance()
+  if redis.call('LLEN', LISTS.import) + redis.call('LLEN', LISTS.registration) > 0 then return end
+  while true do
+    local owner = redis.call('ZRANGE', P .. 'owners', 0, 0)[1]
+    if not owner then return end
+    local id = redis.call('LPOP', line_of(owner))
+    set_tag(owner, tag_of(owner))
+    local kind = id and redis.call('HGET', entry_of(id), 'kind')
+    if kind then
+      redis.call('HSET', P .. 'clock', 'ready', id, 'owner', owner)
+      redis.call('RPUSH', LISTS[kind], id)
+      return
+    end
+  end
+end
+
+local function waits(id)
+  local entry = redis.call('HMGET', entry_of(id), 'owner', 'parked')
+  if entry[1] and redis.call('LPOS', line_of(entry[1]), id) then return true end
+  if entry[2] and redis.call('LPOS', P .. 'parked:' .. entry[2], id) then return true end
+  return redis.call('LPOS', LISTS.import, id) or redis.call('LPOS', LISTS.registration, id)
+end
+
+-- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
+local function runs(id)
+  for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
+    if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
+  end
+  return false
+end
+
+local function remove(id)
+  local entry = redis.call('HMGET', entry_of(id), 'owner', 'parked')
+  local found = redis.call('LREM', LISTS.import, 0, id) + redis.call('LREM', LISTS.registration, 0, id)
+  if entry[1] then
+    found = found + redis.call('LREM', line_of(entry[1]), 0, id)
+    set_tag(entry[1], tag_of(entry[1]))
+  end
+  if entry[2] then found = found + redis.call('LREM', P .. 'parked:' .. entry[2], 0, id) end
+  redis.call('DEL', entry_of(id))
+  return found
+end
+
+local steps = {}
+
+-- what has been waiting already stays where it is; a leftover of a worker's death is replaced
+function steps.enqueue(owner, kind, weight, ...)
+  if waits(name) or runs(name) then return 0 end
+  remove(name)
+  redis.call('DEL', 'rq:job:' .. name)
+  redis.call('HSET', 'rq:job:' .. name, ...)
+  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'since', text(now))
+  redis.call('HSET', P .. 'weights', owner, weight)
+  join(owner, name, 'RPUSH')
+  return 1
+end
+
+function steps.turn() return 0 end
+
+function steps.holds() return (waits(name) or runs(name)) and 1 or 0 end
+
+function steps.remove()
+  if remove(name) == 0 then return 0 end
+  redis.call('DEL', 'rq:job:' .. name)
+  return 1
+end
+
+-- the run has ended after so many seconds: the estimate is put right
+function steps.finish(seconds)
+  local entry = redis.call('HMGET', entry_of(name), 'owner', 'kind', 'cost')
+  redis.call('DEL', entry_of(name))
+  if not entry[3] then return 0 end
+  local owner, kind = entry[1], entry[2]
+  redis.call('HSET', P .. 'costs', owner .. '|' .. kind, seconds)
+  redis.call('HINCRBYFLOAT', ARGV[4], 'worker_seconds|' .. owner .. '|' .. kind, seconds)
+  charge(owner, tonumber(seconds) - tonumber(entry[3]))
+  return 1
+end
+
+-- taken, but it cannot run before the import of this field has ended: it pays nothing meanwhile
+function steps.park(owner, kind, reference)
+  local cost = redis.call('HGET', entry_of(name), 'cost')
+  if cost then charge(owner, -tonumber(cost)) end
+  redis.call('HDEL', entry_of(name), 'cost', 'taken')
+  redis.call('HSETNX', entry_of(name), 'since', text(now))
+  redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'parked', reference)
+  redis.call('PERSIST', entry_of(name))
+  redis.call('RPUSH', P .. 'parked:' .. reference, name)
+  redis.call('SADD', P .. 'parkings', reference)
+  return 1
+end
+
+-- ``name`` is the field; those who have waited longest come first
+function steps.release()
+  local parked = redis.call('LRANGE', P .. 'parked:' .. name, 0, -1)
+  for index = #parked, 1, -1 do
+    local owner = redis.call('HGET', entry_of(parked[index]), 'owner')
+    if owner then
+      redis.call('HDEL', entry_of(parked[index]), 'parked')
+      join(owner, parked[index], 'LPUSH')
+    end
+  end
+  redis.call('DEL', P .. 'parked:' .. name)
+  redis.call('SREM', P .. 'parkings', name)
+  return #parked
+end
+
+settle()
+local answer = steps[op](unpack(ARGV, 5))
+advance()
+return answer
+"""
