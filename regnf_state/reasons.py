@@ -87,6 +87,14 @@ REASONS: dict[str, Reason] = {
         403, "Quota of bytes used up", "Your fields use all the bytes that you may store. Delete some."
     ),
     "QUOTA_FIELDS": Reason(403, "Quota of fields used up", "You have the maximum number of fields. Delete some."),
+    "QUOTA_IMPORTS": Reason(
+        429, "Quota of imports used up", "You have the maximum number of imports that wait or run. Wait for one to end."
+    ),
+    "QUOTA_WORKER_SECONDS": Reason(
+        429,
+        "Quota of worker time used up",
+        "Your imports and jobs of the last hour have used the time that you may use. See `Retry-After`.",
+    ),
     "STORAGE_FULL": Reason(507, "Storage full", "No space is left for the bytes. Nothing was kept."),
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),

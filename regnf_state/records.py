@@ -62,6 +62,10 @@ class Quota:
     """The most that one owner may have; None: any number."""
 
     active_jobs: int | None = None
+    share_jobs: bool = False
+    """Without a number of active jobs: an owner may have as many as are left free for others."""
+    imports: int | None = None
+    """Those that wait or run."""
     fields: int | None = None
     stored_bytes: int | None = None
 
@@ -259,6 +263,10 @@ class RecordStore(Protocol):
 
     def stored(self, owner: str) -> tuple[int, int]:
         """How many fields that were not rejected an owner has, and the bytes of their uploads."""
+        ...
+
+    def importing(self, owner: str) -> int:
+        """How many of an owner's imports wait or run."""
         ...
 
     def get_field(self, sha256: str) -> FieldRecord | None: ...

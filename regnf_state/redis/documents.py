@@ -37,7 +37,7 @@ for _, cap in ipairs(cjson.decode(ARGV[3])) do
   if cap[1] == 'HVALS' then
     for _, value in ipairs(redis.call('HVALS', cap[2])) do held = held + tonumber(value) end
   else
-    held = redis.call(cap[1], cap[2])
+    for key in string.gmatch(cap[2], '%S+') do held = held + redis.call(cap[1], key) end
   end
   if held + cap[3] > cap[4] then return cap[5] end
 end
@@ -62,7 +62,10 @@ return 'OK'
 
 Command = tuple[str, ...]
 Cap = tuple[str, str, int, int, str]
-"""(SCARD, HLEN or HVALS for the sum of a hash's values, key, what is to be added, the most, the answer beyond it)."""
+"""(SCARD, HLEN or HVALS for the sum of a hash's values, key, what is to be added, the most, the answer beyond it).
+
+Of several keys with a space between them, the sum counts.
+"""
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,15 @@ def _rejected_key(owner: str) -> str:
     return f"{PREFIX}owner:{owner}:rejected"
 
 
+def _importing_key(owner: str) -> str:
+    """An owner's fields whose import has not ended."""
+    return f"{_VALIDATING}:{owner}"
+
+
 def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
-    key, caps = _stored_key(record.owner), []
+    key, caps = _stored_key(record.owner), list[Cap]()
+    if quota.imports is not None:
+        caps.append(("SCARD", _importing_key(record.owner), 1, quota.imports, "QUOTA_IMPORTS"))
     if quota.fields is not None:
         caps.append(("HLEN", key, 1, quota.fields, "QUOTA_FIELDS"))
     if quota.stored_bytes is not None:
@@ -64,10 +71,10 @@ class RedisFieldRecords(RedisDocuments):
     def _save_field(
         self, expected_version: int, record: FieldRecord, more: Sequence[Command] = (), caps: Sequence[Cap] = ()
     ) -> str:
-        indexes: list[Command] = [("SADD", OWNERS, record.owner)]
-        index: Command = ("SADD" if record.state == "validating" else "SREM", _VALIDATING, record.sha256)
-        indexes += [
-            index,
+        place = "SADD" if record.state == "validating" else "SREM"
+        indexes: list[Command] = [
+            ("SADD", OWNERS, record.owner),
+            *((place, each, record.sha256) for each in (_VALIDATING, _importing_key(record.owner))),
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
         ]
         indexes += more
@@ -121,6 +128,9 @@ class RedisFieldRecords(RedisDocuments):
         before: Any = self._redis.get(_attempts_key(record.sha256))
         return record if before is None else replace(record, attempt=record.attempt + int(before))
 
+    def importing(self, owner: str) -> int:
+        return int(self._redis.scard(_importing_key(owner)))
+
     def stored(self, owner: str) -> tuple[int, int]:
         sizes: Any = self._redis.hvals(_stored_key(owner))
         return len(sizes), sum(map(int, sizes))
@@ -168,7 +178,7 @@ class RedisFieldRecords(RedisDocuments):
             commands: list[Command] = [
                 ("DEL", FIELD.key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
-                ("SREM", _VALIDATING, sha256),
+                *(("SREM", each, sha256) for each in (_VALIDATING, _importing_key(owner_of(sha256)))),
                 ("ZREM", _rejected_key(owner_of(sha256)), sha256),
                 ("HDEL", _stored_key(owner_of(sha256)), sha256),
                 ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),

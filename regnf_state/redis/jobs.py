@@ -160,6 +160,9 @@ class RedisRecordStore(RedisFieldRecords):
         caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
         if quota.active_jobs is not None:
             caps.append(("SCARD", _active_key(record), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
+        elif quota.share_jobs:
+            # no more than stay free: one greedy owner gets half of all, two get a third each
+            caps.append(("SCARD", f"{_active_key(record)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
         while True:
             known, now = self._read_to_create(JOB, record.id)
             fresh = transitions.restarted_job(known, record, now) if known is not None else record

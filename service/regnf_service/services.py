@@ -44,7 +44,13 @@ class Services:
     def quota(self) -> Quota:
         """What each caller may have."""
         chosen = self.settings
-        return Quota(chosen.quota_active_jobs, chosen.quota_fields, chosen.quota_stored_bytes)
+        return Quota(
+            active_jobs=chosen.quota_active_jobs,
+            share_jobs=chosen.needs_token,
+            imports=chosen.max_imports_per_caller,
+            fields=chosen.quota_fields,
+            stored_bytes=chosen.quota_stored_bytes,
+        )
 
     @cached_property
     def room(self) -> Room:

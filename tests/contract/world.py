@@ -13,6 +13,7 @@ from fastapi import FastAPI
 from redis import Redis
 
 from regnf_service.app import create_app
+from regnf_state.queue import Work
 from regnf_state.records import JobRecord
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
@@ -67,6 +68,7 @@ class World:
         answer = self.client.put(f"/fields/{sha256(data)}", content=data)
         assert answer.status_code == 201, answer.text
         self.blobs.delete(f"fields/{sha256(data)}/original")
+        self.queue.fair.remove(Work("import", sha256(data), 1).name)
         self.records.update_field(sha256(data), attempt=1, state="ready", report={"bounds": bounds or BOUNDS})
         return sha256(data)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.budget import check_budget
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.uploads import Received, Upload
-from regnf_service.problem import CLOSE, Problem
+from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord, QuotaError, UnreadableRecordError
@@ -21,11 +23,12 @@ def function_of(description: UploadDescription) -> dict[str, Any]:
 
 def check_room(services: Services, caller: str, sha256: str, size: int | None) -> None:
     """Refuse an upload of ``size`` bytes before it comes if the caller has no room for it. Raises Problem."""
-    quota = services.quota
-    if size is None or (quota.fields is None and quota.stored_bytes is None):
-        return
     known = _known(services, reference_of(caller, sha256))
     if known is not None and known.state != "rejected":
+        return
+    check_workers(services, caller, CLOSE)
+    quota = services.quota
+    if size is None or (quota.fields is None and quota.stored_bytes is None):
         return
     count, stored = services.records.stored(caller)
     if quota.fields is not None and count >= quota.fields:
@@ -47,6 +50,14 @@ def _known(services: Services, reference: str) -> FieldRecord | None:
         return None
 
 
+def check_workers(services: Services, caller: str, headers: Mapping[str, str] | None = None) -> None:
+    """Refuse an import that the workers have no time for. Raises Problem QUOTA_IMPORTS, QUOTA_WORKER_SECONDS."""
+    check_budget(services, caller, headers)
+    most = services.quota.imports
+    if most is not None and services.records.importing(caller) >= most:
+        raise Problem("QUOTA_IMPORTS", headers={**(headers or {}), **RETRY_LATER})
+
+
 @dataclass(frozen=True)
 class StoredUpload:
     """A field that was taken in. ``created``: it was not held before, or had been rejected and is tried anew."""
@@ -65,12 +76,14 @@ async def store_upload(
 ) -> StoredUpload:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
-    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, and QuotaError.
+    Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_IMPORTS,
+    QUOTA_WORKER_SECONDS, and QuotaError.
     """
     reference = reference_of(caller, received.sha256)
     known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
         return await in_thread(_keep, services, known, description)
+    await in_thread(check_workers, services, caller)
     await in_thread(services.room.make, caller)
     await upload.commit(original_key(reference))
     return await in_thread(_record, services, reference, received.bytes, description)

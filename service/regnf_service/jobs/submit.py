@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from regnf_core.detections import Bounds, require_in_scene
 from regnf_core.errors import InvalidDetectionError
+from regnf_service.budget import check_budget
 from regnf_service.jobs.cost_limits import check_cost
 from regnf_service.jobs.identity import digest, job_id_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.registration_request import RegistrationRequest
 
 _KEY_LIFETIME_S = 24 * 3600
@@ -74,7 +76,7 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
-    Raises Problem IDEMPOTENCY_KEY_REUSED, QueueFullError, QuotaError, RecordsFullError.
+    Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
     job_id = job_id_of(request)
@@ -84,6 +86,7 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
         existing = _earlier_answer(services, digest(key), job_id, request)
         if existing is not None:
             return existing
+    _require_budget(services, caller, job_id)
     now = services.records.now()
     record, _ = services.records.create_job(
         JobRecord(
@@ -100,8 +103,17 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
     )
     if record.status == "accepted":
         # also for a job known before: mends one that was recorded but never queued
-        services.queue.enqueue_registration(record.id, record.attempt)
+        services.queue.enqueue_registration(record.id, record.attempt, record.owner)
     return record
+
+
+def _require_budget(services: Services, caller: str, job_id: str) -> None:
+    """What exists already costs nothing more. Raises Problem QUOTA_WORKER_SECONDS."""
+    with suppress(UnreadableRecordError):
+        known = services.records.get_job(job_id)
+        if known is not None and known.status not in ("failed", "dismissed"):
+            return
+    check_budget(services, caller)
 
 
 def _earlier_answer(services: Services, key: str, job_id: str, request: RegistrationRequest) -> JobRecord | None:

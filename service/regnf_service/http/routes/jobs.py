@@ -52,7 +52,7 @@ class _Seen(NamedTuple):
 
 
 def _seen(services: Services, record: JobRecord) -> _Seen:
-    position = services.records.queue_position(record.id) if record.status == "accepted" else None
+    position = services.queue.position(record.id, record.attempt) if record.status == "accepted" else None
     return _Seen(record, position, services.webhooks.deliveries(record))
 
 

@@ -1,0 +1,130 @@
+"""What one caller may ask of the workers, so that others come to their turn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from redis import Redis
+
+from regnf_state.ownership import reference_of
+from tests.contract.asgi import client_of
+from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
+
+TOKENS = frozenset({"greedy:the-greedy-one-s-token", "honest:the-honest-one-s-token"})
+HONEST = {"Authorization": "Bearer the-honest-one-s-token"}
+
+
+@pytest.fixture
+def shared(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+    """Makes a service of two callers; its client is the greedy one's."""
+    made: list[World] = []
+
+    def make(**settings: object) -> World:
+        made.append(make_world(tmp_path, any_redis, api_tokens=TOKENS, **settings))
+        made[-1].client.headers.update({"Authorization": "Bearer the-greedy-one-s-token"})
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.client.close()
+
+
+def put(client: httpx.Client, name: str) -> httpx.Response:
+    data = field_bytes(name)
+    return client.put(f"/fields/{sha256(data)}", content=data)
+
+
+def imported(world: World, client: httpx.Client, caller: str) -> dict[str, Any]:
+    """A request of the caller's between fields that are ready."""
+    names = []
+    for name in ("scene", "object"):
+        assert put(client, name).status_code == 201
+        names.append(sha256(field_bytes(name)))
+        world.records.update_field(reference_of(caller, names[-1]), attempt=1, state="ready")
+    return {"scene": names[0], "object": names[1], "detection": BOX}
+
+
+def accepted(client: httpx.Client, request: dict[str, Any], tries: int) -> int:
+    """How many of so many registrations are taken before one is refused for the quota."""
+    for seed in range(tries):
+        answer = client.post("/register", json=request | {"seed": seed})
+        if answer.status_code != 202:
+            assert_refused(answer, 429, "QUOTA_ACTIVE_JOBS")
+            assert int(answer.headers["Retry-After"]) >= 1
+            return seed
+    return tries
+
+
+def test_imports_that_wait_are_bounded_for_each_caller(shared: Callable[..., World]) -> None:
+    world = shared()
+    answers = [put(world.client, str(number)) for number in range(150)]
+    assert [answer.status_code for answer in answers] == [201] * 128 + [429] * 22
+    assert_refused(answers[-1], 429, "QUOTA_IMPORTS")
+    assert int(answers[-1].headers["Retry-After"]) >= 1
+    assert len(list(world.blobs.list("fields"))) == 128
+    with client_of(world.app, headers=HONEST) as honest:
+        assert put(honest, "0").status_code == 201
+    assert put(world.client, "0").status_code == 200, "one that is held already asks for nothing"
+    world.records.update_field(reference_of("greedy", sha256(field_bytes("7"))), attempt=1, state="ready")
+    assert put(world.client, "200").status_code == 201
+    assert world.client.delete(f"/fields/{sha256(field_bytes('8'))}").status_code == 204
+    assert put(world.client, "201").status_code == 201
+    assert put(world.client, "202").status_code == 429
+
+
+def test_no_caller_has_more_jobs_than_it_leaves_free(shared: Callable[..., World]) -> None:
+    world = shared(max_queued_jobs=12)
+    with client_of(world.app, headers=HONEST) as honest:
+        requests = imported(world, world.client, "greedy"), imported(world, honest, "honest")
+        assert accepted(world.client, requests[0], 20) == 6
+        assert accepted(honest, requests[1], 20) == 3
+        assert accepted(world.client, requests[0] | {"seed": 100}, 0) == 0
+
+
+def test_a_number_of_jobs_that_was_set_holds_instead(shared: Callable[..., World]) -> None:
+    world = shared(max_queued_jobs=12, quota_active_jobs=10)
+    assert accepted(world.client, imported(world, world.client, "greedy"), 20) == 10
+
+
+def test_a_service_without_tokens_has_one_caller_who_may_have_all(world: World) -> None:
+    request = world.valid_request()
+    limit = world.settings.max_queued_jobs
+    answers = [world.client.post("/register", json=request | {"seed": seed}) for seed in range(limit)]
+    assert {answer.status_code for answer in answers} == {202}
+
+
+def spend(world: World, seconds: float) -> None:
+    """An import of the greedy one's takes so long, and fails."""
+    assert put(world.client, "costly").status_code == 201
+    reference = reference_of("greedy", sha256(field_bytes("costly")))
+    name = world.redis.lpop("rq:queue:regnf-import").decode()
+    assert name.startswith(f"import-{reference}-")
+    world.queue.fair.finish(name, seconds)
+    world.records.update_field(reference, state="rejected", error={"reason": "IMPORT_TIMEOUT"})
+
+
+def test_a_caller_whose_time_is_used_up_waits(shared: Callable[..., World]) -> None:
+    world = shared(quota_worker_seconds_per_hour=100)
+    request = imported(world, world.client, "greedy")
+    world.queue.lose()
+    earlier = world.client.post("/register", json=request).json()["id"]
+    world.queue.lose()
+    spend(world, 99.0)
+    assert world.client.post("/register", json=request | {"seed": 1}).status_code == 202
+    world.queue.lose()
+    spend(world, 1.0)
+    for answer in (
+        put(world.client, "another"),
+        world.client.post("/fields", content=field_bytes("another")),
+        put(world.client, "costly"),
+        world.client.post("/register", json=request | {"seed": 2}),
+    ):
+        assert_refused(answer, 429, "QUOTA_WORKER_SECONDS")
+        assert 3500 <= int(answer.headers["Retry-After"]) <= 3600
+    assert world.client.post("/register", json=request).json()["id"] == earlier, "what exists costs nothing"
+    with client_of(world.app, headers=HONEST) as honest:
+        assert put(honest, "another").status_code == 201
