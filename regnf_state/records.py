@@ -269,6 +269,14 @@ class RecordStore(Protocol):
         """How many of an owner's imports wait or run."""
         ...
 
+    def remember_rejection(self, field: FieldRecord, error: dict[str, Any]) -> None:
+        """Keep why this upload was rejected, also beyond the field's deletion."""
+        ...
+
+    def known_rejection(self, field: FieldRecord) -> dict[str, Any] | None:
+        """Why the same upload of the same owner was rejected lately: bytes, description and gate are the same."""
+        ...
+
     def get_field(self, sha256: str) -> FieldRecord | None: ...
 
     def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:

@@ -88,8 +88,8 @@ class Settings(BaseSettings):
     max_streams_per_caller: int = Field(default=100, ge=1)
     quota_active_jobs: int | None = Field(default=None, ge=1)
     """Jobs of each caller that wait or run. Unset: with tokens, as many as are left free for others."""
-    max_imports_per_caller: int = Field(default=128, ge=1)
-    """Imports of each caller that wait or run. The largest search has 64 candidates."""
+    max_imports_per_caller: int = Field(default=64, ge=1)
+    """Imports of each caller that wait or run."""
     quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
     """What each caller's imports and jobs may cost the workers in an hour."""
     caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)

@@ -12,9 +12,10 @@ from regnf_state import transitions
 from regnf_state.ownership import owner_of
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
-from regnf_state.redis.documents import Cap, Command, Kind, RedisDocuments, text
+from regnf_state.redis.documents import Cap, Command, Kind, text
 from regnf_state.redis.keys import PREFIX
 from regnf_state.redis.owners import OWNERS, Owners
+from regnf_state.redis.rejections import RedisRejections
 from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}fields:created"
@@ -61,7 +62,7 @@ def _attempts_key(sha256: str) -> str:
     return f"{PREFIX}field:{sha256}:attempts"
 
 
-class RedisFieldRecords(RedisDocuments):
+class RedisFieldRecords(RedisRejections):
     """The half of the record store that is about fields."""
 
     def __init__(self, redis: Redis) -> None:

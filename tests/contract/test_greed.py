@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 from redis import Redis
 
 from regnf_state.ownership import reference_of
+from regnf_state.problems import problem_document
+from regnf_state.records import FieldRecord
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
 
@@ -61,11 +64,11 @@ def accepted(client: httpx.Client, request: dict[str, Any], tries: int) -> int:
 
 def test_imports_that_wait_are_bounded_for_each_caller(shared: Callable[..., World]) -> None:
     world = shared()
-    answers = [put(world.client, str(number)) for number in range(150)]
-    assert [answer.status_code for answer in answers] == [201] * 128 + [429] * 22
+    answers = [put(world.client, str(number)) for number in range(100)]
+    assert [answer.status_code for answer in answers] == [201] * 64 + [429] * 36
     assert_refused(answers[-1], 429, "QUOTA_IMPORTS")
     assert int(answers[-1].headers["Retry-After"]) >= 1
-    assert len(list(world.blobs.list("fields"))) == 128
+    assert len(list(world.blobs.list("fields"))) == 64
     with client_of(world.app, headers=HONEST) as honest:
         assert put(honest, "0").status_code == 201
     assert put(world.client, "0").status_code == 200, "one that is held already asks for nothing"
@@ -128,3 +131,62 @@ def test_a_caller_whose_time_is_used_up_waits(shared: Callable[..., World]) -> N
     assert world.client.post("/register", json=request).json()["id"] == earlier, "what exists costs nothing"
     with client_of(world.app, headers=HONEST) as honest:
         assert put(honest, "another").status_code == 201
+
+
+def reject(world: World, caller: str, name: str, reason: str) -> None:
+    """What a worker does with an upload that the gate refuses."""
+    assert put(world.client, name).json()["state"] == "validating"
+    field = world.records.get_field(reference_of(caller, sha256(field_bytes(name))))
+    assert field is not None
+    error = problem_document(reason)
+    world.records.remember_rejection(field, error)
+    world.blobs.delete_prefix(f"fields/{field.sha256}")
+    world.records.update_field(field.sha256, attempt=field.attempt, state="rejected", error=error)
+    world.queue.lose()
+
+
+@pytest.mark.parametrize("delete", [False, True])
+def test_bytes_that_were_rejected_are_not_imported_again(shared: Callable[..., World], delete: bool) -> None:
+    world = shared()
+    reject(world, "greedy", "bad", "FIELD_SHAPES_MISMATCH")
+    path = f"/fields/{sha256(field_bytes('bad'))}"
+    before = world.client.get(path).json()
+    if delete:
+        assert world.client.delete(path).status_code == 204
+    for _ in range(3):
+        answer = put(world.client, "bad")
+        assert (answer.status_code, answer.json()["state"]) == (201, "rejected")
+        assert answer.json()["error"] == before["error"]
+    assert world.queue.imports == []
+    assert list(world.blobs.list("fields")) == []
+    with client_of(world.app, headers=HONEST) as honest:
+        assert put(honest, "bad").json()["state"] == "validating", "nothing tells what another has sent"
+
+
+@pytest.mark.parametrize(
+    ("reason", "seconds"),
+    [("FIELD_SHAPES_MISMATCH", 86400), ("IMPORT_TIMEOUT", 600), ("WORKER_LOST", None), ("INTERNAL", None)],
+)
+def test_how_long_a_rejection_holds(shared: Callable[..., World], reason: str, seconds: int | None) -> None:
+    world = shared()
+    reject(world, "greedy", "bad", reason)
+    keys = world.redis.keys("regnf:rejection:*")
+    assert [world.redis.ttl(key) for key in keys] == ([] if seconds is None else [pytest.approx(seconds, abs=30)])
+    assert put(world.client, "bad").json()["state"] == ("validating" if seconds is None else "rejected")
+
+
+def test_another_description_is_another_upload(shared: Callable[..., World]) -> None:
+    world = shared()
+    reject(world, "greedy", "bad", "FIELD_SHAPES_MISMATCH")
+    parts = {"file": field_bytes("bad"), "description": ("", json.dumps({"family": "grid"}), "application/json")}
+    answer = world.client.post("/fields", files=parts)
+    assert (answer.status_code, answer.json()["state"]) == (201, "validating"), answer.text
+
+
+def test_rejections_that_are_kept_are_bounded(shared: Callable[..., World]) -> None:
+    world = shared()
+    fields = [FieldRecord(f"{number:064x}_greedy", "validating", 1, 0.0, 0.0) for number in range(300)]
+    for field in fields:
+        world.records.remember_rejection(field, {"reason": "FIELD_SHAPES_MISMATCH"})
+    assert len(world.redis.keys("regnf:rejection:*")) == 256
+    assert [world.records.known_rejection(one) is not None for one in (fields[43], fields[44])] == [False, True]

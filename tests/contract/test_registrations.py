@@ -160,11 +160,11 @@ def test_a_search_among_one_is_not_its_registration(world: World) -> None:
 
 
 def test_as_many_candidates_as_are_allowed(world: World) -> None:
-    now = world.records.now()
+    request, now = library(world), world.records.now()
     names = [f"{number:064x}" for number in range(512)]
     for sha in names:
         world.records.create_field(FieldRecord(sha, "validating", 600, now, now))
-    assert world.client.post("/register", json=library(world) | {"candidates": names}).status_code == 202
+    assert world.client.post("/register", json=request | {"candidates": names}).status_code == 202
 
 
 def test_candidates_are_in_use_while_the_job_is_active(world: World) -> None:

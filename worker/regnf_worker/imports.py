@@ -80,6 +80,7 @@ def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -
     """Drop everything the upload left and say why. Does nothing to a field that has moved on."""
     field = context.records.get_field(sha256)
     if field is not None and field.attempt == attempt and field.state == "validating":
+        context.records.remember_rejection(field, error)
         context.blobs.delete_prefix(f"fields/{sha256}")
         _end(context, sha256, attempt, state="rejected", error=error)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from regnf_core.importing.upload_description import UploadDescription
@@ -83,10 +83,13 @@ async def store_upload(
     known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
         return await in_thread(_keep, services, known, description)
+    field = await in_thread(_field, services, reference, received.bytes, description)
+    if field.state == "rejected":
+        return StoredUpload((await in_thread(services.records.create_field, field))[0], created=True)
     await in_thread(check_workers, services, caller)
     await in_thread(services.room.make, caller)
     await upload.commit(original_key(reference))
-    return await in_thread(_record, services, reference, received.bytes, description)
+    return await in_thread(_record, services, field, description)
 
 
 def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> StoredUpload:
@@ -101,7 +104,8 @@ def _keep(services: Services, known: FieldRecord, description: UploadDescription
     return StoredUpload(known, created=False)
 
 
-def _record(services: Services, reference: str, size: int, description: UploadDescription | None) -> StoredUpload:
+def _field(services: Services, reference: str, size: int, description: UploadDescription | None) -> FieldRecord:
+    """The field of a new upload: to be imported, or rejected at once if the same upload of this caller was lately."""
     now = services.records.now()
     said: dict[str, Any] = {} if description is None else function_of(description)
     field = FieldRecord(
@@ -113,14 +117,19 @@ def _record(services: Services, reference: str, size: int, description: UploadDe
         label=None if description is None else description.label,
         description=said,
     )
+    error = services.records.known_rejection(field)
+    return field if error is None else replace(field, state="rejected", error=error)
+
+
+def _record(services: Services, field: FieldRecord, description: UploadDescription | None) -> StoredUpload:
     try:
         record, created = services.records.create_field(field, services.quota)
     except QuotaError:
-        services.blobs.delete(original_key(reference))
+        services.blobs.delete(original_key(field.sha256))
         raise
     if record.state == "ready":
         # another upload of the same bytes came first and is imported already
-        services.blobs.delete(original_key(reference))
+        services.blobs.delete(original_key(field.sha256))
     if not created:
         return _keep(services, record, description)
     services.queue.enqueue_import(record.sha256, record.attempt)
