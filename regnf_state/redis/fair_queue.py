@@ -98,10 +98,12 @@ class FairQueue:
             for name in answers[1::2]:
                 pipeline.hget(f"{_PREFIX}entry:{text(name or '')}", "since")
             since = pipeline.execute()
-        return [
+        lines = [
             Line(owner, count + (owner == ready), now - float(begun or now), tag - clock)
             for (owner, tag), count, begun in zip(owners, answers[::2], since, strict=True)
         ]
+        alone = ready is not None and all(owner != ready for owner, _ in owners)
+        return [*([Line(ready, 1, 0.0, 0.0)] if ready is not None and alone else []), *lines]
 
     def _look(self) -> tuple[list[tuple[str, float]], str | None, float, float]:
         """The owners with their tags, the owner of what lies ready, the virtual clock, the server's time."""

@@ -15,10 +15,12 @@ from redis.exceptions import RedisError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.descriptors import open_descriptors
+from regnf_service.fairness_metrics import fairness_metrics
 from regnf_service.http.connections import Connections
 from regnf_service.http.middleware import route_of
 from regnf_service.services import Services
 from regnf_state.redis.counters import Counters
+from regnf_state.redis.fair_queue import FairQueue
 from regnf_state.redis.webhook_outbox import RedisOutbox
 
 _COUNTS = {
@@ -27,6 +29,7 @@ _COUNTS = {
     "imports": ("Imports that have ended.", ("state", "reason")),
     "jobs_evicted": ("Finished jobs that went before their time, to make room.", ()),
     "records_unreadable": ("Records that could not be read, by what they were of.", ("kind",)),
+    "queue_payloads_refused": ("Entries in the queue that this service has not written.", ("queue",)),
     "webhook_sends": ("Messages about jobs that were sent, or not.", ("outcome",)),
 }
 _TIMES = {
@@ -53,6 +56,12 @@ class Metrics:
             "regnf_redis_errors", "Answers and scrapes for which Redis was away.", registry=self.registry
         )
         self.registry.register(_Process(connections))
+        self.quota_refusals = Counter(
+            "regnf_quota_refusals",
+            "Calls refused because of what their caller has.",
+            ("reason",),
+            registry=self.registry,
+        )
         self.registry.register(_Held(self, services))
 
 
@@ -116,6 +125,7 @@ class _Held(Collector):
         yield _gauge("webhooks_waiting", "Messages still to be sent.", RedisOutbox(services.redis).waiting())
         yield _gauge("records_set_aside", "Records known to be unreadable.", services.records.unreadable.total())
         counters = Counters(services.redis)
+        yield from fairness_metrics(FairQueue(services.redis), counters)
         for name, (about, names) in _COUNTS.items():
             counter = CounterMetricFamily(f"regnf_{name}", about, labels=names)
             for counted, value in counters.counts(name):

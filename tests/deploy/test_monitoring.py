@@ -14,6 +14,7 @@ from prometheus_client import generate_latest
 from regnf_service.metrics import Metrics
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
+from regnf_state.redis.counters import count
 from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 from regnf_state.settings import Settings
 from tests.redis_server import private_redis
@@ -41,11 +42,16 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         store.update_job("ended", 1, status="successful", verdict="registered")
         store.create_field(FieldRecord("a" * 64, "validating", 1, store.now(), store.now()))
         store.update_field("a" * 64, state="ready")
+        for number in range(2):
+            services.queue.enqueue_registration(f"j{number}", 1)
+        count(redis, "worker_seconds", "anonymous", "import")
+        count(redis, "queue_payloads_refused", "regnf")
         RedisOutbox(redis).settle(Message("ended", 1, 0), Delivery("delivered"))
         metrics = Metrics(services)
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)
         metrics.received.labels("/").inc()
+        metrics.quota_refusals.labels("QUOTA_IMPORTS").inc()
         text = generate_latest(metrics.registry).decode()
     found: dict[str, set[str]] = {}
     for line in text.splitlines():

@@ -161,7 +161,7 @@ def test_measured_seconds_replace_the_estimate(shop: Shop) -> None:
     assert sum(shop.fair.spent("a").values()) == pytest.approx(7.0)
     shop.take()
     assert sum(shop.fair.spent("a").values()) == pytest.approx(14.0), "what runs counts as the last did"
-    assert [(line.owner, line.waiting) for line in shop.fair.lines()] == [], "the last one lies ready"
+    assert [(line.owner, line.waiting) for line in shop.fair.lines()] == [("a", 1)]
     assert shop.redis.hget("regnf:counters", "worker_seconds|a|registration") == b"7"
 
 

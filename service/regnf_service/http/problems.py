@@ -97,6 +97,8 @@ async def _answer(request: Request, error: Exception) -> JSONResponse:
         # written outside of everything that gives entries their context
         told = {"request_id": request_id, "caller": getattr(request.state, "caller", None)}
         logger.error("%s request_id=%s", problem.reason, request_id, exc_info=error, extra=told)
+    elif problem.reason.startswith("QUOTA_"):
+        request.app.state.metrics.quota_refusals.labels(problem.reason).inc()
     elif problem.reason == "STORE_UNAVAILABLE":
         request.app.state.metrics.redis_errors.inc()
     if problem.reason != "INTERNAL" and problem.status >= 500:
