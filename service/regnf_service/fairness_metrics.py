@@ -13,6 +13,7 @@ from regnf_state.redis.fair_queue import FairQueue
 
 _MOST_CALLERS = 32
 OTHER = "other"
+"""The label of all the rest."""
 
 
 def fairness_metrics(fair: FairQueue, counters: Counters) -> Iterator[Metric]:
@@ -27,15 +28,9 @@ def fairness_metrics(fair: FairQueue, counters: Counters) -> Iterator[Metric]:
     for labels, value in sorted(_summed(spent.items(), shown).items()):
         seconds.add_metric(labels, value)
     yield seconds
-    waiting = GaugeMetricFamily("regnf_caller_waiting", "Jobs and imports that wait, by caller.", labels=("caller",))
-    oldest = GaugeMetricFamily(
-        "regnf_caller_wait_seconds", "How long the first of them has waited.", labels=("caller",)
-    )
-    lead = GaugeMetricFamily(
-        "regnf_caller_lead_seconds",
-        "Worker seconds that a caller has had beyond who is served now.",
-        labels=("caller",),
-    )
+    waiting = _by_caller("waiting", "Jobs and imports that wait, by caller.")
+    oldest = _by_caller("wait_seconds", "How long the first of them has waited.")
+    lead = _by_caller("lead_seconds", "Worker seconds that a caller has had beyond who is served now.")
     for owner, line in lines.items():
         if owner in shown:
             waiting.add_metric((owner,), line.waiting)
@@ -47,6 +42,10 @@ def fairness_metrics(fair: FairQueue, counters: Counters) -> Iterator[Metric]:
         oldest.add_metric((OTHER,), max(line.oldest_s for line in rest))
         lead.add_metric((OTHER,), max(line.lead_s for line in rest))
     yield from (waiting, oldest, lead)
+
+
+def _by_caller(name: str, about: str) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"regnf_caller_{name}", about, labels=("caller",))
 
 
 def _told_apart(owners: Iterable[str]) -> set[str]:
