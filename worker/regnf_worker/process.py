@@ -204,14 +204,16 @@ class RegnfWorker(ResilientWorker):
                 self.kill_horse()
 
     def _settle(self, work: Work, ended: kernel.Exit, out_of_memory: bool) -> None:
-        status = ended.status
+        status, limited = ended.status, work.kind == "registration"
         end = ChildExit(
             signal=os.WTERMSIG(status) if status is not None and os.WIFSIGNALED(status) else None,
             late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
             given_back=self._given_back,
             exceeded=self._exceeded,
-            crashed_near_limit=work.kind == "registration" and bool(status) and self._job_limits.is_near(ended.peak_memory),
+            crashed_near_limit=work.kind == "registration"
+            and bool(status)
+            and self._job_limits.is_near(ended.peak_memory),
             limits=self._job_limits,
         )
         settle = self._settlers[work.kind]
