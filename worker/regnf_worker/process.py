@@ -204,7 +204,7 @@ class RegnfWorker(ResilientWorker):
                 self.kill_horse()
 
     def _settle(self, work: Work, ended: kernel.Exit, out_of_memory: bool) -> None:
-        status, limited = ended.status, work.kind == "registration"
+        status = ended.status
         end = ChildExit(
             signal=os.WTERMSIG(status) if status is not None and os.WIFSIGNALED(status) else None,
             late=self._late or time.monotonic() - self._started >= self._limit_s,
