@@ -32,13 +32,14 @@ class SmallPair:
         return {**sent, "detection": self.detection}
 
 
-def write_small_pair(folder: Path) -> SmallPair:
-    """Both files, a megabyte each, below ``folder``; the same bytes each time."""
+def write_small_pair(folder: Path, factor: float = 1.0) -> SmallPair:
+    """Both files, a megabyte each, below ``folder``; the same bytes each time, others with another ``factor``."""
+    folder.mkdir(exist_ok=True)
     truth = chair_pose()
     paths = []
     for name, field, reach in (("room", room(truth), 1.0), ("chair", chair(), 0.6)):
         paths.append(folder / f"{name}.npz")
-        values = _sampled(field, reach)
+        values = _sampled(field, reach) * np.float32(factor)
         np.savez(paths[-1], sdf=values, bounds=np.array([[-reach] * 3, [reach] * 3]))
     box = chair_box(truth)
     low, high = (box.center - box.size / 2).tolist(), (box.center + box.size / 2).tolist()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import platform
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from redis.exceptions import RedisError
@@ -115,10 +115,19 @@ async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
     responses={200: {"content": {"application/yaml": {"schema": {"type": "object"}}}}},
 )
 async def openapi_yaml(request: Request) -> Response:
-    return Response(contract_yaml(request.app), media_type="application/yaml")
+    return Response(_made_once(request, contract_yaml, request.app), media_type="application/yaml")
 
 
 @get_and_head(router, "/docs", summary="This contract, for people", response_class=HTMLResponse)
 async def docs(request: Request) -> HTMLResponse:
     """One page without scripts; loads nothing from elsewhere."""
-    return HTMLResponse(render_docs(request.app.openapi()), headers={"Content-Security-Policy": STYLE_POLICY})
+    page = _made_once(request, render_docs, request.app.openapi())
+    return HTMLResponse(page, headers={"Content-Security-Policy": STYLE_POLICY})
+
+
+def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> str:
+    """What ``make`` writes, kept with the application: both take longer than a hundred polls."""
+    made: dict[str, str] = request.app.state.__dict__.setdefault("made_once", {})
+    if make.__name__ not in made:
+        made[make.__name__] = make(source)
+    return made[make.__name__]
