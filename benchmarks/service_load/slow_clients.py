@@ -109,7 +109,7 @@ def measure(folder: Path, slow: int, seconds: float) -> tuple[Seen, float]:
         begin = time.monotonic() + _CALM_S
         until = begin + seconds
         honest = threading.Thread(
-            target=be_honest, args=(house, write_small_pair(folder / "new", 1.0001), begin + 8.0, seen), daemon=True
+            target=be_honest, args=(house, write_small_pair(folder / "new", 1.0001), begin + 22.0, seen), daemon=True
         )
         honest.start()
         pollers = threading.Thread(target=lambda: asyncio.run(everybody(port, path, until, seen)))
