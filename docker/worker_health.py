@@ -14,6 +14,7 @@ from redis import Redis, RedisError
 from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.queue import QUEUE_NAME
+from regnf_state.redis.address import NoRedisError, redis_address
 from regnf_state.settings import Settings
 
 _TIMEOUT_S = 5.0
@@ -31,9 +32,10 @@ def is_alive(redis: Redis, hostname: str) -> bool:
 
 
 def main() -> int:
-    url = Settings().redis_url
-    if url is None:
-        sys.stderr.write("REGNF_REDIS_URL is not set\n")
+    try:
+        url = redis_address(Settings())
+    except NoRedisError as error:
+        sys.stderr.write(f"{error}\n")
         return 1
     try:
         with Redis.from_url(url, socket_timeout=_TIMEOUT_S, socket_connect_timeout=_TIMEOUT_S) as redis:

@@ -29,7 +29,7 @@ def worker(
     from regnf_cli.settings import check_redis_url, read_settings
     from regnf_cli.start_errors import StartError
     from regnf_state.journal.storage_claim import StorageMismatchError
-    from regnf_state.stores import NoRedisError
+    from regnf_state.redis.address import NoRedisError
     from regnf_worker.main import run_worker
     from regnf_worker.preload import PreloadError
 

@@ -46,6 +46,8 @@ class Settings(BaseSettings):
     """Unset: `regnf serve` starts a private server of its own."""
     queue_key: str | None = Field(default=None, min_length=16, repr=False)
     """Signs what the queue in Redis holds; the same for front ends and workers. What is not signed never runs."""
+    redis_password_file: Path | None = None
+    """A file with Redis' password, in place of one in the address."""
     workers: int = Field(default=1, ge=0, le=64)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where registrations run; auto: on the GPU if torch can use one."""

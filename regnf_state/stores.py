@@ -10,16 +10,11 @@ from regnf_state.blobs.base import BlobStore
 from regnf_state.blobs.open import open_blobs
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.queue import JobQueue
+from regnf_state.redis.address import redis_address
 from regnf_state.redis.bounded_client import connect_bounded
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
-
-
-class NoRedisError(RuntimeError):
-    """The settings name no Redis."""
-
-    reason = "REDIS_URL_MISSING"
 
 
 @dataclass(frozen=True)
@@ -39,9 +34,7 @@ def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: floa
     gives no answer. A storage that is away is waited for ``storage_wait_s`` seconds. ``existing``: for a job, which
     makes no storage of its own where that of its worker is away.
     """
-    if settings.redis_url is None:
-        raise NoRedisError("set REGNF_REDIS_URL, or start with `regnf serve`, which brings its own Redis")
-    url = settings.redis_url
+    url = redis_address(settings)
     redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
     queue = RqJobQueue(redis, settings.queue_key, settings.caller_weights)

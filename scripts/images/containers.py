@@ -19,6 +19,7 @@ from typing import Any
 from scripts.images.compose import Service
 
 _HEALTHY_S = 90.0
+_REDIS_SCRIPT = Path(__file__).resolve().parents[2] / "docker/redis.sh"
 
 
 class TrialError(Exception):
@@ -65,8 +66,8 @@ class Container:
         options = ["--hostname", self.name]
         options += [f"--cap-drop={name}" for name in self.service["cap_drop"]]
         options += [f"--env={name}={value}" for name, value in self.service["environment"].items()]
-        named = [entry.split(":") for entry in self.service["volumes"]]
-        options += [f"--volume={self.volumes[name]}:{place}" for name, place in named]
+        named = [entry.partition(":") for entry in self.service["volumes"]]
+        options += [f"--volume={self.volumes[name]}:{place}" for name, _, place in named]
         options += [f"--mount=type=tmpfs,{_tmpfs(entry)}" for entry in self.service["tmpfs"]]
         return [*self.buildah.command, "run", *options, self.id, "--", *command]
 
@@ -132,5 +133,8 @@ def _program_of(pid: int) -> int:
 
 def start_redis(program: str, service: Service, address: str, data: Path) -> subprocess.Popen[bytes]:
     """A server of this machine with the options that the compose file gives to its own, and its image's."""
-    options = ["--bind", address, "--protected-mode", "no", "--dir", str(data), "--loglevel", "warning"]
-    return subprocess.Popen([program, *service["command"][1:], *options], stdout=subprocess.DEVNULL)
+    shell, _, *given = service["command"]
+    options = ["--bind", address, "--protected-mode", "no", "--loglevel", "warning"]
+    environment = os.environ | {"REDIS_SERVER": program, "REDIS_DATA": str(data), "REDIS_RUN": str(data)}
+    command = [shell, str(_REDIS_SCRIPT), *given, *options]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)

@@ -117,10 +117,12 @@ def run(plan: Plan, buildah: Buildah, redis_program: str) -> None:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="regnf-trial-")))
         began = time.monotonic()
-        redis = start_redis(redis_program, plan.redis, HOSTS["redis"], folder)
+        data = folder / "redis"
+        data.mkdir()
+        redis = start_redis(redis_program, plan.redis, HOSTS["redis"], data)
         stack.callback(redis.wait)
         stack.callback(redis.kill)
-        _wait_for_redis(redis)
+        _wait_for_redis(redis, data / "password")
         containers = []
         for container in _containers(plan, buildah, folder):
             stack.callback(container.close)
@@ -142,9 +144,9 @@ def run(plan: Plan, buildah: Buildah, redis_program: str) -> None:
             raise TrialError(f"written outside of the volumes: {', '.join(strays)}")
 
 
-def _wait_for_redis(redis: subprocess.Popen[bytes]) -> None:
+def _wait_for_redis(redis: subprocess.Popen[bytes], password: Path) -> None:
     deadline = time.monotonic() + 20
-    while not answers(f"redis://{HOSTS['redis']}:6379/0"):
+    while not (password.exists() and answers(f"redis://:{password.read_text()}@{HOSTS['redis']}:6379/0")):
         if redis.poll() is not None or time.monotonic() > deadline:
             raise TrialError("Redis does not answer")
         time.sleep(0.05)
@@ -157,7 +159,9 @@ def _containers(plan: Plan, buildah: Buildah, folder: Path) -> Iterator[Containe
     shutil.chown(state, USER, USER)
     services = {"api": plan.api} | {f"worker-{number}": plan.worker for number in range(plan.workers)}
     for name, service in services.items():
-        yield Container(buildah, name, service, {"state": state}, HOSTS, folder / f"{name}.log")
+        yield Container(
+            buildah, name, service, {"state": state, "redis": folder / "redis"}, HOSTS, folder / f"{name}.log"
+        )
 
 
 def use(plan: Plan) -> None:

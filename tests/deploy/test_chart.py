@@ -116,7 +116,15 @@ def test_plain_brings_its_own_redis_and_volume() -> None:
     assert "--appendonly yes" in " ".join(redis["command"])
     assert "noeviction" in redis["command"]
     api = pods(plain)["demo-api"]
-    assert environment(api)["REGNF_REDIS_URL"] == "redis://demo-redis:6379/0"
+    assert environment(api)["REGNF_REDIS_URL"] == {"secretKeyRef": {"name": "demo-redis", "key": "url"}}
+    secret = plain["Secret", "demo-redis"]["stringData"]
+    assert len(secret["password"]) == 48
+    assert secret["url"] == f"redis://:{secret['password']}@demo-redis:6379/0"
+    assert secret["users.acl"].startswith(f"user default on >{secret['password']} ")
+    assert "-config" in secret["users.acl"].split()
+    assert "--aclfile /etc/redis/users.acl" in " ".join(redis["command"])
+    given = render([*OPEN, "redis.password=abcdefghijklmnop"])["Secret", "demo-redis"]["stringData"]
+    assert given["password"] == "abcdefghijklmnop"
     assert environment(api)["REGNF_ALLOW_UNAUTHENTICATED"] == "true"
     claim = plain["PersistentVolumeClaim", "demo-state"]
     assert claim["spec"]["accessModes"] == ["ReadWriteMany"]
@@ -161,6 +169,7 @@ def test_workers_are_scaled_by_what_is_unfinished() -> None:
     [
         ([], "auth.existingSecret"),
         ([*OPEN, "storage.kind=nfs"], "storage"),
+        ([*OPEN, "redis.password=a b"], "password"),
         ([*OPEN, "storage.kind=s3"], "storage.s3.url"),
         ([*OPEN, "worker.device=tpu"], "device"),
         ([*OPEN, "api.replicas=0"], "replicas"),

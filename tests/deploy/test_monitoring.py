@@ -46,6 +46,8 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
             services.queue.enqueue_registration(f"j{number}", 1)
         count(redis, "worker_seconds", "anonymous", "import")
         count(redis, "queue_payloads_refused", "regnf")
+        count(redis, "jobs_evicted")
+        count(redis, "records_unreadable", "job")
         RedisOutbox(redis).settle(Message("ended", 1, 0), Delivery("delivered"))
         metrics = Metrics(services)
         metrics.requests.labels("GET", "/", "200").inc()

@@ -89,7 +89,7 @@ def test_redis_forgets_nothing() -> None:
     assert "--appendonly yes" in command
     assert "--appendfsync everysec" in command
     assert "--maxmemory-policy noeviction" in command
-    assert redis["volumes"] == ["redis:/data"]
+    assert redis["volumes"] == ["redis:/data", "./redis.sh:/etc/redis.sh:ro"]
     assert "ports" not in redis
     assert redis["user"].split(":")[0] not in ("0", "root")
     memory = re.search(r"--maxmemory (\d+)mb", command)
@@ -102,7 +102,8 @@ def test_redis_forgets_nothing() -> None:
 def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
     service = services()[name]
     assert service["depends_on"] == {"redis": {"condition": "service_healthy"}}
-    assert service["volumes"] == ["state:/var/lib/regnf"]
+    assert service["volumes"] == ["state:/var/lib/regnf", "redis:/run/redis:ro"]
+    assert service["environment"]["REGNF_REDIS_PASSWORD_FILE"] == "/run/redis/password"
     assert service["environment"]["REGNF_STATE_DIR"] == "/var/lib/regnf"
     assert service["environment"]["REGNF_REDIS_URL"] == "redis://redis:6379/0"
 
@@ -110,7 +111,7 @@ def test_programs_wait_for_redis_and_share_the_state(name: str) -> None:
 def test_volumes_and_networks_are_declared() -> None:
     document = compose()
     used = {entry.split(":")[0] for service in services().values() for entry in service["volumes"]}
-    used = {name for name in used if not name.startswith("..")}
+    used = {name for name in used if not name.startswith(".")}
     assert used == set(document["volumes"])
     assert {network for service in services().values() for network in service["networks"]} == set(document["networks"])
 
@@ -122,8 +123,12 @@ def test_only_the_api_can_be_reached_and_only_from_this_machine() -> None:
         "grafana": ["${GRAFANA_PUBLISH:-127.0.0.1:3000}:3000"],
     }
     assert compose()["networks"]["inside"] == {"internal": True}
-    for name in ("redis", "worker", "worker-gpu", "prometheus"):
-        assert services()[name]["networks"] == ["inside"]
+    assert compose()["networks"]["records"] == {"internal": True}
+    for name in ("redis", "worker", "worker-gpu"):
+        assert services()[name]["networks"] == ["records"]
+    assert services()["api"]["networks"] == ["records", "inside", "outside"]
+    for name in ("prometheus", "grafana"):
+        assert "records" not in services()[name]["networks"], "it has no business with Redis"
 
 
 def test_no_tokens_is_nobodys_default() -> None:

@@ -58,7 +58,7 @@ def test_a_worker_that_stopped_reporting_is_not_alive(health: ModuleType, redis:
 
 
 @pytest.mark.parametrize(
-    ("url", "said"), [(None, "REGNF_REDIS_URL is not set"), ("unix:///nowhere/socket", "Redis does not answer")]
+    ("url", "said"), [(None, "set REGNF_REDIS_URL"), ("unix:///nowhere/socket", "Redis does not answer")]
 )
 def test_says_what_is_wrong(url: str | None, said: str) -> None:
     environment = {"PYTHONPATH": str(ROOT)} | ({"REGNF_REDIS_URL": url} if url else {})

@@ -8,8 +8,8 @@ import sys
 
 from regnf_state.journal.storage_claim import StorageMismatchError
 from regnf_state.logs import configure_logging
+from regnf_state.redis.address import NoRedisError
 from regnf_state.settings import Settings
-from regnf_state.stores import NoRedisError
 from regnf_worker.context import Context
 from regnf_worker.kernel import share_cores
 from regnf_worker.preload import PreloadError, preload

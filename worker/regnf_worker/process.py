@@ -29,6 +29,7 @@ from rq.worker import WorkerStatus
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis import payload
+from regnf_state.redis.address import redis_address
 from regnf_state.redis.client import connect
 from regnf_state.redis.fair_queue import FairQueue
 from regnf_worker import jobs, kernel
@@ -55,8 +56,7 @@ class RegnfWorker(ResilientWorker):
     def __init__(
         self, context: Context, scratch: Scratch, monitor_s: int = 1, functions: Mapping[Kind, Function] = FUNCTIONS
     ) -> None:
-        assert context.settings.redis_url is not None
-        redis = connect(context.settings.redis_url, retries=20)
+        redis = connect(redis_address(context.settings), retries=20)
         super().__init__(
             [IMPORT_QUEUE_NAME, QUEUE_NAME],
             connection=redis,

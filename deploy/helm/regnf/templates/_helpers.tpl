@@ -29,11 +29,7 @@ capabilities: {drop: [ALL]}
 {{/* What front end and workers are both told. */}}
 {{- define "regnf.environment" -}}
 - name: REGNF_REDIS_URL
-  {{- if .Values.redis.existingSecret }}
-  valueFrom: {secretKeyRef: {name: {{ .Values.redis.existingSecret }}, key: url}}
-  {{- else }}
-  value: redis://{{ include "regnf.name" . }}-redis:6379/0
-  {{- end }}
+  valueFrom: {secretKeyRef: {name: {{ .Values.redis.existingSecret | default (printf "%s-redis" (include "regnf.name" .)) }}, key: url}}
 - {name: REGNF_STATE_DIR, value: /var/lib/regnf}
 - {name: REGNF_LOG_FORMAT, value: json}
 {{- if eq .Values.storage.kind "s3" }}
