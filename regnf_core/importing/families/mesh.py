@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from regnf_core.importing.families.converted import ConvertedField
@@ -11,16 +13,19 @@ from regnf_core.importing.meshes.geometry import malformed
 from regnf_core.importing.upload_description import UploadDescription
 
 
-def convert_mesh(format_: str, data: memoryview, overrides: UploadDescription) -> ConvertedField:
+def convert_mesh(
+    format_: str, data: memoryview, overrides: UploadDescription, work_s: float = math.inf
+) -> ConvertedField:
     """The exact distance to the mesh in ``data``, a file of the format that ``sniff_format`` named.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
-    POINT_CLOUD_WITHOUT_NORMALS, and what ``overrides`` is refused for.
+    POINT_CLOUD_WITHOUT_NORMALS, IMPORT_TOO_COSTLY beyond ``work_s`` estimated seconds, and what ``overrides`` is
+    refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
         geometry = MESH_READERS[format_](data)
     if len(geometry.faces) > 0:
-        return mesh_field(geometry, f"a {format_} file", overrides)
+        return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
     if format_ != "ply" or len(geometry.vertices) == 0:
         raise malformed(f"the {format_} file holds no triangles")
     from regnf_core.importing.families.point_cloud import convert_cloud  # loads scipy and Open3D

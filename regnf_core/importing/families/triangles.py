@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import igl
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +12,8 @@ from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.work.budget import require_within
+from regnf_core.importing.work.mesh_work import mesh_seconds
 
 _MARGIN = 0.05
 """How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""
@@ -19,12 +23,15 @@ _FAR = 1e4
 """Coordinates beyond this many diagonals leave float32 too few digits."""
 
 
-def mesh_field(geometry: Geometry, origin: str, overrides: UploadDescription, family: str = "mesh") -> ConvertedField:
+def mesh_field(
+    geometry: Geometry, origin: str, overrides: UploadDescription, family: str = "mesh", work_s: float = math.inf
+) -> ConvertedField:
     """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
     require_family(overrides, family)
     refuse_other_entries(overrides, family)
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
+    require_within(mesh_seconds(vertices, faces, _PROBES), work_s)
     inside_out = _is_inside_out(vertices, faces)
     if inside_out:
         faces = faces[:, ::-1]

@@ -53,7 +53,7 @@ def convert_file(
     from regnf_core.importing.work.estimate import require_affordable
     from regnf_core.schema.safe_format import write_safe_field
 
-    converted = _convert(upload, description, limits.tensor_bytes)
+    converted = _convert(upload, description, limits)
     _require_text(converted.description)
     require_affordable(converted, limits.work_s)
     converted = _settled(converted)
@@ -96,7 +96,7 @@ def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
         field_picture(field, up_axis).save(path)
 
 
-def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int) -> ConvertedField:
+def _convert(upload: Path, description: dict[str, Any] | None, limits: ImportLimits) -> ConvertedField:
     from regnf_core.importing.containers.container import read_archive
     from regnf_core.importing.containers.legacy_container import read_legacy
     from regnf_core.importing.containers.npz import ArraySource
@@ -107,7 +107,7 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     from regnf_core.importing.tensor_source import TensorSource
     from regnf_core.importing.upload_description import UploadDescription
 
-    overrides = UploadDescription.from_dict(description)
+    overrides, tensor_bytes = UploadDescription.from_dict(description), limits.tensor_bytes
     data = _mapped(upload)
     head = bytes(data[:HEAD_BYTES])
     kind = sniff_format(head)
@@ -133,7 +133,7 @@ def _convert(upload: Path, description: dict[str, Any] | None, tensor_bytes: int
     if kind in MESH_FORMATS:
         from regnf_core.importing.families.mesh import convert_mesh
 
-        return convert_mesh(kind, data, overrides)
+        return convert_mesh(kind, data, overrides, limits.work_s)
     reason, detail = explain_refusal(head)
     raise FieldFormatError(detail, reason=reason)
 

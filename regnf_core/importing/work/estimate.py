@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.work.budget import require_within
 from regnf_core.importing.work.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
 from regnf_core.importing.work.mesh_work import mesh_work
 from regnf_core.importing.work.network_work import network_work
@@ -26,9 +26,7 @@ def require_affordable(converted: ConvertedField, work_s: float) -> float:
     trials = [(reading.description, reading.tensors) for reading in converted.readings]
     seconds = sum(_seconds(*trial, calls_of_check(TRIAL_SAMPLES)) for trial in trials)
     seconds += _seconds(converted.description, converted.tensors, calls_of_check(SAMPLES))
-    if seconds > work_s:
-        message = f"the field's checks would take an estimated {seconds:.0f} s of a core; {work_s:g} s are allowed"
-        raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
+    require_within(seconds, work_s)
     return seconds
 
 
@@ -43,5 +41,5 @@ def _work(description: FieldDescription, tensors: Mapping[str, StoredArray], cal
         case OnnxDescription():
             return onnx_work(description, tensors, calls)
         case MeshDescription():
-            return mesh_work(tensors, calls)
+            return mesh_work(tensors["vertices"], tensors["faces"], calls)
     return network_work(description, tensors, calls)

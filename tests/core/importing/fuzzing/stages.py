@@ -13,9 +13,11 @@ from regnf_core.importing.containers.container import read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
+from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.importing.work.estimate import require_affordable
 from regnf_core.schema.safe_format import write_safe_field
 
 BUDGET = 1 << 24
@@ -23,6 +25,7 @@ BUDGET = 1 << 24
 PARTS = ("container", "pickle", "tensors", "header")
 """The stages that see a part of the gate; all others begin with a whole file."""
 _TAKEN = "taken"
+_LIMITS = ImportLimits(tensor_bytes=BUDGET)
 _QUIET = (
     "object.",
     "sys._getframe",
@@ -118,8 +121,9 @@ def _file(data: bytes, folder: Path) -> None:
     upload, out = folder / "upload", folder / "out"
     upload.write_bytes(data)
     try:
-        converted = convert._convert(upload, None, BUDGET)
+        converted = convert._convert(upload, None, _LIMITS)
         convert._require_text(converted.description)
+        require_affordable(converted, _LIMITS.work_s)
         write_safe_field(out, converted.description, converted.tensors)
     finally:
         upload.unlink()
