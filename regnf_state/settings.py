@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIB = 1024 * 1024
@@ -44,7 +44,9 @@ class Settings(BaseSettings):
     """Blobs, the embedded Redis' files and temporary uploads live under it."""
     redis_url: str | None = Field(default=None, repr=False)
     """Unset: `regnf serve` starts a private server of its own."""
-    queue_key: str | None = Field(default=None, min_length=16, repr=False)
+    queue_key: Annotated[Annotated[str, Field(min_length=16)] | None, BeforeValidator(lambda given: given or None)] = (
+        Field(default=None, repr=False)
+    )
     """Signs what the queue in Redis holds; the same for front ends and workers. What is not signed never runs."""
     redis_password_file: Path | None = None
     """A file with Redis' password, in place of one in the address."""
