@@ -56,6 +56,13 @@ def test_an_abort_far_from_the_limit_is_no_matter_of_memory(table: Bench) -> Non
     assert error["reason"] == "WORKER_LOST"
 
 
+def test_a_job_that_redis_failed_near_the_limit_is_run_again(table: Bench) -> None:
+    table.start_worker()
+    table.submit("lose_redis_near_the_limit")
+    done = table.finished()
+    assert (done.status, done.attempt) == ("successful", 2), done.error
+
+
 def test_a_limit_that_is_given_holds_whatever_there_is() -> None:
     assert JobLimits.of(Settings(job_memory_bytes=700 * MIB, workers=64)).memory == 700 * MIB
 

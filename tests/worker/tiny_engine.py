@@ -15,6 +15,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from redis.exceptions import RedisError
+
 from regnf_core.errors import NoSurfaceError
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
@@ -85,6 +87,12 @@ class TinyEngine:
             while True:
                 held.append(bytearray(16 << 20))
         os.abort()
+
+    def lose_redis_near_the_limit(self, report: Report) -> None:
+        """The first time Redis goes away when most of the memory is in use."""
+        held = bytearray(b".") * (440 << 20)
+        if self.attempt == 1:
+            raise RedisError(f"with {len(held)} bytes in use")
 
     def abort(self, report: Report) -> None:
         os.abort()

@@ -48,6 +48,8 @@ _IDLE_REPORT_S = 30
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
+_RAISED = 70
+"""Status of a job's process that ended with an exception: Redis or storage was away. Native code ends with others."""
 
 
 class RegnfWorker(ResilientWorker):
@@ -144,7 +146,7 @@ class RegnfWorker(ResilientWorker):
 
     def main_work_horse(self, job: Any, queue: Any) -> None:
         """What the child does: it runs one of our functions, never what RQ would import. Does not return."""
-        status = 1
+        status = _RAISED
         try:
             random.seed()
             self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
@@ -211,9 +213,7 @@ class RegnfWorker(ResilientWorker):
             out_of_memory=out_of_memory,
             given_back=self._given_back,
             exceeded=self._exceeded,
-            crashed_near_limit=work.kind == "registration"
-            and bool(status)
-            and self._job_limits.is_near(ended.peak_memory),
+            crashed_near_limit=work.kind == "registration" and self._crashed_near_limit(ended),
             limits=self._job_limits,
         )
         settle = self._settlers[work.kind]
@@ -231,6 +231,11 @@ class RegnfWorker(ResilientWorker):
             write_down()
         elif not kernel.in_child(write_down):  # a client of an object store does not survive the forks to come
             self.log.error("job %s could not be settled: the process that should have has died", work.name)
+
+    def _crashed_near_limit(self, ended: kernel.Exit) -> bool:
+        """Whether a process has ended by itself, by no exception of ours, with most of its memory in use."""
+        crashed = bool(ended.status) and os.waitstatus_to_exitcode(ended.status or 0) != _RAISED
+        return crashed and self._job_limits.is_near(ended.peak_memory)
 
     # the worker itself
 
