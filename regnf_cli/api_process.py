@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 
-from regnf_service.http.guarded_server import GuardedServer
+from regnf_service.server import GuardedServer
 from regnf_state.logs import configure_logging
 from regnf_state.settings import Settings
 
