@@ -14,10 +14,10 @@ from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
 from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.gate.work_estimate import require_affordable
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.importing.work.estimate import require_affordable
 from regnf_core.schema.safe_format import write_safe_field
 
 BUDGET = 1 << 24
