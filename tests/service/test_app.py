@@ -19,8 +19,8 @@ from regnf_service.app import create_app
 from regnf_service.concurrency import Waiters
 from regnf_service.http.waiting import pause, wait_for
 from regnf_service.shutdown import stopping_on_signals
+from regnf_state.redis.address import NoRedisError
 from regnf_state.settings import Settings
-from regnf_state.stores import NoRedisError
 from tests.contract.world import make_world
 from tests.stores import services_over
 

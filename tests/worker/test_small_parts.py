@@ -12,8 +12,8 @@ from rq.timeouts import JobTimeoutException
 
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.problems import problem_document
+from regnf_state.redis.address import NoRedisError
 from regnf_state.settings import Settings
-from regnf_state.stores import NoRedisError
 from regnf_worker import kernel
 from regnf_worker.context import Context
 from regnf_worker.problems import fault
