@@ -1,11 +1,13 @@
 """Fuzz the import gate: many damaged and invented files, each stage in one process, some through the whole gate.
 
     python -m benchmarks.fuzz_gate --cases 200000 --seed 1 [--stages NAME ...] [--output FILE] [--keep FOLDER]
+        [--corpus FOLDER]
 
 A case fails if a stage raises anything but FieldFormatError, takes five seconds of processor time, needs more
 than 2 GiB of address space, leaves a file, or brings about an import, a program, a socket or the opening of a file;
-through the whole gate also if the process crashes or is stopped. Failing cases are written to FOLDER. Ends with status
-1 if there are any.
+through the whole gate also if the process crashes or is stopped. Failing cases are written to the folder of --keep.
+Cases that reach a new outcome or take a new step are kept in that of --corpus, and the next run builds upon them.
+Ends with status 1 if there are any failures.
 """
 
 from __future__ import annotations
@@ -42,9 +44,10 @@ _FAULTS = ("IMPORT_CRASHED", "IMPORT_TIMEOUT", "IMPORT_OUT_OF_MEMORY", "IMPORT_O
 class Worker:
     """A fuzzing process that is replaced when it ends before its answer."""
 
-    def __init__(self, seeds: Path, folder: Path, seed: str, stages: list[str]) -> None:
+    def __init__(self, folder: Path, seed: str, corpus: Path, stages: list[str]) -> None:
         self._folder = folder
-        command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", str(seeds), str(folder), seed, *stages]
+        places = (str(folder / "seeds"), str(folder), seed, str(corpus))
+        command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", *places, *stages]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def run(self, first: int, count: int) -> dict[str, Any] | None:
@@ -140,7 +143,8 @@ def fuzz(folder: Path, arguments: argparse.Namespace) -> Tally:
     first, part = 0, 0
     while first < arguments.cases:
         part += 1
-        with Worker(folder / "seeds", folder, f"{arguments.seed}.{part}", arguments.stages) as worker:
+        corpus = arguments.corpus or folder / "corpus"
+        with Worker(folder, f"{arguments.seed}.{part}", corpus, arguments.stages) as worker:
             while first < arguments.cases:
                 count = min(arguments.chunk, arguments.cases - first)
                 results = worker.run(first, count)
@@ -200,6 +204,7 @@ def main() -> int:
     parser.add_argument("--stages", nargs="+", choices=STAGES, default=list(STAGES), help="these alone")
     parser.add_argument("--chunk", type=int, default=1000)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--corpus", type=Path, help="where cases worth building upon are kept from run to run")
     parser.add_argument("--keep", type=Path, help="where failing cases are written")
     arguments = parser.parse_args()
     begun = time.monotonic()

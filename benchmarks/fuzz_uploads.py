@@ -1,6 +1,6 @@
 """Damaged and invented files sent to the whole service, one after the other, as a hostile client would.
 
-    python -m benchmarks.fuzz_uploads [--cases 1000] [--seed 1] [--output benchmarks/results/fuzz_uploads.md]
+    python -m benchmarks.fuzz_uploads [--cases 1000] [--seed 1] [--output FILE] [--corpus FOLDER]
 
 The files are those of benchmarks.fuzz_gate. A case fails if the API answers 5xx or not at all, if the field does not
 come to ``ready`` or ``rejected`` in three minutes, or if a rejected file leaves anything in the store; the run also if
@@ -24,6 +24,7 @@ import httpx
 
 from tests.contract.live import Live, live_service
 from tests.core.importing.fuzzing.cases import STAGES, make_case
+from tests.core.importing.fuzzing.corpus import Corpus
 from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 
 _STATE_S = 180.0
@@ -57,18 +58,22 @@ def upload(client: httpx.Client, data: bytes) -> str:
     return "ready" if document["state"] == "ready" else f"rejected {document['error']['reason']}"
 
 
-def run(live: Live, seeds: Seeds, cases: int, seed: int) -> Tally:
-    """Every case, each followed by a look at the store."""
+def run(live: Live, seeds: Seeds, cases: int, seed: int, corpus: Corpus) -> Tally:
+    """Every case, each followed by a look at the store. Cases build upon ``corpus``, which keeps every new outcome."""
     tally = Tally()
     stages = [stage for stage in STAGES if stage != "pickle"]  # a bare pickle is told by its first bytes
     known: set[str] = set()
+    finds = {stage: corpus.of(stage) for stage in stages}
     with live.client() as client:
         for index in range(cases):
             stage = stages[index % len(stages)]
-            data = make_case(Random(f"{seed} {index}"), stage, seeds, [])
+            data = make_case(Random(f"{seed} {index}"), stage, seeds, finds[stage])
             begun = time.monotonic()
             try:
-                tally.outcomes[upload(client, data)] += 1
+                outcome = upload(client, data)
+                tally.outcomes[outcome] += 1
+                if corpus.offer(stage, outcome.rpartition(" ")[2], data):
+                    finds[stage].append(data)
             except (ValueError, KeyError, httpx.HTTPError) as error:
                 tally.failures.append(f"case {index} ({stage}): {error!r:.300}")
             tally.slowest = max(tally.slowest, time.monotonic() - begun)
@@ -125,6 +130,7 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--corpus", type=Path, help="where cases with a new outcome are kept from run to run")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="regnf-fuzz-") as name:
         folder = Path(name)
@@ -132,7 +138,8 @@ def main() -> int:
         begun = time.monotonic()
         (folder / "state").mkdir()
         with live_service(folder / "state") as live:
-            tally = run(live, seeds, arguments.cases, arguments.seed)
+            corpus = Corpus(arguments.corpus or folder / "corpus")
+            tally = run(live, seeds, arguments.cases, arguments.seed, corpus)
             text = report(tally, arguments, time.monotonic() - begun, live.peak_memory())
     sys.stdout.write(text + "\n")
     if arguments.output:

@@ -53,6 +53,7 @@ def _with_frequency(layers: Layers) -> Layers:
     """sin(30 (W h + b)) = sin((30 W) h + 30 b): the factor folded into all layers but the last."""
     last = len(layers.weights) - 1
     factors = [np.float32(_OMEGA if i < last else 1.0) for i in range(last + 1)]
-    weights = tuple(np.asarray(f * w, dtype=np.float32) for f, w in zip(factors, layers.weights, strict=True))
+    with np.errstate(over="ignore"):  # what is not finite is refused when it is written
+        weights = tuple(np.asarray(f * w, dtype=np.float32) for f, w in zip(factors, layers.weights, strict=True))
     biases = tuple(np.asarray(f * b, dtype=np.float32) for f, b in zip(factors, layers.biases, strict=True))
     return Layers(weights, biases)

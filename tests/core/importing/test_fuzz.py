@@ -169,7 +169,7 @@ def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     folder = tmp_path_factory.mktemp("fuzz")
     seeds.save(folder / "seeds")
     module, places = "tests.core.importing.fuzzing.worker", (str(folder / "seeds"), str(folder))
-    command = [sys.executable, "-m", module, *places, "1.1", *STAGES]
+    command = [sys.executable, "-m", module, *places, "1.1", str(folder / "corpus"), *STAGES]
     done = subprocess.run(command, input=f"0 {CASES}\n", cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.stderr} at {(folder / 'case').read_bytes()!r:.300}"
     results: dict[str, Any] = json.loads(done.stdout)

@@ -1,9 +1,9 @@
 """The process that runs a fuzzer's cases: little memory, a time limit each, every import and file noticed.
 
-    python -m tests.core.importing.fuzzing.worker SEEDS FOLDER SEED STAGE...
+    python -m tests.core.importing.fuzzing.worker SEEDS FOLDER SEED CORPUS STAGE...
 
 Reads lines "FIRST COUNT" and answers each with one line of JSON. The case under way lies in FOLDER/case, for whoever
-has to find out why this process ended. Needs no torch.
+has to find out why this process ended. Cases are built upon those in the folder CORPUS, which grows. Needs no torch.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 
 from regnf_core.importing import families
 from tests.core.importing.fuzzing.cases import make_case
+from tests.core.importing.fuzzing.corpus import Corpus
 from tests.core.importing.fuzzing.line_coverage import Coverage
 from tests.core.importing.fuzzing.seeds import load_seeds
 from tests.core.importing.fuzzing.stages import PARTS, Watch, run_stage
@@ -46,14 +47,15 @@ def _late(*_: object) -> None:
 class Fuzzer:
     """Makes cases and runs them. A case's index and the seed decide it, together with what was found before."""
 
-    def __init__(self, seeds: Path, folder: Path, seed: str, stages: list[str]) -> None:
+    def __init__(self, seeds: Path, folder: Path, seed: str, corpus: Path, stages: list[str]) -> None:
         self.seeds, self.stages = load_seeds(seeds), stages
         self.folder, self.seed = folder, seed
         self.scratch = folder / "scratch"
         self.scratch.mkdir(exist_ok=True)
         self.case = (folder / "case").open("w+b", buffering=0)
         self.coverage, self.watch = Coverage(), Watch()
-        self.finds: dict[str, list[bytes]] = {stage: [] for stage in stages}
+        self.corpus = Corpus(corpus)
+        self.finds = {stage: self.corpus.of(stage) for stage in stages}
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -107,7 +109,9 @@ class Fuzzer:
             outcome, fault = type(error).__name__, f"{error!r:.300}"
         finally:
             signal.setitimer(signal.ITIMER_PROF, 0)
-        if len(self.coverage.steps) > before and len(self.finds[stage]) < _MAX_FINDS:
+        new_step = len(self.coverage.steps) > before
+        new_outcome = self.corpus.offer(stage, outcome, data, new_step)
+        if (new_step or new_outcome) and len(self.finds[stage]) < _MAX_FINDS:
             self.finds[stage].append(data)
         return outcome, fault or self._traces(known)
 
@@ -139,7 +143,7 @@ def main(arguments: list[str]) -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     signal.signal(signal.SIGPROF, _late)
-    fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2], arguments[3:])
+    fuzzer = Fuzzer(Path(arguments[0]), Path(arguments[1]), arguments[2], Path(arguments[3]), arguments[4:])
     if "torch" in sys.modules:
         raise RuntimeError("the stages loaded torch")
     for line in sys.stdin:
