@@ -11,6 +11,7 @@ import pytest
 import yaml
 from prometheus_client import generate_latest
 
+from regnf_service.http.connections import Connections
 from regnf_service.metrics import Metrics
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.redis.client import connect
@@ -49,7 +50,9 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         count(redis, "jobs_evicted")
         count(redis, "records_unreadable", "job")
         RedisOutbox(redis).settle(Message("ended", 1, 0), Delivery("delivered"))
-        metrics = Metrics(services)
+        connections = Connections(most=1, most_of_site=1, most_unread=1)
+        connections.ended["all"] += 1
+        metrics = Metrics(services, connections)
         metrics.requests.labels("GET", "/", "200").inc()
         metrics.seconds.labels("/").observe(1)
         metrics.received.labels("/").inc()
