@@ -2,7 +2,7 @@
 
 Start-time fair queueing (Goyal, Vin and Cheng, 1996) over RQ's lists, see docs/adr/0009-fair-queue.md. The costs of a
 piece of work are estimated when it is taken, as those of its caller's last work of its kind, and put right when it has
-ended. A caller who was idle gains nothing for that time.
+ended. A caller who was idle for long comes before those who were not, with a minute of work at most.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from regnf_state.redis.keys import PREFIX
 _PREFIX = f"{PREFIX}queue:"
 _FIRST_COST_S = 10.0
 """What a caller's first work of a kind is taken to cost until it has run."""
+_CREDIT_S = 60.0
+"""How far behind the caller served last one may start that was idle: a few imports and a registration."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class FairQueue:
         self._script = redis.register_script(SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
-        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY]
+        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S]
         return int(self._script(keys=[_PREFIX], args=[*fixed, *arguments]))
 
     def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any]) -> bool:

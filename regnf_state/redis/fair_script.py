@@ -16,7 +16,7 @@ An entry: owner, kind, since; once taken: cost, taken; while it waits for a fiel
 
 SCRIPT = """
 local P, op, name = KEYS[1], ARGV[1], ARGV[2]
-local FIRST, DAY = tonumber(ARGV[3]), 86400
+local FIRST, CREDIT, DAY = tonumber(ARGV[3]), tonumber(ARGV[5]), 86400
 local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
 local time = redis.call('TIME')
 local now = time[1] + time[2] / 1e6
@@ -51,11 +51,12 @@ local function charge(owner, seconds)
   redis.call('EXPIRE', key, 7200)
 end
 
--- a caller who had no line and none of whose work is in RQ's list gains nothing for the time without
+-- a caller who had no line gains the credit at most for the time without: its first work goes before that of those
+-- who have been served all the while, and not more than that
 local function join(owner, id, push)
   local idle = redis.call('EXISTS', line_of(owner)) == 0
   redis.call(push, line_of(owner), id)
-  set_tag(owner, idle and math.max(clock(), tag_of(owner)) or tag_of(owner))
+  set_tag(owner, idle and math.max(clock() - CREDIT, tag_of(owner)) or tag_of(owner))
 end
 
 local function settle()
@@ -185,7 +186,7 @@ function steps.release()
 end
 
 settle()
-local answer = steps[op](unpack(ARGV, 5))
+local answer = steps[op](unpack(ARGV, 6))
 advance()
 return answer
 """

@@ -115,18 +115,36 @@ def test_callers_get_their_shares_of_worker_seconds(
     assert lead <= (workers + 1) * (max(costs.values()) + 10.0)
 
 
-def test_a_caller_who_was_idle_gains_nothing(shop: Shop) -> None:
+def test_a_caller_who_was_idle_gains_a_minute_of_work_at_most(shop: Shop) -> None:
     costs = {"busy": 5.0, "late": 5.0}
-    for number in range(40):
+    for number in range(80):
         shop.enqueue(job_of("busy", number), "busy")
-    for _ in range(20):
+    for _ in range(40):
         shop.run(costs)
-    for number in range(20):
-        shop.enqueue(job_of("late", number), "late")
     before = shop.served["busy"]
-    for _ in range(20):
+    for number in range(40):
+        shop.enqueue(job_of("late", number), "late")
+    for _ in range(10):
         shop.run(costs)
-    assert abs(shop.served["late"] - (shop.served["busy"] - before)) <= 15
+    assert (shop.served["late"], shop.served["busy"]) == (50.0, before), "its first work goes first"
+    for _ in range(30):
+        shop.run(costs)
+    assert abs(shop.served["late"] - (shop.served["busy"] - before) - 60.0) <= 15
+
+
+def test_coming_and_going_renews_no_credit(shop: Shop) -> None:
+    """A caller who always has its next work sent when the last has ended has no more than one who sends all at once."""
+    costs = {"busy": 5.0, "comes": 5.0}
+    for number in range(100):
+        shop.enqueue(job_of("busy", number), "busy")
+    for _ in range(40):
+        shop.run(costs)
+    before = shop.served["busy"]
+    for number in range(40):
+        shop.enqueue(job_of("comes", number), "comes")
+        while shop.owner(str(shop.run(costs))) != "comes":
+            pass
+    assert shop.served["comes"] - (shop.served["busy"] - before) <= 75
 
 
 def test_a_caller_s_own_work_keeps_its_order(shop: Shop) -> None:
