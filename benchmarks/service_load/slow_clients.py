@@ -52,14 +52,13 @@ async def poll(port: int, path: str, until: float, seen: Seen) -> None:
     """One poller. A connection that breaks, or says nothing for five seconds, is a lost poll; the next is made anew."""
     await asyncio.sleep(random.uniform(0.0, _EVERY_S))
     while time.monotonic() < until:
-        begun = time.monotonic()
         try:
             async with asyncio.timeout(_PATIENCE_S):
                 connection = await Connection(port).__aenter__()
             async with connection:
                 await _poll_on(connection, path, until, seen)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
-            seen.lost.append(begun)
+            seen.lost.append(time.monotonic())
             await asyncio.sleep(_EVERY_S)
 
 

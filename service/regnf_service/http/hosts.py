@@ -120,8 +120,8 @@ def is_same_site(origin: Authority, host: Authority) -> bool:
 def allowed_hosts(settings: Settings) -> AllowedHosts:
     """Those that the settings list, and the host to listen on or to publish on where that is a name or one address."""
     published = (settings.publish or "").rpartition(":")[0]
-    named = {host for host in (settings.host, published) if host and not _is_everywhere(host)}
-    return AllowedHosts({*settings.allowed_hosts, *map(_bracketed, named)})
+    named = {_bracketed(host) for host in (settings.host, published) if host and not _is_everywhere(host)}
+    return AllowedHosts({*settings.allowed_hosts, *filter(parse_authority, named)})
 
 
 def _is_everywhere(host: str) -> bool:
