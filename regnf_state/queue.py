@@ -75,6 +75,10 @@ class JobQueue(Protocol):
         """Take a waiting job out of the queue, or tell the worker to end a running one."""
         ...
 
+    def drop_import(self, sha256: str, attempt: int) -> None:
+        """Take a waiting import out of the queue: its field is gone. One that runs goes on, and finds that itself."""
+        ...
+
     def turn(self) -> None:
         """Hand the next in turn to the workers, if a process died before it did so."""
         ...

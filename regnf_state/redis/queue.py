@@ -47,6 +47,9 @@ class RqJobQueue:
         if worker:
             send_command(self._redis, text(worker), "stop-job", job_id=name)
 
+    def drop_import(self, sha256: str, attempt: int) -> None:
+        self.fair.remove(Work("import", sha256, attempt).name)
+
     def turn(self) -> None:
         self.fair.turn()
 

@@ -95,6 +95,14 @@ def test_a_boundary_continued_beyond_all_counting_is_refused(world: World) -> No
     assert_refused(world.client.post("/fields", content=b"x", headers=headers), 400, "MALFORMED_MULTIPART")
 
 
+def test_headers_of_thousands_of_parameters_are_not_read(world: World) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x" + ";" * 8000}
+    assert_refused(world.client.post("/fields", content=FILE, headers=headers), 400, "MALFORMED_MULTIPART")
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    disposition = b'--x\r\nContent-Disposition: form-data; name="file"' + b";" * 2000
+    assert_refused(world.client.post("/fields", content=disposition + b"\r\n\r\n", headers=headers), 400, "UNKNOWN_PART")
+
+
 @pytest.mark.parametrize("boundary", ["y" * 71, "", '"'])
 def test_boundaries_that_cannot_be_used_are_refused(world: World, boundary: str) -> None:
     headers = {"Content-Type": f"multipart/form-data; boundary={boundary}"}

@@ -134,6 +134,14 @@ def test_delete_leaves_nothing(world: World) -> None:
     assert_refused(world.client.delete(f"/fields/{sha256(A)}"), 404, "FIELD_NOT_FOUND")
 
 
+def test_a_field_that_is_deleted_before_its_import_leaves_nothing_in_the_queue(world: World) -> None:
+    for _ in range(3):
+        assert world.client.put(f"/fields/{sha256(A)}", content=A).status_code == 201
+        assert len(world.queue.waiting) == 1
+        assert world.client.delete(f"/fields/{sha256(A)}").status_code == 204
+        assert world.queue.waiting == []
+
+
 def test_a_field_that_a_job_needs_is_not_deleted(world: World) -> None:
     job_id = world.submit()
     scene = world.valid_request()["scene"]

@@ -16,6 +16,8 @@ from starlette.requests import Request
 from regnf_service.problem import CLOSE, Problem
 
 _MAX_HEADER_BYTES = 4096
+_MAX_PARAMETERS = 64
+"""Of a header. The library that reads them takes time that grows with the square of their number."""
 _MAX_HEADERS = 8
 
 
@@ -79,7 +81,9 @@ class _Collector:
 
 
 def _parameter(header: str, name: str) -> str | None:
-    """One parameter of a structured header such as Content-Disposition or Content-Type."""
+    """One parameter of a structured header such as Content-Disposition or Content-Type; None where there are many."""
+    if header.count(";") > _MAX_PARAMETERS:
+        return None
     message = Message()
     message["content-type"] = header.replace("\r", " ").replace("\n", " ")
     try:

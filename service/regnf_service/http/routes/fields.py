@@ -125,9 +125,11 @@ async def list_fields(
 @blocking
 def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
     """Refused while an active job needs the field. Results of finished jobs stay."""
-    reference = _require(services, caller, sha256).sha256
+    field = _require(services, caller, sha256)
+    reference = field.sha256
     if next(iter(services.records.jobs_using_field(reference)), None) is not None:
         raise Problem("FIELD_IN_USE")
     services.records.delete_field(reference)
+    services.queue.drop_import(reference, field.attempt)
     services.blobs.delete_prefix(f"fields/{reference}")
     return Response(status_code=204)
