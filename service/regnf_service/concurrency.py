@@ -98,11 +98,20 @@ class Slots:
 
 
 class Waiters:
-    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many."""
+    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many.
 
-    def __init__(self, looks_per_s: float = 200.0) -> None:
+    Each keeps a connection in use: beyond ``most`` no further one is held back.
+    """
+
+    def __init__(self, looks_per_s: float = 200.0, most: int = 1000) -> None:
         self._looks_per_s = looks_per_s
+        self._most = most
         self._held = 0
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more answer may be held back."""
+        return self._held < self._most
 
     @contextmanager
     def held(self) -> Iterator[None]:

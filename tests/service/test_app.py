@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -64,6 +65,18 @@ def test_waiting_ends_when_the_service_stops(tmp_path: Path, any_redis: Redis) -
         return await wait_for(lambda: 1, lambda _: False, 60.0, services)
 
     assert asyncio.run(asyncio.wait_for(run(), 20)) == 1
+
+
+def test_where_many_answers_are_held_no_more_are(tmp_path: Path, any_redis: Redis) -> None:
+    """A held answer keeps its connection: enough of them would leave none for anybody else."""
+    services = replace(make_world(tmp_path, any_redis).app.state.services, waiters=Waiters(most=1))
+    looks: list[int] = []
+
+    async def ask() -> int:
+        return await wait_for(lambda: looks.append(1) or len(looks), lambda _: False, 600.0, services)
+
+    with services.waiters.held():
+        assert asyncio.run(asyncio.wait_for(ask(), 20)) == len(looks) == 1
 
 
 def test_the_more_answers_are_held_the_more_seldom_each_looks() -> None:

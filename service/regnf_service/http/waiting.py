@@ -19,8 +19,11 @@ _Value = TypeVar("_Value")
 async def wait_for(
     fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services
 ) -> _Value:
-    """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops."""
-    deadline = time.monotonic() + seconds
+    """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops.
+
+    At once where very many wait already.
+    """
+    deadline = time.monotonic() + (seconds if services.waiters.has_room else 0.0)
     step = _FIRST_PAUSE_S
     with services.waiters.held():
         value = await in_thread(fetch)
