@@ -43,9 +43,9 @@ _SETTINGS: dict[str, object] = {
 }
 _WAITING = 4
 """Jobs that wait when a leg ends."""
-_SLOW = {"preset": "paper", "optimization": {"iterations": 800, "stop_residual": 0}, "resampling": {"every": 10_000}}
+_SLOW = {"preset": "paper", "optimization": {"iterations": 400, "stop_residual": 0}, "resampling": {"every": 10_000}}
 """A job that runs for about a quarter of a minute."""
-_MAX_WAIT_S = 240.0
+_MAX_WAIT_S = 900.0
 
 
 @dataclass(frozen=True)
