@@ -55,5 +55,10 @@ def test_default_options_are_never_too_costly(redis: Redis, tmp_path: Path) -> N
     for preset in ("paper", "robust"):
         body = world.valid_request() | {"options": {"preset": preset}}
         assert post(world, body).status_code == 202
-    dearer = world.valid_request() | {"options": {"robust": {"rotations": 20_000}}}
+    dearer = world.valid_request() | {"options": {"preset": "paper", "optimization": {"iterations": 10_000}}}
     assert_refused(post(world, dearer), 422, "OPTIONS_TOO_COSTLY")
+
+
+def test_a_product_that_a_fast_field_does_in_time_is_taken(world: World) -> None:
+    body = world.valid_request() | {"options": {"preset": "paper", "optimization": {"iterations": 10_000}}}
+    assert post(world, body).status_code == 202
