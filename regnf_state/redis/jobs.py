@@ -16,7 +16,7 @@ from typing import Any, cast
 from redis import Redis
 
 from regnf_state import transitions
-from regnf_state.ownership import ANONYMOUS
+from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.records import (
     ACTIVE,
     NO_QUOTA,
@@ -66,8 +66,8 @@ def _created_keys(record: JobRecord) -> tuple[str, str]:
     return _CREATED, f"{_CREATED}:{record.owner}"
 
 
-def _active_key(record: JobRecord) -> str:
-    return f"{PREFIX}owner:{record.owner}:active"
+def _active_key(owner: str) -> str:
+    return f"{PREFIX}owner:{owner}:active"
 
 
 def _events_key(job_id: str) -> str:
@@ -99,7 +99,10 @@ class RedisRecordStore(RedisFieldRecords):
         commands: list[Command] = [
             *(("ZADD", each, repr(after.created), after.id) for each in _created_keys(after)),
             ("SADD", OWNERS, after.owner),
-            *(("SADD" if after.status in ACTIVE else "SREM", each, after.id) for each in (_ACTIVE, _active_key(after))),
+            *(
+                ("SADD" if after.status in ACTIVE else "SREM", each, after.id)
+                for each in (_ACTIVE, _active_key(after.owner))
+            ),
         ]
         if after.status != "accepted":
             commands.append(("ZREM", _WAITING, after.id))
@@ -159,10 +162,10 @@ class RedisRecordStore(RedisFieldRecords):
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
         caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
         if quota.active_jobs is not None:
-            caps.append(("SCARD", _active_key(record), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
+            caps.append(("SCARD", _active_key(record.owner), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
         elif quota.share_jobs:
             # no more than stay free: one greedy owner gets half of all, two get a third each
-            caps.append(("SCARD", f"{_active_key(record)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
+            caps.append(("SCARD", f"{_active_key(record.owner)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
         while True:
             known, now = self._read_to_create(JOB, record.id)
             fresh = transitions.restarted_job(known, record, now) if known is not None else record
@@ -283,4 +286,5 @@ class RedisRecordStore(RedisFieldRecords):
         return [JobNews(self._readable(JOB, name, held), events_in(entries)) for (name, _), held, entries in found]
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
-        return iter([record.id for record in self.active_jobs() if transitions.uses_field(record, sha256)])
+        names = sorted(map(text, self._redis.smembers(_active_key(owner_of(sha256)))))
+        return (record.id for record in self._read_many(JOB, names) if transitions.uses_field(record, sha256))

@@ -41,6 +41,7 @@ class BoundedParser(h11.Connection):
             event = super().next_event()
             self.is_paused = event is h11.PAUSED
             if isinstance(event, h11.Request):
+                _check_framing(event)
                 self.request_at, self.body_bytes, self._chunks = self._clock(), 0, 0
             elif isinstance(event, h11.Data):
                 self._count(event)
@@ -61,3 +62,10 @@ class BoundedParser(h11.Connection):
         self._chunks += event.chunk_start
         if self._chunks > _FREE_CHUNKS and self.body_bytes < _LEAST_CHUNK_BYTES * (self._chunks - _FREE_CHUNKS):
             raise h11.RemoteProtocolError("the chunks are too small")
+
+
+def _check_framing(request: h11.Request) -> None:
+    """A body has one length. A proxy that goes by another one of two would take what follows for a request."""
+    names = {name for name, _ in request.headers}
+    if b"transfer-encoding" in names and (b"content-length" in names or request.http_version < b"1.1"):
+        raise h11.RemoteProtocolError("the end of the body is not clear")
