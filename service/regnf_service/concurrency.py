@@ -100,31 +100,32 @@ class Slots:
 class Waiters:
     """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many.
 
-    Each keeps a connection in use: beyond ``most`` no further one is held back.
+    Each keeps a connection in use: beyond ``most``, or half as many of one caller, no further one is held back.
     """
 
     def __init__(self, looks_per_s: float = 200.0, most: int = 1000) -> None:
         self._looks_per_s = looks_per_s
         self._most = most
-        self._held = 0
+        self._held: Counter[str] = Counter()
 
-    @property
-    def has_room(self) -> bool:
-        """Whether one more answer may be held back."""
-        return self._held < self._most
+    def has_room(self, caller: str) -> bool:
+        """Whether one more answer to this caller may be held back."""
+        return self._held.total() < self._most and 2 * self._held[caller] < self._most
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def held(self, caller: str) -> Iterator[None]:
         """One answer is held while the block runs."""
-        self._held += 1
+        self._held[caller] += 1
         try:
             yield
         finally:
-            self._held -= 1
+            self._held[caller] -= 1
+            if not self._held[caller]:
+                del self._held[caller]
 
     def pause_s(self, wanted_s: float) -> float:
         """Seconds until one of them looks again: what it would like, or more where others look too.
 
         Up to a quarter more or less, so that those that began together do not look together ever after.
         """
-        return max(wanted_s, self._held / self._looks_per_s) * random.uniform(0.75, 1.25)  # noqa: S311
+        return max(wanted_s, self._held.total() / self._looks_per_s) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -62,7 +62,7 @@ def test_waiting_ends_when_the_service_stops(tmp_path: Path, any_redis: Redis) -
 
     async def run() -> int:
         asyncio.get_running_loop().call_later(0.05, services.stopping.set)
-        return await wait_for(lambda: 1, lambda _: False, 60.0, services)
+        return await wait_for(lambda: 1, lambda _: False, 60.0, services, "alice")
 
     assert asyncio.run(asyncio.wait_for(run(), 20)) == 1
 
@@ -73,19 +73,29 @@ def test_where_many_answers_are_held_no_more_are(tmp_path: Path, any_redis: Redi
     looks: list[int] = []
 
     async def ask() -> int:
-        return await wait_for(lambda: looks.append(1) or len(looks), lambda _: False, 600.0, services)
+        return await wait_for(lambda: looks.append(1) or len(looks), lambda _: False, 600.0, services, "alice")
 
-    with services.waiters.held():
+    with services.waiters.held("alice"):
         assert asyncio.run(asyncio.wait_for(ask(), 20)) == len(looks) == 1
+
+
+def test_a_caller_has_half_of_the_answers_that_are_held() -> None:
+    waiters = Waiters(most=4)
+    with waiters.held("alice"), waiters.held("alice"):
+        assert not waiters.has_room("alice")
+        assert waiters.has_room("bob")
+        with waiters.held("bob"), waiters.held("carol"):
+            assert not waiters.has_room("dave"), "all together have as many as there may be"
+    assert waiters.has_room("alice")
 
 
 def test_the_more_answers_are_held_the_more_seldom_each_looks() -> None:
     waiters = Waiters(looks_per_s=10.0)
     with ExitStack() as stack:
-        stack.enter_context(waiters.held())
+        stack.enter_context(waiters.held("alice"))
         assert 0.1875 <= waiters.pause_s(0.25) <= 0.3125
         for _ in range(9):
-            stack.enter_context(waiters.held())
+            stack.enter_context(waiters.held("alice"))
         assert 0.75 <= waiters.pause_s(0.25) <= 1.25
         assert 1.5 <= waiters.pause_s(2.0) <= 2.5
         assert len({waiters.pause_s(2.0) for _ in range(5)}) > 1, "those that began together do not stay together"

@@ -17,15 +17,15 @@ _Value = TypeVar("_Value")
 
 
 async def wait_for(
-    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services
+    fetch: Callable[[], _Value], enough: Callable[[_Value], bool], seconds: float, services: Services, caller: str
 ) -> _Value:
     """What ``fetch`` (blocking) returns once it is ``enough``, ``seconds`` have passed or the service stops.
 
-    At once where very many wait already.
+    At once where very many wait already, or many of this caller.
     """
-    deadline = time.monotonic() + (seconds if services.waiters.has_room else 0.0)
+    deadline = time.monotonic() + (seconds if services.waiters.has_room(caller) else 0.0)
     step = _FIRST_PAUSE_S
-    with services.waiters.held():
+    with services.waiters.held(caller):
         value = await in_thread(fetch)
         while True:
             left = deadline - time.monotonic()

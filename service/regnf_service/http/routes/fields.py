@@ -60,7 +60,7 @@ async def get_field(
     def is_news(found: FieldRecord) -> bool:
         return found.state != "validating" or held.differs(field_etag(found))
 
-    record = await wait_for(lambda: _require(services, caller, sha256), is_news, wait, services)
+    record = await wait_for(lambda: _require(services, caller, sha256), is_news, wait, services, caller)
     headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
     if record.state == "validating":
         headers["Retry-After"] = "1"

@@ -125,7 +125,7 @@ async def get_job(
     def is_news(seen: _Seen) -> bool:
         return seen.record.status not in ACTIVE or held.differs(_etag(seen))
 
-    seen = await wait_for(look, is_news, wait, services)
+    seen = await wait_for(look, is_news, wait, services, caller)
     if wait and not held.given:
         seen = await in_thread(_seen, services, seen.record)
     return held.apply(_answer(services, seen, prefix, 200))

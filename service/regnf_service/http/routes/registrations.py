@@ -143,6 +143,7 @@ async def register(
             lambda found: found.status in FINISHED,
             wait,
             services,
+            caller,
         )
     response = await job_answer(services, record, prefix, 200 if record.status in FINISHED else 202)
     response.headers["Location"] = f"{prefix}/jobs/{record.id}"
