@@ -20,6 +20,8 @@ _MAX_POINTS = 300_000
 _DEPTH = 8
 _REACH_SPACINGS, _REACH_SHARE = 4.0, 0.01
 """The surface ends where no point is within this many times their usual spacing, or this share of their diagonal."""
+_MEASURED = 10_000
+"""Points whose distance to the surface is measured: one that is far from it, and as far from all, takes long."""
 
 
 def convert_cloud(geometry: Geometry, origin: str, overrides: UploadDescription) -> ConvertedField:
@@ -35,16 +37,17 @@ def convert_cloud(geometry: Geometry, origin: str, overrides: UploadDescription)
     if not diagonal > 0.0:
         raise malformed("all points of the cloud are one")
     unit = (points - low) / diagonal
-    tree = cKDTree(unit)
+    places = np.unique(unit, axis=0)  # a tree cannot part points at one place: each would be compared with each
+    tree = cKDTree(places)
     vertices, faces = _poisson(unit, normals)
-    spacing = float(np.median(tree.query(unit, k=2)[0][:, 1]))
-    near = tree.query(vertices)[0] < max(_REACH_SPACINGS * spacing, _REACH_SHARE)
+    reach = max(_REACH_SPACINGS * float(np.median(tree.query(places, k=2)[0][:, 1])), _REACH_SHARE)
+    near = tree.query(vertices, distance_upper_bound=reach)[0] < reach
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
         raise malformed("no surface passes near the points: are the normals theirs?")
     surface = Geometry(vertices * diagonal + low, faces, left_out=geometry.left_out)
     found = mesh_field(surface, "their screened Poisson surface, 256 cells wide", overrides, "point_cloud")
-    beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(unit)[0], 0.95)
+    beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(_some(unit))[0], 0.95)
     why = (f"{origin}: {len(geometry.vertices)} points with normals", *found.why)
     text = f"what lies between the points is a guess; 19 of 20 points are within {beside:.2g} % of the diagonal of it"
     return replace(found, why=why, warnings=(*found.warnings, f"SURFACE_RECONSTRUCTED: {text}"))
@@ -64,6 +67,13 @@ def _usable(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, 
         chosen = np.random.default_rng(0).permutation(len(points))[:_MAX_POINTS]
         points, normals = points[chosen], normals[chosen]
     return points, normals
+
+
+def _some(points: Float64Array) -> Float64Array:
+    """At most so many of them, drawn at random."""
+    if len(points) <= _MEASURED:
+        return points
+    return points[np.random.default_rng(0).choice(len(points), _MEASURED, replace=False)]
 
 
 def _poisson(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, Int64Array]:

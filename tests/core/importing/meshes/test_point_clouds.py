@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.families import point_cloud
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
@@ -40,6 +43,21 @@ def converted(data: bytes) -> ConvertedField:
 
 def field_of(found: ConvertedField) -> MeshField:
     return MeshField(found.tensors["vertices"], found.tensors["faces"])
+
+
+def test_points_at_one_place_are_compared_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100,000 of them, each compared with each, took longer than any import may."""
+    built: list[NDArray[np.float64]] = []
+
+    def tree(places: NDArray[np.float64]) -> Any:
+        built.append(places)
+        return cKDTree(places)
+
+    monkeypatch.setattr(point_cloud, "cKDTree", tree)
+    around = directions(400)
+    again = np.concatenate((around, around[:20].repeat(50, axis=0)))
+    assert len(field_of(converted(ply(again, again))).faces) > 1000
+    assert len(built[0]) == 400
 
 
 def test_points_on_a_sphere_are_a_sphere(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import trimesh
 
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.work.mesh_work import mesh_seconds
+from regnf_core.importing.work.calls import SAMPLES, calls_of_check
+from regnf_core.importing.work.mesh_work import mesh_seconds, mesh_work
 from tests.core.importing.archives import assert_refused, saved
 
 RANDOM = np.random.default_rng(0)
@@ -46,6 +47,18 @@ def test_a_sound_mesh_of_as_many_triangles_is_quick() -> None:
     sound = mesh_seconds(ball.vertices, ball.faces, 2_000)
     vertices = COSTLY["triangles across all the space"].reshape(-1, 3)
     assert sound < 1.0 < mesh_seconds(vertices, np.arange(len(vertices)).reshape(-1, 3), 2_000) / 20
+
+
+def test_a_knot_in_a_large_box_is_costly_since_all_points_walk_to_it() -> None:
+    """20,000 needles through one place, and two specks far away: hardly a random point comes near the needles."""
+    ends, turns = RANDOM.normal(size=(2, 20_000, 3))
+    ends /= np.linalg.norm(ends, axis=1)[:, None]
+    needles = np.stack((ends, 1e-3 * turns - ends, -1e-3 * turns - ends), axis=1)
+    specks = 1e-3 * np.eye(3) + np.array([[[-50.0]], [[50.0]]])
+    vertices = np.concatenate((needles, specks)).reshape(-1, 3)
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    assert mesh_seconds(vertices, faces, 26_000) < 5.0
+    assert mesh_work(vertices, faces, calls_of_check(SAMPLES)) > 30.0
 
 
 def test_what_is_no_mesh_is_left_to_those_who_refuse_it() -> None:
