@@ -49,7 +49,6 @@ def convert_file(
 
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
-    from regnf_core.fields.build import open_field
     from regnf_core.importing.gate.work_estimate import require_affordable
     from regnf_core.schema.safe_format import write_safe_field
 
@@ -65,9 +64,9 @@ def convert_file(
     bounds, label = converted.description["bounds"], converted.description["label"]
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
-    from regnf_core.importing.gate.plausibility import (
-        check_plausibility,  # loads torch, which a refused file never needs
-    )
+    # These load torch, which takes seconds and which a file that is refused above never needs.
+    from regnf_core.fields.build import open_field
+    from regnf_core.importing.gate.plausibility import check_plausibility
 
     field, started = open_field(target), time.process_time()
     measured, more = check_plausibility(field)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,7 @@ from tests.core.fields.test_onnx import GRAPHS
 from tests.core.importing.archives import assert_refused, saved
 from tests.core.importing.onnx_models import Initializers, model
 
+ROOT = Path(__file__).resolve().parents[4]
 HALF: Initializers = {"axes": np.array([1]), "half": np.array(0.5, np.float32)}
 SPHERE = "r = ReduceL2 x axes keepdims:1; s = Sub r half; "
 LAST = "; k = ReduceSum {0} axes keepdims:1; t = Tanh k; y = Add s t"
@@ -158,6 +161,19 @@ def test_a_costly_graph_through_the_gate_says_both_numbers(tmp_path: Path) -> No
     with pytest.raises(FieldFormatError, match=r"estimated \d+ s of a core; 60 s are allowed") as caught:
         import_field(path, tmp_path / "out")
     assert caught.value.reason == "IMPORT_TOO_COSTLY"
+
+
+def test_a_costly_graph_is_refused_before_torch_is_loaded(tmp_path: Path) -> None:
+    """Which takes seconds of the worker's time."""
+    path = saved(tmp_path, costly("large products one after the other").SerializeToString())
+    program = (
+        "import sys; from pathlib import Path; from regnf_core.importing.gate import convert;"
+        "told = convert.run(Path(sys.argv[1]), Path(sys.argv[2]), None, convert.ImportLimits());"
+        "print(told['reason'], 'torch' in sys.modules)"
+    )
+    command = [sys.executable, "-c", program, str(path), str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["IMPORT_TOO_COSTLY", "False"]
 
 
 def test_the_limit_is_the_callers(tmp_path: Path) -> None:
