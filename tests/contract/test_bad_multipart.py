@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import threading
 from typing import Any
 
 import pytest
 
+from regnf_service.fields.uploads import Upload
+from regnf_service.http.multipart import _Collector
 from tests.contract.bad_input import GOOD, PNG, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, make_world
 
@@ -108,3 +111,29 @@ def test_headers_of_thousands_of_parameters_are_not_read(world: World) -> None:
 def test_boundaries_that_cannot_be_used_are_refused(world: World, boundary: str) -> None:
     headers = {"Content-Type": f"multipart/form-data; boundary={boundary}"}
     assert_refused(world.client.post("/fields", content=FILE, headers=headers), 400, "MALFORMED_MULTIPART")
+
+
+def test_what_is_nearly_a_boundary_is_not_handed_on_in_crumbs(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A boundary of one character, and nearly that one in every few bytes: each would be an event of its own."""
+    pieces: list[int] = []
+    threads: set[str] = set()
+    feed, parse = Upload.feed, _Collector.feed
+
+    async def counted(upload: Upload, data: bytes | bytearray) -> None:
+        pieces.append(len(data))
+        await feed(upload, data)
+
+    def watched(collector: _Collector, data: bytes) -> Any:
+        threads.add(threading.current_thread().name)
+        return parse(collector, data)
+
+    monkeypatch.setattr(Upload, "feed", counted)
+    monkeypatch.setattr(_Collector, "feed", watched)
+    crumbs = GOOD + b"\r\n--xxy" * 300
+    body = part("file", crumbs, file=True) + b"--x--\r\n"
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    answer = world.client.post("/fields", content=body, headers=headers)
+    assert (answer.status_code, answer.json()["bytes"]) == (201, len(crumbs))
+    assert len(pieces) <= 2
+    assert all("AnyIO worker" in name for name in threads), "not on the event loop, where everybody would wait"
+    assert world.client.delete(answer.json()["links"]["self"]).status_code == 204

@@ -44,7 +44,7 @@ class Upload:
         self._pending = bytearray()
         self._recognized = False
 
-    async def feed(self, data: bytes) -> None:
+    async def feed(self, data: bytes | bytearray) -> None:
         """Take the next bytes. Raises Problem UPLOAD_TOO_LARGE, FIELD_NOT_RECOGNIZED as soon as the bytes show it."""
         if self._bytes + len(self._pending) + len(data) > self._limit:
             raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)

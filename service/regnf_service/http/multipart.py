@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Mapping
 from email.message import Message
 from typing import Protocol
 
+from anyio import CapacityLimiter, to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
@@ -24,7 +25,7 @@ _MAX_HEADERS = 8
 class Sink(Protocol):
     """Where a file part's bytes go."""
 
-    async def feed(self, data: bytes) -> None: ...
+    async def feed(self, data: bytes | bytearray) -> None: ...
 
 
 class _Part:
@@ -40,7 +41,7 @@ class _Collector:
     """Turns the parser's callbacks into a list of (part, bytes): None for a part's beginning."""
 
     def __init__(self, boundary: str) -> None:
-        self.events: list[tuple[_Part, bytes | None]] = []
+        self.events: list[tuple[_Part, bytearray | None]] = []
         self.ended = False
         self._part = _Part()
         self._field = bytearray()
@@ -49,7 +50,7 @@ class _Collector:
             boundary,
             {
                 "on_part_begin": self._begin,
-                "on_part_data": lambda data, start, end: self.events.append((self._part, data[start:end])),
+                "on_part_data": self._data,
                 "on_header_field": lambda data, start, end: self._field.extend(data[start:end]),
                 "on_header_value": lambda data, start, end: self._value.extend(data[start:end]),
                 "on_header_end": self._header,
@@ -63,6 +64,13 @@ class _Collector:
     def _begin(self) -> None:
         self._part = _Part()
 
+    def _data(self, data: bytes, start: int, end: int) -> None:
+        """Joined with what came just before: nearly a boundary in every line would make an event of every few bytes."""
+        if self.events and isinstance(known := self.events[-1][1], bytearray):
+            known += data[start:end]
+        else:
+            self.events.append((self._part, bytearray(data[start:end])))
+
     def _end(self) -> None:
         self.ended = True
 
@@ -74,7 +82,7 @@ class _Collector:
         if name == "content-disposition":
             self._part.name = _parameter(self._part.headers[name], "name") or ""
 
-    def feed(self, data: bytes) -> list[tuple[_Part, bytes | None]]:
+    def feed(self, data: bytes) -> list[tuple[_Part, bytearray | None]]:
         self._parser.write(data)
         events, self.events = self.events, []
         return events
@@ -102,18 +110,24 @@ def boundary_of(request: Request) -> str:
 
 
 async def read_parts(
-    body: AsyncIterator[bytes], boundary: str, files: Mapping[str, Sink], texts: Mapping[str, int]
+    body: AsyncIterator[bytes],
+    boundary: str,
+    files: Mapping[str, Sink],
+    texts: Mapping[str, int],
+    limiter: CapacityLimiter,
 ) -> dict[str, bytes]:
     """Feed the parts named in ``files`` to their sinks; return the text parts, capped as ``texts`` says, by name.
 
-    A file part that came appears in the answer too, empty. Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART,
-    DUPLICATE_PART, REQUEST_TOO_LARGE, and what the sinks raise.
+    A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
+    in every line, so it is done in a thread, in as many at once as ``limiter`` says.
+
+    Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, DUPLICATE_PART, REQUEST_TOO_LARGE, and what the sinks raise.
     """
     collector = _Collector(boundary)
     parts: dict[str, _Part] = {}
     async for data in body:
         try:
-            events = collector.feed(data)
+            events = await to_thread.run_sync(collector.feed, data, limiter=limiter)
         except FormParserError as error:
             raise Problem("MALFORMED_MULTIPART", headers=CLOSE) from error
         for part, content in events:
@@ -138,7 +152,7 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
     parts[part.name] = part
 
 
-def _add_text(part: _Part, content: bytes, limit: int) -> None:
+def _add_text(part: _Part, content: bytearray, limit: int) -> None:
     if len(part.text) + len(content) > limit:
         raise Problem("REQUEST_TOO_LARGE", f"The part takes at most {limit} bytes.", headers=CLOSE)
     part.text += content

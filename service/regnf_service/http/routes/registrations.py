@@ -183,7 +183,8 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     async with AsyncExitStack() as stack:
         files = {name: await stack.enter_async_context(open_upload(services, caller)) for name in ("scene", "object")}
         data = body.chunks(request, limit, settings)
-        parts = await read_parts(data, boundary_of(request), files, {"request": settings.max_request_bytes})
+        texts = {"request": settings.max_request_bytes}
+        parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")

@@ -151,7 +151,8 @@ async def _receive_parts(
     data = body.chunks(request, limit, settings)
     if digest is not None:
         data = _compared(data, digest)
-    parts = await read_parts(data, boundary_of(request), {"file": upload}, {"description": DESCRIPTION_BYTES})
+    texts = {"description": DESCRIPTION_BYTES}
+    parts = await read_parts(data, boundary_of(request), {"file": upload}, texts, services.parse_limiter)
     if "file" not in parts:
         raise Problem("MISSING_PART", "The part `file` is missing.")
     text = parts.get("description")
