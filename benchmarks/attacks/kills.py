@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -54,6 +55,9 @@ def _kill(house: House, kills: int, seed: int, outcome: Outcome, stop: threading
         "process inside the gate": lambda: _inner(house, random, deep=True),
         "API": lambda: _api(house),
         "Redis": lambda: _redis(house),
+        "worker, told to stop": lambda: _told_to_stop(house, random),
+        "worker, frozen for a while": lambda: _frozen(house.workers[random.randrange(len(house.workers))].pid, random),
+        "API, frozen for a while": lambda: house.api is not None and _frozen(house.api.pid, random),
     }
     try:
         while outcome.kills < kills:
@@ -69,6 +73,26 @@ def _kill(house: House, kills: int, seed: int, outcome: Outcome, stop: threading
 def _worker(house: House, random: Random) -> bool:
     house.kill_worker(random.randrange(len(house.workers)))
     return True
+
+
+def _told_to_stop(house: House, random: Random) -> bool:
+    """A worker gets SIGTERM; if it lets its job go on for long, it is killed after a while, as supervisors do."""
+    index = random.randrange(len(house.workers))
+    house.workers[index].terminate()
+    with suppress(subprocess.TimeoutExpired):
+        house.workers[index].wait(random.uniform(0.0, 20.0))
+    house.kill_worker(index)
+    return True
+
+
+def _frozen(pid: int, random: Random) -> bool:
+    """A process stands still, for less or more than the time after which it counts as lost."""
+    with suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGSTOP)
+        time.sleep(random.choice([1.0, 5.0, 12.0]))
+        os.kill(pid, signal.SIGCONT)
+        return True
+    return False
 
 
 def _inner(house: House, random: Random, deep: bool) -> bool:
@@ -164,7 +188,7 @@ def _followed(place: str, ended: Callable[[dict[str, Any]], bool], outcome: Outc
         if ended(document):
             return document
         if time.monotonic() > end:
-            raise TimeoutError(f"{place} has not ended after {_MOST_S:.0f} s")
+            raise TimeoutError(f"{place} has not ended after {_MOST_S:.0f} s: {str(document)[:400]}")
         time.sleep(0.2)
 
 

@@ -68,7 +68,7 @@ def _put_back(redis: Redis, sound: dict[bytes, Any]) -> None:
 
 def _change(random: Random, redis: Redis, trap: Path, outcome: Outcome) -> None:
     outcome.inputs += 1
-    kinds = [_change_document, _change_document, _change_type, _change_member, _drop]
+    kinds = [_change_document, _change_document, _change_type, _change_member, _change_value, _drop]
     try:
         if random.random() < 0.25:
             outcome.ends[_queue_entry(random, redis, trap)] += 1
@@ -131,6 +131,28 @@ def _change_member(random: Random, redis: Redis) -> str:
     elif redis.type(key) == b"set":
         redis.sadd(key, member)
     return "index changed"
+
+
+def _change_value(random: Random, redis: Redis) -> str:
+    """A value or name within what the fair queue, the counters and RQ keep, of the same type as before."""
+    key = _keys(random, redis, random.choice(["regnf:queue:*", "regnf:queue:*", "regnf:[cr]*", "rq:*"]))
+    if key is None:
+        return "no such key"
+    value = random.choice([b"x", b"", b"nan", b"inf", b"-inf", b"-1", b"0", b"\xff\xfe", b"9" * 400, b"x" * 100_000])
+    members: Any
+    match redis.type(key):
+        case b"hash":
+            members = sorted(redis.hkeys(key))
+            redis.hset(key, random.choice([*members, b"\xff", b"x"]), value)
+        case b"zset":
+            redis.zadd(key, {value: random.choice([0.0, float("inf"), float("-inf"), 1e300])})
+        case b"list":
+            random.choice([redis.lpush, redis.rpush])(key, value)
+        case b"set":
+            redis.sadd(key, value)
+        case b"string":
+            redis.set(key, value)
+    return "value changed"
 
 
 def _drop(random: Random, redis: Redis) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from redis import Redis
 
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord
-from regnf_state.redis.documents import Command, text
+from regnf_state.redis.documents import Command, shown
 from regnf_state.redis.keys import PREFIX
 
 COUNTERS_KEY = f"{PREFIX}counters"
@@ -68,7 +68,7 @@ class Counters:
 
     def __init__(self, redis: Redis) -> None:
         held: Any = redis.hgetall(COUNTERS_KEY)
-        self._held = {tuple(text(name).split("|")): _number(text(value)) for name, value in held.items()}
+        self._held = {tuple(shown(name).split("|")): _number(shown(value)) for name, value in held.items()}
 
     def counts(self, name: str) -> Iterable[tuple[Sequence[str], float]]:
         """(labels, value) of each count."""

@@ -20,6 +20,7 @@ from regnf_state.redis.unreadable import UNREADABLE, Stored, UnreadableRecords
 
 _PAGE = 100
 _PROBE_KEPT_S = 60
+_MOST_S = 1e12
 _Record = TypeVar("_Record", JobRecord, FieldRecord)
 logger = logging.getLogger(__name__)
 
@@ -247,3 +248,17 @@ def _decoded(kind: Kind[_Record], name: str, stored: Stored) -> _Record:
 def text(value: bytes | str) -> str:
     """What Redis answered, as text, whether or not the client decodes."""
     return value.decode() if isinstance(value, bytes) else value
+
+
+def shown(value: bytes | str) -> str:
+    """What Redis answered, as text, where it may be no text at all."""
+    return value.decode(errors="backslashreplace") if isinstance(value, bytes) else value
+
+
+def number(value: Any, otherwise: float = 0.0) -> float:
+    """A number that Redis holds; ``otherwise`` for none, for what is no number, and for what no seconds can be."""
+    try:
+        found = float(value)
+    except (TypeError, ValueError):
+        return otherwise
+    return found if abs(found) < _MOST_S else otherwise

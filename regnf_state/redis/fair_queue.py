@@ -7,16 +7,18 @@ ended. A caller who was idle for long comes before those who were not, with a mi
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from redis import Redis
+from redis.exceptions import ResponseError
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.counters import COUNTERS_KEY
-from regnf_state.redis.documents import text
+from regnf_state.redis.documents import number, shown
 from regnf_state.redis.fair_script import SCRIPT
 from regnf_state.redis.keys import PREFIX
 
@@ -25,6 +27,22 @@ _FIRST_COST_S = 10.0
 """What a caller's first work of a kind is taken to cost until it has run."""
 _CREDIT_S = 60.0
 """How far behind the caller served last one may start that was idle: a few imports and a registration."""
+_LISTS = tuple(f"rq:queue:{name}" for name in (IMPORT_QUEUE_NAME, QUEUE_NAME))
+_NOT_DAMAGE = (
+    "OOM",
+    "MISCONF",
+    "READONLY",
+    "NOSCRIPT",
+    "BUSY",
+    "LOADING",
+    "NOPERM",
+    "MASTERDOWN",
+    "NOREPLICAS",
+    "denied",
+)
+"""What Redis says of a script that it does not run now, or not for us."""
+_Value = TypeVar("_Value")
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -46,8 +64,28 @@ class FairQueue:
         self._script = redis.register_script(SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
+        """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
         fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S]
-        return int(self._script(keys=[_PREFIX], args=[*fixed, *arguments]))
+        return self._mended(lambda: int(self._script(keys=[_PREFIX], args=[*fixed, *arguments])))
+
+    def _mended(self, do: Callable[[], _Value]) -> _Value:
+        """What ``do`` returns, on an empty queue if the keys of this one are damaged."""
+        try:
+            return do()
+        except ResponseError as error:
+            if not _tells_of_damage(error):
+                raise
+            logger.error("the fair queue is damaged and begins anew: %s", error)
+        self._begin_anew()
+        return do()
+
+    def _begin_anew(self) -> None:
+        """Drop every key that the script uses; of RQ's lists and the counters those of another type only."""
+        shared = {**dict.fromkeys(_LISTS, b"list"), COUNTERS_KEY: b"hash"}
+        damaged = [key for key, kind in shared.items() if self._redis.type(key) != kind]
+        held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
+        if held:
+            self._redis.delete(*held)
 
     def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any]) -> bool:
         """Put work at the end of its owner's line; False when it waits or runs already."""
@@ -80,17 +118,22 @@ class FairQueue:
 
     def awaited(self) -> list[str]:
         """The fields that something waits for."""
-        return sorted(text(reference) for reference in self._redis.smembers(f"{_PREFIX}parkings"))
+        return sorted(
+            shown(reference) for reference in self._mended(lambda: self._redis.smembers(f"{_PREFIX}parkings"))
+        )
 
     def spent(self, owner: str) -> dict[int, float]:
         """An owner's worker seconds of the last hour by minute. What runs counts as the estimate says."""
-        held: Any = self._redis.hgetall(f"{_PREFIX}spent:{owner}")
+        held: Any = self._mended(lambda: self._redis.hgetall(f"{_PREFIX}spent:{owner}"))
         oldest = int(self._redis.time()[0]) // 60 - 60
-        minutes = {int(minute): float(seconds) for minute, seconds in held.items()}
+        minutes = {int(number(minute)): max(0.0, number(seconds)) for minute, seconds in held.items()}
         return {minute: seconds for minute, seconds in sorted(minutes.items()) if minute > oldest}
 
     def lines(self) -> list[Line]:
         """Every caller with work that waits, those whose turn is next first."""
+        return self._mended(self._lines)
+
+    def _lines(self) -> list[Line]:
         owners, ready, clock, now = self._look()
         with self._redis.pipeline(transaction=False) as pipeline:
             for owner, _ in owners:
@@ -98,10 +141,10 @@ class FairQueue:
                 pipeline.lindex(f"{_PREFIX}line:{owner}", 0)
             answers = pipeline.execute()
             for name in answers[1::2]:
-                pipeline.hget(f"{_PREFIX}entry:{text(name or '')}", "since")
+                pipeline.hget(f"{_PREFIX}entry:{shown(name or '')}", "since")
             since = pipeline.execute()
         lines = [
-            Line(owner, count + (owner == ready), now - float(begun or now), tag - clock)
+            Line(owner, count + (owner == ready), max(0.0, now - number(begun, now)), number(tag) - clock)
             for (owner, tag), count, begun in zip(owners, answers[::2], since, strict=True)
         ]
         alone = ready is not None and all(owner != ready for owner, _ in owners)
@@ -117,15 +160,18 @@ class FairQueue:
             pipeline.time()
             owners, (ready, clock), imports, registrations, (seconds, _) = pipeline.execute()
         lies = ready is not None and imports + registrations > 0
-        tags = [(text(owner), float(tag)) for owner, tag in owners]
-        return tags, text(ready) if lies else None, float(clock or 0), float(seconds)
+        tags = [(shown(owner), number(tag)) for owner, tag in owners]
+        return tags, shown(ready) if lies else None, number(clock), float(seconds)
 
     def position(self, work: Work) -> int | None:
         """The place of work in the order that is expected of what waits now; None when it is in no line."""
+        return self._mended(lambda: self._position(work))
+
+    def _position(self, work: Work) -> int | None:
         held: Any = self._redis.hget(f"{_PREFIX}entry:{work.name}", "owner")
         if held is None:
             return None
-        mine = text(held)
+        mine = shown(held)
         with self._redis.pipeline(transaction=False) as pipeline:
             pipeline.lpos(f"{_PREFIX}line:{mine}", work.name)
             pipeline.lpos(f"rq:queue:{work.queue_name}", work.name)
@@ -155,5 +201,14 @@ class FairQueue:
                 pipeline.llen(f"{_PREFIX}line:{owner}")
             answers = pipeline.execute()
         rows = zip(owners, answers[::3], answers[1::3], strict=True)
-        costs = {owner: max(float(cost or _FIRST_COST_S), 1e-3) / float(weight or 1) for owner, cost, weight in rows}
+        costs = {
+            owner: max(number(cost, _FIRST_COST_S), 1e-3) / max(number(weight, 1.0), 1e-6)
+            for owner, cost, weight in rows
+        }
         return costs, dict(zip(owners, answers[2::3], strict=True))
+
+
+def _tells_of_damage(error: ResponseError) -> bool:
+    """Whether the script met a key of another type, or a value that it cannot reckon with: that stays until mended."""
+    said = str(error)
+    return ("WRONGTYPE" in said or "user_script" in said) and not any(word in said for word in _NOT_DAMAGE)

@@ -23,13 +23,23 @@ local now = time[1] + time[2] / 1e6
 
 local function entry_of(id) return P .. 'entry:' .. id end
 local function line_of(owner) return P .. 'line:' .. owner end
-local function tag_of(owner) return tonumber(redis.call('HGET', P .. 'tags', owner) or '0') end
-local function weight_of(owner) return tonumber(redis.call('HGET', P .. 'weights', owner) or '1') end
-local function clock() return tonumber(redis.call('HGET', P .. 'clock', 'now') or '0') end
+-- what is no number, or none that seconds can be, counts as if it were not there
+local function number(held, otherwise)
+  local found = tonumber(held or '')
+  return found and math.abs(found) < 1e12 and found or otherwise
+end
+
+local function tag_of(owner) return number(redis.call('HGET', P .. 'tags', owner), 0) end
+local function clock() return number(redis.call('HGET', P .. 'clock', 'now'), 0) end
+local function weight_of(owner)
+  local weight = number(redis.call('HGET', P .. 'weights', owner), 1)
+  return weight >= 1e-6 and weight or 1
+end
+
 local function text(number) return string.format('%.6f', number) end
 
 local function cost_of(owner, kind)
-  return tonumber(redis.call('HGET', P .. 'costs', owner .. '|' .. kind) or FIRST)
+  return number(redis.call('HGET', P .. 'costs', owner .. '|' .. kind), FIRST)
 end
 
 local function set_tag(owner, tag)
@@ -46,7 +56,7 @@ local function charge(owner, seconds)
   local key, minute = P .. 'spent:' .. owner, math.floor(now / 60)
   redis.call('HINCRBYFLOAT', key, string.format('%d', minute), text(seconds))
   for _, each in ipairs(redis.call('HKEYS', key)) do
-    if tonumber(each) <= minute - 60 then redis.call('HDEL', key, each) end
+    if number(each, 0) <= minute - 60 then redis.call('HDEL', key, each) end
   end
   redis.call('EXPIRE', key, 7200)
 end
@@ -64,8 +74,9 @@ local function settle()
   local id, owner = ready[1], ready[2]
   if not id then return end
   redis.call('HDEL', P .. 'clock', 'ready', 'owner')
+  if not owner then return end
   local kind = redis.call('HGET', entry_of(id), 'kind')
-  if not kind then return end
+  if not LISTS[kind] then return end
   if redis.call('LREM', LISTS[kind], 1, id) == 1 then
     redis.call('LPUSH', line_of(owner), id)
     set_tag(owner, tag_of(owner))
@@ -86,7 +97,7 @@ local function advance()
     local id = redis.call('LPOP', line_of(owner))
     set_tag(owner, tag_of(owner))
     local kind = id and redis.call('HGET', entry_of(id), 'kind')
-    if kind then
+    if LISTS[kind] then
       redis.call('HSET', P .. 'clock', 'ready', id, 'owner', owner)
       redis.call('RPUSH', LISTS[kind], id)
       return
@@ -103,6 +114,7 @@ end
 
 -- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
 local function runs(id)
+  if redis.call('TYPE', 'rq:executions:' .. id).ok ~= 'zset' then return false end
   for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
     if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
   end
@@ -149,18 +161,18 @@ end
 function steps.finish(seconds)
   local entry = redis.call('HMGET', entry_of(name), 'owner', 'kind', 'cost')
   redis.call('DEL', entry_of(name))
-  if not entry[3] then return 0 end
-  local owner, kind = entry[1], entry[2]
+  local owner, kind, cost = entry[1], entry[2], number(entry[3], nil)
+  if not owner or not kind or not cost then return 0 end
   redis.call('HSET', P .. 'costs', owner .. '|' .. kind, seconds)
   redis.call('HINCRBYFLOAT', ARGV[4], 'worker_seconds|' .. owner .. '|' .. kind, seconds)
-  charge(owner, tonumber(seconds) - tonumber(entry[3]))
+  charge(owner, tonumber(seconds) - cost)
   return 1
 end
 
 -- taken, but it cannot run before the import of this field has ended: it pays nothing meanwhile
 function steps.park(owner, kind, reference)
-  local cost = redis.call('HGET', entry_of(name), 'cost')
-  if cost then charge(owner, -tonumber(cost)) end
+  local cost = number(redis.call('HGET', entry_of(name), 'cost'), nil)
+  if cost then charge(owner, -cost) end
   redis.call('HDEL', entry_of(name), 'cost', 'taken')
   redis.call('HSETNX', entry_of(name), 'since', text(now))
   redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'parked', reference)

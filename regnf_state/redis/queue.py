@@ -12,7 +12,7 @@ from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
 from regnf_state.redis import payload
-from regnf_state.redis.documents import text
+from regnf_state.redis.documents import shown
 from regnf_state.redis.fair_queue import FairQueue, Line
 
 
@@ -45,7 +45,7 @@ class RqJobQueue:
             return
         worker: Any = self._redis.hget(f"rq:job:{name}", "worker_name")
         if worker:
-            send_command(self._redis, text(worker), "stop-job", job_id=name)
+            send_command(self._redis, shown(worker), "stop-job", job_id=name)
 
     def drop_import(self, sha256: str, attempt: int) -> None:
         self.fair.remove(Work("import", sha256, attempt).name)
@@ -70,7 +70,7 @@ class RqJobQueue:
         return self.fair.lines()
 
     def live_workers(self) -> int:
-        names = [text(name) for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)]
+        names = [shown(name) for name in self._redis.smembers(WORKERS_BY_QUEUE_KEY % QUEUE_NAME)]
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 pipeline.exists(name)

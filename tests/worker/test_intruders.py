@@ -198,3 +198,13 @@ def test_with_a_key_only_what_is_signed_runs(tmp_path: Path) -> None:
         assert {table.job(name).status for name in ("unsigned", "forged", "borrowed")} == {"accepted"}
         assert table.redis.hget("regnf:counters", "queue_payloads_refused|regnf") == b"3"
         assert key not in table.log()
+
+
+@pytest.mark.parametrize("document", ["{", "[]", json.dumps({"attempt": "x"})])
+def test_a_damaged_record_does_not_end_the_worker_that_takes_its_job(table: Bench, document: str) -> None:
+    table.submit("succeed", "damaged")
+    table.redis.hset("regnf:job:damaged", "document", document)
+    worker = table.start_worker()
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+    assert worker.poll() is None, table.log()

@@ -13,7 +13,7 @@ from redis import Redis
 from redis.exceptions import ResponseError
 
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
-from regnf_state.records import FieldRecord, JobRecord
+from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis import payload
 from regnf_state.redis.counters import count
 from regnf_state.redis.documents import text
@@ -73,8 +73,16 @@ class Taking:
                 raise
             self._refuse(taken, "not a hash")
         else:
-            return None if work.kind == "registration" and self._parked(work) else work
+            return None if work.kind == "registration" and self._is_put_aside(work) else work
         return None
+
+    def _is_put_aside(self, work: Work) -> bool:
+        """Whether the registration waits for an import. One with a record that cannot be read is run, which says so."""
+        try:
+            return self._parked(work)
+        except UnreadableRecordError as error:
+            logger.error("%s: %s", work.name, error)
+            return False
 
     def _refuse(self, taken: Taken, why: str) -> None:
         self._fair.remove(taken.name)
