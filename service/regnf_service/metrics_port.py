@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import ThreadingHTTPServer
 from typing import Any
@@ -19,6 +19,8 @@ from regnf_service.http.security_headers import SECURITY_HEADERS
 _MOST_CONNECTIONS = 16
 _SILENCE_S = 5.0
 """How long a scraper may send nothing, or read nothing."""
+_LONGEST_S = 15.0
+"""How long one scrape may take in all: who sends a byte now and then must not keep a connection for hours."""
 
 
 @contextmanager
@@ -78,10 +80,20 @@ class _Server(ThreadingHTTPServer):
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
+        ending = threading.Timer(_LONGEST_S, _cut_off, (request,))
+        ending.daemon = True
+        ending.start()
         try:
             super().process_request_thread(request, client_address)
         finally:
+            ending.cancel()
             self._slots.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A scraper that leaves is no error of ours."""
+
+
+def _cut_off(connection: socket.socket) -> None:
+    """Whoever reads from or writes to the connection finds that it has ended."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)

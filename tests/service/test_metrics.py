@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from redis import Redis
 
+from regnf_service import metrics_port
 from regnf_service.http.hosts import AllowedHosts
 from regnf_service.metrics import Metrics
 from regnf_service.metrics_port import served
@@ -187,6 +189,28 @@ def test_silent_connections_do_not_fill_the_metrics_port(tmp_path: Path, any_red
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(17)]
         assert silent[-1].recv(1) == b""
         assert threading.active_count() < 40
+
+
+def test_trickling_connections_do_not_keep_the_metrics_port(
+    tmp_path: Path, any_redis: Redis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metrics_port, "_LONGEST_S", 0.5)
+    metrics = make_world(tmp_path, any_redis).app.state.metrics
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    end = time.monotonic() + 20
+    with (
+        served(metrics.registry, AllowedHosts(()), "127.0.0.1", port),
+        socket.create_connection(("127.0.0.1", port)) as trickling,
+    ):
+        trickling.settimeout(0.1)
+        with suppress(ConnectionError):
+            while time.monotonic() < end:
+                trickling.sendall(b"x")
+                with suppress(TimeoutError):
+                    if trickling.recv(1) == b"":
+                        break
+    assert time.monotonic() < end, "a byte now and then kept the connection"
 
 
 def test_the_verdict_is_kept_with_the_job(redis: Redis) -> None:
