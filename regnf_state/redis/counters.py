@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from redis import Redis
+from redis.exceptions import ResponseError
 
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord
 from regnf_state.redis.documents import Command, shown
@@ -24,8 +25,18 @@ def counted(name: str, *labels: str, by: int = 1) -> Command:
 
 
 def count(redis: Redis, name: str, *labels: str) -> None:
-    """Count one that is no part of a change."""
-    redis.hincrby(COUNTERS_KEY, "|".join((name, *labels)), 1)
+    """Count one that is no part of a change. Counters that are no hash, or no number, begin anew."""
+    counter = "|".join((name, *labels))
+    try:
+        redis.hincrby(COUNTERS_KEY, counter, 1)
+    except ResponseError as error:
+        if "WRONGTYPE" in str(error):
+            redis.delete(COUNTERS_KEY)
+        elif "not an integer" in str(error):
+            redis.hdel(COUNTERS_KEY, counter)
+        else:
+            raise
+        redis.hincrby(COUNTERS_KEY, counter, 1)
 
 
 def timed(name: str, seconds: float, *labels: str) -> list[Command]:

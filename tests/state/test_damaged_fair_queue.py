@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import pytest
 from redis import Redis
 from redis.exceptions import ResponseError
 
 from regnf_state.queue import Work
-from regnf_state.redis.counters import Counters
+from regnf_state.redis.counters import COUNTERS_KEY, Counters, count
 from regnf_state.redis.fair_queue import FairQueue
 
 PREFIX = "regnf:queue:"
@@ -23,7 +24,7 @@ def used(redis: Redis) -> FairQueue:
     for number in range(3):
         fair.enqueue(Work("registration", f"{number:032x}", 1), "one", {"owner": "one"})
     fair.enqueue(WAITING, "two", {"owner": "two"})
-    first = redis.lpop("rq:queue:regnf")
+    first: Any = redis.lpop("rq:queue:regnf")
     fair.turn()
     fair.finish(first.decode(), 2.0)
     fair.park(PARKED, "one", "e" * 64)
@@ -40,7 +41,8 @@ def go_through(fair: FairQueue, redis: Redis) -> None:
     fair.release("e" * 64)
     fair.awaited()
     Counters(redis)
-    if name := redis.lpop("rq:queue:regnf"):
+    name: Any = redis.lpop("rq:queue:regnf")
+    if name is not None:
         fair.turn()
         fair.finish(name.decode(errors="replace"), 1.0)
 
@@ -58,7 +60,7 @@ def comes_out(fair: FairQueue, redis: Redis, work: Work) -> bool:
 @pytest.mark.parametrize("kind", ["string", "list", "hash", "set", "zset"])
 def test_keys_of_another_type(redis: Redis, kind: str) -> None:
     used(redis)
-    keys = [key for key in redis.keys(f"{PREFIX}*") + redis.keys("rq:queue:regnf*") if redis.type(key).decode() != kind]
+    keys = [key for key in redis.keys(f"{PREFIX}*") + redis.keys("rq:queue:regnf*") if redis.type(key) != kind.encode()]
     assert keys
     for key in keys:
         redis.flushall()
@@ -115,3 +117,13 @@ def test_a_redis_that_refuses_for_a_while_does_not_empty_the_queue(
     with pytest.raises(ResponseError, match=re.escape(said)):
         fair.turn()
     assert sorted(redis.keys("*")) == held
+
+
+@pytest.mark.parametrize("value", [None, "x", "1.5"])
+def test_damaged_counters_begin_anew(redis: Redis, value: str | None) -> None:
+    if value is None:
+        redis.set(COUNTERS_KEY, "x")
+    else:
+        redis.hset(COUNTERS_KEY, "refused|a", value)
+    count(redis, "refused", "a")
+    assert list(Counters(redis).counts("refused")) == [(("a",), 1.0)]
