@@ -11,6 +11,7 @@ from rq.exceptions import StopRequested
 
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
+from regnf_worker import kernel
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.process import RegnfWorker
@@ -113,8 +114,9 @@ def test_a_job_is_settled_once_redis_takes_it(
     """The child died because Redis was full, and Redis is still full when its parent wants to say so."""
     accept(worker._context)
     refuse(monkeypatch, worker._context, "update_job", 3)
-    for name in ("begin_job", "_run_child", "finish_job"):
+    for name in ("begin_job", "finish_job"):
         monkeypatch.setattr(worker, name, lambda *_: None)
+    monkeypatch.setattr(worker, "_run_child", lambda *_: kernel.Exit(status=None))
     worker.execute_job(TakenJob, JobsQueue)
     again = worker._context.records.get_job("j1")
     assert again is not None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.manifest import Artifact, Manifest, artifact_key, manifest_key, read_result
+from regnf_state.records import UnreadableRecordError
 
 _CHUNK_BYTES = 1 << 20
 _VERDICTS = ("registered", "ambiguous", "rejected")
@@ -17,7 +18,7 @@ def verdict_of(blobs: BlobStore, manifest: Manifest) -> str | None:
     """The verdict in the result; None for a result without a known one."""
     try:
         verdict = read_result(blobs, manifest).get("verdict")
-    except (FileNotFoundError, ValueError, AttributeError):
+    except (FileNotFoundError, UnreadableRecordError):
         return None
     return verdict if verdict in _VERDICTS else None
 
