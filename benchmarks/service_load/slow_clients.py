@@ -4,7 +4,8 @@
         [--output benchmarks/results/service_slow_clients.md]
 
 The slow ones come from a process of their own (`slow_connections`), all from one address, which the pollers and the
-honest client share. Each poller asks for a job every two seconds. One worker, one thread.
+honest client share; they have a token of another caller. Each poller asks for a job every two seconds. One worker, one
+thread.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _EVERY_S = 2.0
 _CALM_S = 12.0
 _PATIENCE_S = 5.0
 _OPTIONS = {"up_axis": "z"}
+_HONEST, _SLOW = "honest-caller-of-the-benchmark", "slow-caller-of-the-benchmark"
+_TOKENS = f'["honest:{_HONEST}", "slow:{_SLOW}"]'
 
 
 @dataclass
@@ -54,7 +57,7 @@ async def poll(port: int, path: str, until: float, seen: Seen) -> None:
     while time.monotonic() < until:
         try:
             async with asyncio.timeout(_PATIENCE_S):
-                connection = await Connection(port).__aenter__()
+                connection = await Connection(port, _HONEST).__aenter__()
             async with connection:
                 await _poll_on(connection, path, until, seen)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
@@ -79,14 +82,14 @@ def be_honest(house: House, pair: SmallPair, begin: float, seen: Seen) -> None:
     time.sleep(max(0.0, begin - time.monotonic()))
     begun = time.monotonic()
     try:
-        with RemoteService(house.address) as remote:
+        with RemoteService(house.address, _HONEST) as remote:
             request = {**pair.upload(remote), "options": _OPTIONS, "seed": 4711}
             job_id = remote.submit(request)["id"]
             remote.follow(job_id, lambda phase, share: None)
             verdict = remote.result(job_id)["verdict"]
         seen.honest = f"{verdict} after {time.monotonic() - begun:.1f} s"
     except Exception as error:  # noqa: BLE001 -- whatever it was, it is the result
-        seen.honest = f"failed after {time.monotonic() - begun:.1f} s: {type(error).__name__}"
+        seen.honest = f"failed after {time.monotonic() - begun:.1f} s: {type(error).__name__}: {error}"
 
 
 async def everybody(port: int, path: str, until: float, seen: Seen) -> None:
@@ -100,9 +103,9 @@ async def everybody(port: int, path: str, until: float, seen: Seen) -> None:
 
 def measure(folder: Path, slow: int, seconds: float) -> tuple[Seen, float]:
     """What was seen, and when the slow connections began."""
-    with running_house(folder, 1, threads=1) as house:
+    with running_house(folder, 1, _HONEST, threads=1, api_tokens=_TOKENS, rate_limit_per_s=0) as house:
         seen, port = Seen(), house.listener.getsockname()[1]
-        with RemoteService(house.address) as remote:
+        with RemoteService(house.address, _HONEST) as remote:
             request = {**write_small_pair(folder).upload(remote), "options": _OPTIONS}
             path = f"/jobs/{remote.submit(request)['id']}"
         begin = time.monotonic() + _CALM_S
@@ -114,7 +117,15 @@ def measure(folder: Path, slow: int, seconds: float) -> tuple[Seen, float]:
         pollers = threading.Thread(target=lambda: asyncio.run(everybody(port, path, until, seen)))
         pollers.start()
         time.sleep(max(0.0, begin - time.monotonic()))
-        command = [sys.executable, "-m", "benchmarks.service_load.slow_connections", str(port), str(slow), str(seconds)]
+        command = [
+            sys.executable,
+            "-m",
+            "benchmarks.service_load.slow_connections",
+            str(port),
+            str(slow),
+            str(seconds),
+            _SLOW,
+        ]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         seen.slow = json.loads(done.stdout)
         pollers.join()

@@ -1,6 +1,6 @@
 """Holds slow connections of four kinds to a service, in a process of its own; each that is cut off is made anew.
 
-    python -m benchmarks.service_load.slow_connections PORT COUNT SECONDS
+    python -m benchmarks.service_load.slow_connections PORT COUNT SECONDS TOKEN
 
 A quarter each: heads that never end, a byte a second; bodies of uploads, a byte a second; answers that are never read;
 connections that stay idle after an answer. Prints how many were made and how many were closed by the service.
@@ -19,7 +19,7 @@ from collections import Counter
 _DROP_EVERY_S = 1.0
 _RETRY_S = 5.0
 _FIRST_WITHIN_S = 20.0
-_HOST = b"Host: 127.0.0.1\r\n"
+_HOST = b"Host: 127.0.0.1\r\nAuthorization: Bearer " + (sys.argv[4] if len(sys.argv) > 4 else "").encode() + b"\r\n"
 _BODY = b"POST /fields HTTP/1.1\r\n" + _HOST + b"Content-Length: 100000000\r\n\r\n" + b"\x10" + bytes(7)
 _LARGE_ANSWER = b"GET /openapi.yaml HTTP/1.1\r\n" + _HOST + b"\r\n"
 

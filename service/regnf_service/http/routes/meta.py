@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import platform
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from regnf_core import __version__
-from regnf_service.concurrency import blocking
+from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http.contract import contract_yaml
 from regnf_service.http.dependencies import PrefixDep, ServicesDep
 from regnf_service.http.docs_page import STYLE_POLICY, render_docs
@@ -115,19 +116,19 @@ async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
     responses={200: {"content": {"application/yaml": {"schema": {"type": "object"}}}}},
 )
 async def openapi_yaml(request: Request) -> Response:
-    return Response(_made_once(request, contract_yaml, request.app), media_type="application/yaml")
+    return Response(await _made_once(request, contract_yaml, request.app), media_type="application/yaml")
 
 
 @get_and_head(router, "/docs", summary="This contract, for people", response_class=HTMLResponse)
 async def docs(request: Request) -> HTMLResponse:
     """One page without scripts; loads nothing from elsewhere."""
-    page = _made_once(request, render_docs, request.app.openapi())
+    page = await _made_once(request, render_docs, request.app.openapi())
     return HTMLResponse(page, headers={"Content-Security-Policy": STYLE_POLICY})
 
 
-def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> str:
-    """What ``make`` writes, kept with the application: both take longer than a hundred polls."""
-    made: dict[str, str] = request.app.state.__dict__.setdefault("made_once", {})
+async def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> str:
+    """What ``make`` writes, kept with the application. It takes as long as a hundred polls: not in the event loop."""
+    made: dict[str, asyncio.Future[str]] = request.app.state.__dict__.setdefault("made_once", {})
     if make.__name__ not in made:
-        made[make.__name__] = make(source)
-    return made[make.__name__]
+        made[make.__name__] = asyncio.ensure_future(in_thread(make, source))
+    return await asyncio.shield(made[make.__name__])
