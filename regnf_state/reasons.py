@@ -55,6 +55,9 @@ REASONS: dict[str, Reason] = {
     "RATE_LIMITED": Reason(
         429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
     ),
+    "TOO_MANY_REQUESTS_AT_ONCE": Reason(
+        429, "Too many requests at once", "Wait until some of your requests have been answered, then repeat."
+    ),
     "CONFLICT": Reason(409, "Conflict", "Another client changed it at the same time. Read it again, then repeat."),
     "REQUEST_TOO_LARGE": Reason(
         413, "Request too large", "The JSON or a text part exceeds the service's limit of bytes or of values."

@@ -88,6 +88,8 @@ class Settings(BaseSettings):
     """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
     rate_limit_burst: int = Field(default=100, ge=1)
     """Calls that a caller may make at once after a pause."""
+    max_requests_per_caller: int = Field(default=512, ge=1)
+    """Requests of each caller that are in progress in one process; without tokens, of each address."""
     max_uploads_per_caller: int = Field(default=64, ge=2)
     max_streams_per_caller: int = Field(default=100, ge=1)
     quota_active_jobs: int | None = Field(default=None, ge=1)

@@ -19,6 +19,7 @@ from regnf_service.http.middleware import RequestContext, TokenGate
 from regnf_service.http.origin_gate import OriginGate
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
+from regnf_service.http.request_gate import RequestGate
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics
@@ -59,7 +60,7 @@ def create_app(
         redirect_slashes=False,  # the framework's redirects lead to whatever `Host` says
         generate_unique_id_function=lambda route: route.name,
         lifespan=lifespan_of(services, metrics),
-        middleware=_middleware(settings, callers, metrics, limiter),
+        middleware=_middleware(services, callers, metrics, limiter),
     )
     app.state.services = services
     app.state.metrics = metrics
@@ -72,16 +73,19 @@ def create_app(
 
 
 def _middleware(
-    settings: Settings, callers: Callers, metrics: Metrics, limiter: RateLimiter | None
+    services: Services, callers: Callers, metrics: Metrics, limiter: RateLimiter | None
 ) -> list[Middleware]:
     """What every request passes through, outermost first."""
+    settings = services.settings
     gate = Middleware(
         TokenGate,
         callers=callers,
         needs_token=settings.needs_token,
         allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
-    limits = [Middleware(RateGate, limiter=limiter)] if limiter is not None else []
+    limits = [Middleware(RequestGate, slots=services.requests)]
+    if limiter is not None:
+        limits.append(Middleware(RateGate, limiter=limiter))
     hosts = Middleware(OriginGate, hosts=allowed_hosts(settings))
     return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), hosts, gate, *limits]
 

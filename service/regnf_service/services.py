@@ -58,6 +58,11 @@ class Services:
         return Room(self.records, self.blobs, self.redis, self.settings)
 
     @cached_property
+    def requests(self) -> Slots:
+        """Requests that are in progress."""
+        return Slots(self.settings.max_requests_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
+
+    @cached_property
     def uploads(self) -> Slots:
         """Uploads that are under way."""
         return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")

@@ -1,0 +1,122 @@
+"""Clients that ask for more at once than they wait for: refused, so that others come to their turn."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import httpx
+import pytest
+from redis import Redis
+
+from tests.contract.live import Live, eventually, live_service
+from tests.contract.test_slow_clients import ended, submit
+from tests.contract.world import World, assert_refused, make_world
+
+MOST = 8
+TOKENS = frozenset({"alice:the-secret-of-alice", "bob:the-secret-of-bob"})
+ALICE = {"Authorization": "Bearer the-secret-of-alice"}
+BOB = {"Authorization": "Bearer the-secret-of-bob"}
+REQUEST = b"GET /openapi.yaml HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+@pytest.fixture
+def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+    """Makes a service where a caller has one request in progress."""
+    made: list[World] = []
+
+    def make(**settings: object) -> World:
+        made.append(make_world(tmp_path, any_redis, max_requests_per_caller=1, **settings))
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.client.close()
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """A real API where an address has few requests in progress."""
+    folder = tmp_path_factory.mktemp("narrow")
+    limits = {"max_requests_per_caller": MOST, "max_connections": 3 * MOST, "max_connections_per_address": 2 * MOST}
+    with live_service(folder, with_worker=False, **limits) as started:
+        yield started
+
+
+def test_requests_at_once(limited: Callable[..., World]) -> None:
+    world = limited(api_tokens=TOKENS)
+    requests = world.app.state.services.requests
+    with requests.held("alice"):
+        refused = world.client.get("/fields", headers=ALICE)
+        assert_refused(refused, 429, "TOO_MANY_REQUESTS_AT_ONCE")
+        assert (int(refused.headers["retry-after"]) > 0, refused.headers["connection"]) == (True, "close")
+        assert world.client.get("/healthz", headers=ALICE).status_code == 200
+        assert world.client.get("/static/favicon.svg", headers=ALICE).status_code == 200
+        assert_refused(world.client.get("/fields"), 401, "UNAUTHENTICATED")
+        assert world.client.get("/fields", headers=BOB).status_code == 200
+    for path in ("/fields", "/nowhere", "/fields?what=1"):
+        assert world.client.get(path, headers=ALICE).status_code != 429
+    assert requests.taken == 0, "places are given back, by a refused request too"
+
+
+def test_without_tokens_each_address_has_its_own(limited: Callable[..., World]) -> None:
+    world = limited()
+    with world.app.state.services.requests.held("anonymous 127.0.0.1"):
+        assert_refused(world.client.get("/fields"), 429, "TOO_MANY_REQUESTS_AT_ONCE")
+    with world.app.state.services.requests.held("anonymous 127.0.0.2"):
+        assert world.client.get("/fields").status_code == 200
+
+
+def test_held_answers_of_one_address_shut_no_other_out(narrow: Live) -> None:
+    """As many as it may have connections; those beyond the limit are refused and closed, so that there is room."""
+    with narrow.client() as client, ExitStack() as stack:
+        job = submit(client)
+        request = f"GET /jobs/{job}?wait=30 HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        held = []
+        for address in ("127.0.0.2", "127.0.0.3"):
+            for _ in range(2 * MOST):
+                one = stack.enter_context(
+                    socket.create_connection(("127.0.0.1", narrow.port), timeout=20, source_address=(address, 0))
+                )
+                one.sendall(request)
+                held.append(one)
+        with narrow.client() as honest:
+            assert eventually(lambda: answered(honest, f"/jobs/{job}"), "an answer", 10)
+        refused = [text for text in map(at_hand, held) if b"TOO_MANY_REQUESTS_AT_ONCE" in text]
+        assert len(refused) >= MOST
+        client.post(f"/jobs/{job}/cancel")
+
+
+def answered(client: httpx.Client, path: str) -> bool:
+    try:
+        return client.get(path, timeout=5).status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def at_hand(connection: socket.socket) -> bytes:
+    connection.setblocking(False)
+    try:
+        return connection.recv(65536)
+    except OSError:
+        return b""
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_requests_that_do_not_wait_for_answers_are_not_all_answered(narrow: Live, count: int) -> None:
+    with narrow.connect() as connection:
+        connection.sendall(REQUEST * count)
+        text = ended(connection)
+    first, second = text.lower().split(b"http/1.1 200 ")[1:]
+    assert b"connection: close" not in first.partition(b"\r\n\r\n")[0]
+    assert b"connection: close" in second.partition(b"\r\n\r\n")[0]
+
+
+def test_two_requests_at_once_are_answered_and_more_one_by_one(narrow: Live) -> None:
+    with narrow.client() as client, narrow.connect() as connection:
+        for _ in range(5):
+            assert client.get("/version").status_code == 200
+        connection.sendall(REQUEST + REQUEST.replace(b"localhost\r\n", b"localhost\r\nConnection: close\r\n"))
+        assert ended(connection).count(b"HTTP/1.1 200 ") == 2
