@@ -88,7 +88,7 @@ def prepare(live: Live, folder: Path, spare_fields: int) -> dict[str, Any]:
         "jobs": {"ended": [ended, failed], "kept": [ended, failed, jobs[0], jobs[-1]], "spare": jobs[1:]},
         "artifacts": artifacts,
         "detection": pair.detection,
-        "page_tokens": [page["next_page_token"] for page in created] + [encode_token(time.time(), "z")],
+        "page_tokens": [page["next_page_token"] for page in created] + [encode_token((time.time(), "z"))],
     }
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Protocol
 
 from regnf_state.ownership import ANONYMOUS, owner_of
+from regnf_state.pages import Page, Position
 
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
 FieldState = Literal["validating", "ready", "rejected"]
@@ -200,8 +201,8 @@ class RecordStore(Protocol):
         ...
 
     def list_jobs(
-        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
-    ) -> list[JobRecord]:
+        self, status: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[JobRecord]:
         """Newest first, older than ``before`` = (created, id); ``owner`` None: everybody's."""
         ...
 
@@ -284,8 +285,8 @@ class RecordStore(Protocol):
         ...
 
     def list_fields(
-        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
-    ) -> list[FieldRecord]:
+        self, label: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[FieldRecord]:
         """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
         ...
 

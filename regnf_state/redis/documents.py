@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 from uuid import uuid4
@@ -13,6 +13,7 @@ from uuid import uuid4
 from redis import Redis
 from redis.exceptions import ResponseError
 
+from regnf_state.pages import LOOKED_AT, Page, Position
 from regnf_state.record_format import FORMAT, decoded, encoded
 from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
@@ -134,14 +135,41 @@ class RedisDocuments:
             answers = pipeline.execute(raise_on_error=False)
         return [(name, stored_in(answer)) for name, answer in zip(names, answers, strict=True)]
 
-    def _newest_first(self, index: str, kind: Kind[_Record], before: tuple[float, str] | None) -> Iterator[_Record]:
-        """Records listed in the sorted set ``index`` by time of creation, older than ``before`` = (created, name)."""
+    def _page(
+        self, index: str, kind: Kind[_Record], limit: int, before: Position | None, wanted: Callable[[_Record], bool]
+    ) -> Page[_Record]:
+        """The newest ``limit`` of the records in ``index`` that are ``wanted``, older than ``before``.
+
+        Looks at LOOKED_AT records at most: the next page goes on after the last that was looked at.
+        """
+        found: list[_Record] = []
+        last = before
+        for looked_at, (position, record) in enumerate(self._newest_first(index, kind, before), 1):
+            if record is not None and wanted(record):
+                if len(found) == limit:
+                    return Page(found, last)
+                found.append(record)
+            last = position
+            if looked_at == LOOKED_AT:
+                return Page(found, last)
+        return Page(found, None)
+
+    def _newest_first(
+        self, index: str, kind: Kind[_Record], before: Position | None
+    ) -> Iterator[tuple[Position, _Record | None]]:
+        """What the sorted set ``index`` lists by time of creation, older than ``before``.
+
+        A record that is gone or cannot be read is None.
+        """
         highest: float = before[0] if before is not None else math.inf
         seen_at_highest = 0
         while True:
             answer: Any = self._redis.zrevrangebyscore(index, highest, "-inf", seen_at_highest, _PAGE, withscores=True)
             page = [(float(score), text(name)) for name, score in answer]
-            yield from self._read_many(kind, [name for score, name in page if before is None or (score, name) < before])
+            older = [position for position in page if before is None or position < before]
+            read = self._fetch(kind, [name for _, name in older])
+            for position, (name, stored) in zip(older, read, strict=True):
+                yield position, self._readable(kind, name, stored)
             if len(page) < _PAGE:
                 return
             # continue from the last score, not by offset: records created in between would shift the offsets

@@ -10,6 +10,7 @@ from redis import Redis
 
 from regnf_state import transitions
 from regnf_state.ownership import owner_of
+from regnf_state.pages import Page, Position
 from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.documents import Cap, Command, Kind, text
@@ -150,16 +151,10 @@ class RedisFieldRecords(RedisRejections):
         return self._read_each(FIELD, references)
 
     def list_fields(
-        self, label: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
-    ) -> list[FieldRecord]:
-        found: list[FieldRecord] = []
+        self, label: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[FieldRecord]:
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
-        for record in self._newest_first(index, FIELD, before):
-            if label in (None, record.label):
-                found.append(record)
-            if len(found) == limit:
-                break
-        return found
+        return self._page(index, FIELD, limit, before, lambda record: label in (None, record.label))
 
     def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
         return self._change_field(sha256, lambda known, now: transitions.changed_field(known, attempt, changes, now))

@@ -17,6 +17,7 @@ from redis import Redis
 
 from regnf_state import transitions
 from regnf_state.ownership import ANONYMOUS, owner_of
+from regnf_state.pages import Page, Position
 from regnf_state.records import (
     ACTIVE,
     NO_QUOTA,
@@ -211,16 +212,10 @@ class RedisRecordStore(RedisFieldRecords):
         return (gone is not None and text(gone) == owner) or self.owners.was_evicted(owner, job_id)
 
     def list_jobs(
-        self, status: str | None, limit: int, before: tuple[float, str] | None, owner: str | None = None
-    ) -> list[JobRecord]:
-        found: list[JobRecord] = []
+        self, status: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[JobRecord]:
         index = _CREATED if owner is None else f"{_CREATED}:{owner}"
-        for record in self._newest_first(index, JOB, before):
-            if status in (None, record.status):
-                found.append(record)
-            if len(found) == limit:
-                break
-        return found
+        return self._page(index, JOB, limit, before, lambda record: status in (None, record.status))
 
     def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
         return self._change_job(job_id, lambda known, now: transitions.changed_job(known, attempt, changes, now))

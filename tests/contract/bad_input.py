@@ -22,7 +22,7 @@ def nothing_of_an_upload_stays(world: World) -> Iterator[None]:
     """No blob, no record; and the next good upload is taken."""
     yield
     assert world.blobs.blobs == {}
-    assert world.records.list_fields(None, 10, None) == []
+    assert world.records.list_fields(None, 10, None).records == []
     assert world.client.put(PUT_GOOD, content=GOOD).status_code == 201
 
 
@@ -31,7 +31,7 @@ def nothing_of_a_request_stays(world: World) -> Iterator[None]:
     """No job, nothing queued; and the next good request is taken."""
     request = world.valid_request()
     yield
-    assert world.records.list_jobs(None, 10, None) == []
+    assert world.records.list_jobs(None, 10, None).records == []
     assert world.queue.registrations == []
     assert world.client.post("/register", json=request).status_code == 202
 

@@ -126,6 +126,22 @@ def test_lists_go_page_by_page_and_by_label(world: World) -> None:
     assert [field["sha256"] for field in labeled["fields"]] == [known[1]]
 
 
+def test_a_page_may_be_empty_and_not_the_last(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("regnf_state.redis.documents.LOOKED_AT", 2)
+    known = [world.ready_field(name) for name in "abcde"]
+    world.records.update_field(known[0], label="chair")
+    world.submit()
+    pages = [world.client.get("/fields", params={"label": "chair", "limit": 1}).json()]
+    while (token := pages[-1]["next_page_token"]) is not None:
+        params = {"label": "chair", "limit": 1, "page_token": token}
+        pages.append(world.client.get("/fields", params=params).json())
+    assert pages[0]["fields"] == []
+    assert [field["sha256"] for page in pages for field in page["fields"]] == [known[0]]
+    world.submit(seed=1)
+    page = world.client.get("/jobs", params={"status": "failed", "limit": 1}).json()
+    assert (page["jobs"], page["next_page_token"] is not None) == ([], True)
+
+
 def test_delete_leaves_nothing(world: World) -> None:
     world.client.put(f"/fields/{sha256(A)}", content=A)
     assert world.client.delete(f"/fields/{sha256(A)}").status_code == 204

@@ -245,7 +245,7 @@ def test_a_dry_run_starts_nothing(world: World) -> None:
     answer = world.client.post("/register?dry_run=true", json=world.valid_request())
     assert answer.status_code == 200
     assert answer.json()["valid"] is True
-    assert world.records.list_jobs(None, 10, None) == []
+    assert world.records.list_jobs(None, 10, None).records == []
     assert answer.json()["id"] == post(world).json()["id"]
 
 
@@ -305,7 +305,7 @@ def test_one_shot_keeps_nothing_of_a_request_that_is_refused(world: World) -> No
     }
     assert_refused(world.client.post("/register", files=missing), 400, "MISSING_PART")
     assert world.blobs.blobs == {}
-    assert world.records.list_fields(None, 10, None) == []
+    assert world.records.list_fields(None, 10, None).records == []
 
 
 def test_a_one_shot_dry_run_keeps_nothing(world: World) -> None:

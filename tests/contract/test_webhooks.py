@@ -48,7 +48,7 @@ def test_refused(told: World, webhook: Any, reason: str, query: str) -> None:
     answer = told.client.post(f"/register{query}", json=told.valid_request() | {"webhook": webhook})
     problem = assert_refused(answer, 422, reason)
     assert all(entry["pointer"].startswith("/webhook") for entry in problem["errors"])
-    assert told.records.list_jobs(None, 10, None) == []
+    assert told.records.list_jobs(None, 10, None).records == []
 
 
 def test_without_a_secret_of_ones_own_there_is_none(tmp_path: Path, any_redis: Redis) -> None:

@@ -53,7 +53,7 @@ class House:
         """No blob and no temporary file; of a record at most the word that, and why, a file was rejected."""
         assert self.world.blobs.blobs == {}
         assert list(self.scratch.iterdir()) == []
-        assert {field.state for field in self.world.records.list_fields(None, 10, None)} <= {"rejected"}
+        assert {field.state for field in self.world.records.list_fields(None, 10, None).records} <= {"rejected"}
 
     def assert_next_is_taken(self) -> None:
         """The next good upload becomes a field."""

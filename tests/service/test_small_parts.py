@@ -88,7 +88,7 @@ def test_names_of_fields() -> None:
 
 @given(st.floats(0, 1e11), st.text("0123456789abcdef", max_size=64))
 def test_page_tokens_come_back(created: float, name: str) -> None:
-    assert decode_token(encode_token(created, name)) == (created, name)
+    assert decode_token(encode_token((created, name))) == (created, name)
 
 
 def outcome(read: Callable[[Any], Any], value: Any) -> Any:

@@ -67,12 +67,12 @@ def test_a_field_that_was_deleted_counts_its_attempts_on(store: RecordStore) -> 
 def test_fields_are_listed_and_deleted(store: RecordStore) -> None:
     for number, label in enumerate(["chair", "table", "chair"]):
         store.create_field(field(store, str(number) * 64, float(number), label))
-    assert [record.sha256[0] for record in store.list_fields(None, 10, None)] == ["2", "1", "0"]
-    assert [record.sha256[0] for record in store.list_fields("chair", 1, None)] == ["2"]
-    assert [record.sha256[0] for record in store.list_fields("chair", 10, (2.0, "2" * 64))] == ["0"]
+    assert [record.sha256[0] for record in store.list_fields(None, 10, None).records] == ["2", "1", "0"]
+    assert [record.sha256[0] for record in store.list_fields("chair", 1, None).records] == ["2"]
+    assert [record.sha256[0] for record in store.list_fields("chair", 10, (2.0, "2" * 64)).records] == ["0"]
     assert store.delete_field("1" * 64)
     assert not store.delete_field("1" * 64)
-    assert len(store.list_fields(None, 10, None)) == 2
+    assert len(store.list_fields(None, 10, None).records) == 2
     assert store.get_field("1" * 64) is None
     with pytest.raises(StaleAttemptError):
         store.update_field("1" * 64, label="x")
@@ -131,14 +131,14 @@ def test_lists_and_tombstones_are_each_owners_own(store: RecordStore) -> None:
         scene = reference_of(owner, SCENE)
         store.create_field(field(store, scene, created))
         store.create_job(replace(job(store, f"job-of-{owner}", created), request={"scene": scene}), 10)
-    assert [record.sha256 for record in store.list_fields(None, 10, None, "alice")] == [f"{SCENE}_alice"]
-    assert [record.id for record in store.list_jobs(None, 10, None, "bob")] == ["job-of-bob"]
-    assert [record.id for record in store.list_jobs(None, 10, None, "carol")] == []
-    assert len(store.list_fields(None, 10, None)) == len(store.list_jobs(None, 10, None)) == 3
+    assert [record.sha256 for record in store.list_fields(None, 10, None, "alice").records] == [f"{SCENE}_alice"]
+    assert [record.id for record in store.list_jobs(None, 10, None, "bob").records] == ["job-of-bob"]
+    assert [record.id for record in store.list_jobs(None, 10, None, "carol").records] == []
+    assert len(store.list_fields(None, 10, None).records) == len(store.list_jobs(None, 10, None).records) == 3
     store.update_job("job-of-bob", 1, status="failed", error={"reason": "INTERNAL"})
     store.delete_job("job-of-bob")
     store.delete_field(f"{SCENE}_alice")
-    assert store.list_jobs(None, 10, None, "bob") == store.list_fields(None, 10, None, "alice") == []
+    assert store.list_jobs(None, 10, None, "bob").records == store.list_fields(None, 10, None, "alice").records == []
 
 
 def test_an_expired_job_is_so_to_its_owner_alone(redis_url: str) -> None:
@@ -153,7 +153,7 @@ def test_an_expired_job_is_so_to_its_owner_alone(redis_url: str) -> None:
         assert not store.job_expired("j1", "bob")
         assert not store.job_expired("j1")
         assert store.expire_jobs() == ["j1"]
-        assert store.list_jobs(None, 10, None, "alice") == []
+        assert store.list_jobs(None, 10, None, "alice").records == []
         assert not redis.exists("regnf:jobs:created:alice")
 
 

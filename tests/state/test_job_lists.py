@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from redis import Redis
 
+from regnf_state.pages import all_of
 from regnf_state.records import QueueFullError, RecordStore, StaleAttemptError
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
@@ -56,23 +57,53 @@ def test_listing_pages_through_every_job_once(store: RecordStore) -> None:
     for number, created in enumerate(times):
         store.create_job(job(store, f"j{number}", created), 10)
     expected = ["j2", "j4", "j3", "j1", "j0"]
-    assert [record.id for record in store.list_jobs(None, 10, None)] == expected
-    seen: list[str] = []
-    before = None
-    while page := store.list_jobs(None, 2, before):
-        seen += [record.id for record in page]
-        before = (page[-1].created, page[-1].id)
-    assert seen == expected
+    assert [record.id for record in store.list_jobs(None, 10, None).records] == expected
+    assert [record.id for record in all_of(lambda rest: store.list_jobs(None, 2, rest))] == expected
     store.update_job("j4", 1, status="running")
-    assert [record.id for record in store.list_jobs("running", 10, None)] == ["j4"]
-    assert len(store.list_jobs("accepted", 10, None)) == 4
+    assert [record.id for record in store.list_jobs("running", 10, None).records] == ["j4"]
+    assert len(store.list_jobs("accepted", 10, None).records) == 4
 
 
 def test_long_listings_with_equal_times(store: RecordStore) -> None:
     for number in range(230):
         store.create_field(field(store, f"{number:064d}", created=1.0 if number < 215 else float(number)))
-    listed = [record.sha256 for record in store.list_fields(None, 1000, None)]
+    listed = [record.sha256 for record in store.list_fields(None, 1000, None).records]
     assert listed == [f"{number:064d}" for number in reversed(range(230))]
+
+
+@pytest.mark.parametrize("label", ["rare", "never"])
+def test_one_page_looks_at_a_bounded_number_of_records(
+    store: RecordStore, label: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("regnf_state.redis.documents.LOOKED_AT", 20)
+    expected = []
+    for number in range(110):
+        rare = label == "rare" and number % 7 == 0 and not 30 < number < 90
+        record = field(store, f"{number:064d}", created=float(number // 3), label="rare" if rare else "common")
+        store.create_field(record)
+        if rare:
+            expected.insert(0, record.sha256)
+    pages = [store.list_fields(label, 2, None)]
+    while (rest := pages[-1].rest) is not None:
+        pages.append(store.list_fields(label, 2, rest))
+    assert [record.sha256 for page in pages for record in page.records] == expected, "each exactly once"
+    assert any(not page.records for page in pages), "a page may be empty"
+    assert pages[0].rest is not None
+    looked_at = [page.rest for page in pages[:-1]]
+    assert looked_at == sorted(looked_at, reverse=True)
+    assert len(pages) >= 110 / 20, "no page looked further than it may"
+
+
+def test_records_that_cannot_be_read_are_looked_at_too(store: RecordStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("regnf_state.redis.documents.LOOKED_AT", 3)
+    for number in range(9):
+        store.create_job(job(store, f"j{number}", float(number)), 10)
+    for number in range(2, 8):
+        store._redis.hset(f"regnf:job:j{number}", "document", "no record")  # type: ignore[attr-defined]
+    assert [record.id for record in store.list_jobs(None, 10, None).records] == ["j8"]
+    assert [record.id for record in all_of(lambda rest: store.list_jobs(None, 10, rest))] == ["j8", "j1", "j0"]
+    assert store.list_jobs("failed", 1, None).records == []
+    assert store.list_jobs("failed", 1, None).rest is not None
 
 
 # jobs: events
@@ -123,7 +154,7 @@ def test_deleting(store: RecordStore) -> None:
     assert store.delete_job("j1")
     assert store.get_job("j1") is None
     assert store.events("j1", None) == []
-    assert store.list_jobs(None, 10, None) == []
+    assert store.list_jobs(None, 10, None).records == []
     assert not store.job_expired("j1")
     assert store.create_job(job(store), 10)[0].attempt == 1
 
@@ -164,7 +195,7 @@ def _assert_expiry(store: RecordStore, wait) -> None:  # type: ignore[no-untyped
     assert store.job_expired("done")
     assert store.get_job("waiting") is not None
     assert not store.job_expired("waiting")
-    assert [record.id for record in store.list_jobs(None, 10, None)] == ["waiting"]
+    assert [record.id for record in store.list_jobs(None, 10, None).records] == ["waiting"]
 
 
 def test_an_expired_job_can_be_asked_for_again(redis: Redis) -> None:

@@ -49,7 +49,7 @@ def change(redis: Redis, key: str, **members: Any) -> None:
 
 
 def test_every_record_of_the_release_before_is_read(upgraded: World) -> None:
-    states = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None)}
+    states = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None).records}
     assert states == {
         "accepted": "accepted",
         "of-lab": "accepted",
@@ -59,7 +59,7 @@ def test_every_record_of_the_release_before_is_read(upgraded: World) -> None:
         "failed": "failed",
         "dismissed": "dismissed",
     }
-    fields = {field.label: field.state for field in upgraded.records.list_fields(None, 100, None)}
+    fields = {field.label: field.state for field in upgraded.records.list_fields(None, 100, None).records}
     assert fields == {"ready": "ready", "of_lab": "ready", "validating": "validating", "rejected": "rejected"}
     assert len(upgraded.records.events("running", None)) == 3
     manifest = read_manifest(upgraded.blobs, "successful")
@@ -79,11 +79,11 @@ def test_what_the_release_before_began_is_ended(upgraded: World) -> None:
 
 
 def test_the_journal_of_the_release_before_is_read(upgraded: World) -> None:
-    before = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None)}
+    before = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None).records}
     upgraded.redis.flushall()
     upgraded.rebuilder = type(upgraded.rebuilder)(upgraded.records, upgraded.queue, upgraded.blobs)
     upgraded.rebuilder.run_if_needed()
-    after = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None)}
+    after = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None).records}
     assert after == before | {"running": "accepted"}
 
 
@@ -115,7 +115,7 @@ def test_members_that_are_not_known_are_written_back(store: RedisRecordStore, re
     document = json.loads(redis.hget("regnf:job:j1", "document"))  # type: ignore[arg-type]
     assert (document["budget"], document["note"], document["attempt"]) == ({"seconds": 12.5}, None, 3)
     assert redis.hget("regnf:job:j1", "extra") == b"of another release"
-    assert [one.id for one in store.list_jobs(None, 10, None)] == ["j1"]
+    assert [one.id for one in store.list_jobs(None, 10, None).records] == ["j1"]
 
 
 def test_members_that_are_not_known_survive_in_the_journal(world: World) -> None:
@@ -181,7 +181,7 @@ def test_a_damaged_record_is_set_aside_and_the_others_go_on(
     started(store, "j2")
     damage(redis, "regnf:job:j1")
     assert [one.id for one in store.active_jobs()] == ["j2"]
-    assert [one.id for one in store.list_jobs(None, 10, None)] == ["j2"]
+    assert [one.id for one in store.list_jobs(None, 10, None).records] == ["j2"]
     assert [one.record and one.record.id for one in store.news([("j1", None), ("j2", None)])] == [None, "j2"]
     for _ in range(2):
         with pytest.raises(UnreadableRecordError) as caught:
@@ -203,7 +203,7 @@ def test_a_record_of_a_later_format_stays_where_it_is(store: RedisRecordStore, r
             store.get_job("j1")
     with pytest.raises(UnreadableRecordError):
         store.create_job(job(store), 10)
-    assert store.list_jobs(None, 10, None) == []
+    assert store.list_jobs(None, 10, None).records == []
     assert redis.hget("regnf:job:j1", "document") == b"whatever that is"
     assert store.unreadable.total() == 1
 
@@ -227,7 +227,7 @@ def test_a_damaged_field_is_set_aside(store: RedisRecordStore, redis: Redis) -> 
     for name in (SCENE, OBJECT):
         store.create_field(field(store, name))
     redis.hset(f"regnf:field:{SCENE}", "document", "{")
-    assert [one.sha256 for one in store.list_fields(None, 10, None)] == [OBJECT]
+    assert [one.sha256 for one in store.list_fields(None, 10, None).records] == [OBJECT]
     assert [one.sha256 for one in store.validating_fields()] == [OBJECT]
     with pytest.raises(UnreadableRecordError):
         store.get_field(SCENE)

@@ -120,10 +120,10 @@ def service(server: FixtureServer) -> Iterator[RealService]:
 
 def assert_untouched(service: RealService) -> None:
     """The job waits as it did, and there is nothing else."""
-    (job,) = service.records.list_jobs(None, 10, None, ANONYMOUS)
+    (job,) = service.records.list_jobs(None, 10, None, ANONYMOUS).records
     assert isinstance(job, JobRecord)
     assert (job.id, job.status, job.cancel_requested) == (JOB_ID, "accepted", False)
-    assert {field.sha256 for field in service.records.list_fields(None, 10, None, ANONYMOUS)} == {SCENE, OBJECT}
+    assert {field.sha256 for field in service.records.list_fields(None, 10, None, ANONYMOUS).records} == {SCENE, OBJECT}
 
 
 def port_of(service: RealService) -> str:

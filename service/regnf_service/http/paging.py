@@ -1,4 +1,4 @@
-"""Page tokens: where the page before ended. They carry no secret and open nothing, so they need no signature."""
+"""Page tokens: where the look for the page before ended. They carry no secret and open nothing, so none is signed."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ import json
 import math
 
 from regnf_service.problem import Problem
+from regnf_state.pages import Position
+
+NEXT_PAGE = "For the next page's `page_token`; null on the last page. A page before the last may be short or empty."
 
 
-def encode_token(created: float, name: str) -> str:
-    """The token for what is older than this record."""
-    return base64.urlsafe_b64encode(json.dumps([created, name]).encode()).decode().rstrip("=")
+def encode_token(rest: Position | None) -> str | None:
+    """The token for what is older than this position; None when there is no more."""
+    if rest is None:
+        return None
+    return base64.urlsafe_b64encode(json.dumps(rest).encode()).decode().rstrip("=")
 
 
-def decode_token(token: str | None) -> tuple[float, str] | None:
-    """(created, name) from a token. Raises Problem INVALID_PAGE_TOKEN."""
+def decode_token(token: str | None) -> Position | None:
+    """The position from a token. Raises Problem INVALID_PAGE_TOKEN."""
     if token is None:
         return None
     try:

@@ -17,6 +17,7 @@ from redis import Redis
 from regnf_service.upkeep.lease import Term
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.pages import all_of
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
 from regnf_state.room import Room
@@ -143,16 +144,11 @@ class Housekeeper:
         return sorted(zip(uses, idle, strict=True), key=lambda one: (one[0], one[1].sha256))
 
     def _fields(self) -> Iterator[FieldRecord]:
-        before = None
-        while page := self._records.list_fields(None, _PAGE, before):
-            yield from page
-            before = page[-1].created, page[-1].sha256
+        return all_of(lambda before: self._records.list_fields(None, _PAGE, before))
 
     def _finished_jobs(self) -> Iterator[JobRecord]:
-        before = None
-        while page := self._records.list_jobs(None, _PAGE, before):
-            yield from (job for job in page if job.status not in ACTIVE)
-            before = page[-1].created, page[-1].id
+        jobs = all_of(lambda before: self._records.list_jobs(None, _PAGE, before))
+        return (job for job in jobs if job.status not in ACTIVE)
 
     def _drop_field(self, term: Term, field: FieldRecord) -> bool:
         """Delete a field unless a job has asked for it in between."""

@@ -107,12 +107,10 @@ async def list_fields(
     page_token: PageTokenQuery = None,
     label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
 ) -> JSONResponse:
-    before = decode_token(page_token)
-    # one more than asked for tells whether there is a next page
-    found = await in_thread(services.records.list_fields, label, limit + 1, before, caller)
-    page = found[:limit]
-    more = encode_token(page[-1].created, page[-1].sha256) if len(found) > limit else None
-    return JSONResponse({"fields": [field_document(record, prefix) for record in page], "next_page_token": more})
+    """A page may be short or empty and not be the last: go on while there is a `next_page_token`."""
+    page = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
+    documents = [field_document(record, prefix) for record in page.records]
+    return JSONResponse({"fields": documents, "next_page_token": encode_token(page.rest)})
 
 
 @router.delete(

@@ -88,12 +88,13 @@ def list_jobs(
     page_token: PageTokenQuery = None,
     status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
 ) -> JSONResponse:
-    """`queue_position` is left out here: ask for the job itself."""
-    found = services.records.list_jobs(status, limit + 1, decode_token(page_token), caller)
-    page = found[:limit]
-    more = encode_token(page[-1].created, page[-1].id) if len(found) > limit else None
-    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page]
-    return JSONResponse({"jobs": documents, "next_page_token": more})
+    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+
+    `queue_position` is left out here: ask for the job itself.
+    """
+    page = services.records.list_jobs(status, limit, decode_token(page_token), caller)
+    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page.records]
+    return JSONResponse({"jobs": documents, "next_page_token": encode_token(page.rest)})
 
 
 @router.get(

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
@@ -35,7 +36,7 @@ class FieldPage(Outgoing):
     """Fields, newest first."""
 
     fields: list[FieldDocument]
-    next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
+    next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
 def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:

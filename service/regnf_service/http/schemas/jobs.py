@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
 from regnf_state.records import ACTIVE, JobRecord
@@ -66,7 +67,7 @@ class JobPage(Outgoing):
     """Jobs, newest first."""
 
     jobs: list[JobDocument]
-    next_page_token: str | None = Field(None, description="For the next page's `page_token`; null on the last page.")
+    next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
 def job_document(
