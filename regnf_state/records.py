@@ -263,7 +263,10 @@ class RecordStore(Protocol):
         ...
 
     def stored(self, owner: str) -> tuple[int, int]:
-        """How many fields that were not rejected an owner has, and the bytes of their uploads."""
+        """How many fields that were not rejected an owner has, and the bytes that are kept of them.
+
+        Of a ready field these are the bytes of its upload or of what the import made, whichever are more.
+        """
         ...
 
     def importing(self, owner: str) -> int:

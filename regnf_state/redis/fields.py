@@ -34,8 +34,17 @@ def _created_keys(reference: str) -> tuple[str, str]:
 
 
 def _stored_key(owner: str) -> str:
-    """The bytes of an owner's uploads by their fields, as long as these are not rejected."""
+    """What is kept of an owner, in bytes, by its fields, as long as these are not rejected."""
     return f"{PREFIX}owner:{owner}:stored"
+
+
+def _kept_bytes(record: FieldRecord) -> int:
+    """What counts towards the quota: of a ready field, its upload or what the import made of it, whichever is larger.
+
+    A compressed upload may become a field a thousand times as large.
+    """
+    made = record.report.get("field_bytes") if record.state == "ready" else None
+    return max(record.bytes, made) if isinstance(made, int) else record.bytes
 
 
 def _rejected_key(owner: str) -> str:
@@ -86,7 +95,7 @@ class RedisFieldRecords(RedisRejections):
             indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
             indexes.append(("ZREM", rejected, record.sha256))
-            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.bytes)))
+            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(_kept_bytes(record))))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:

@@ -126,6 +126,18 @@ def test_stored_bytes(limited: Callable[..., World]) -> None:
     assert put(world.client, "c", 1500).status_code == 201, "the bytes of a rejected field were dropped"
 
 
+def test_a_field_that_grew_counts_as_what_it_became(limited: Callable[..., World]) -> None:
+    world = limited(quota_stored_bytes=2000)
+    assert put(world.client, "a").status_code == 201
+    name = sha256(field_bytes("a"))
+    world.records.update_field(name, attempt=1, state="ready", report={"field_bytes": 1 << 31})
+    assert world.client.get(f"/fields/{name}").json()["state"] == "ready", "it stays"
+    assert_refused(put(world.client, "b"), 403, "QUOTA_STORED_BYTES")
+    assert_refused(world.client.post("/fields", content=field_bytes("b")), 403, "QUOTA_STORED_BYTES")
+    assert world.client.delete(f"/fields/{name}").status_code == 204
+    assert put(world.client, "b").status_code == 201
+
+
 # at once
 
 

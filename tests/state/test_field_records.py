@@ -183,6 +183,27 @@ def test_an_owner_has_no_more_than_its_quota(store: RecordStore) -> None:
     assert store.stored("anonymous") == (0, 0)
 
 
+def test_what_an_import_made_counts_towards_the_quota(store: RecordStore) -> None:
+    quota = Quota(stored_bytes=100)
+    large, small, other = (reference_of("alice", digit * 64) for digit in "123")
+    store.create_field(replace(field(store, large), bytes=10), quota)
+    store.create_field(replace(field(store, small), bytes=20), quota)
+    assert store.stored("alice") == (2, 30), "nothing is made yet"
+    store.update_field(small, attempt=1, state="ready", report={"field_bytes": 5})
+    store.update_field(large, attempt=1, state="ready", report={"field_bytes": 81})
+    assert store.stored("alice") == (2, 101), "the one that went over stays"
+    with pytest.raises(QuotaError, match="QUOTA_STORED_BYTES"):
+        store.create_field(replace(field(store, other), bytes=1), quota)
+    store.update_field(large, label="hall")
+    assert store.stored("alice") == (2, 101)
+    lost = store.get_field(large)
+    assert lost is not None
+    store.delete_field(large)
+    assert store.stored("alice") == (1, 20)
+    assert store.restore_field(lost)
+    assert store.stored("alice") == (2, 101)
+
+
 def test_several_fields_come_in_the_order_asked_for(store: RecordStore) -> None:
     store.create_field(field(store, SCENE))
     store.create_field(field(store, OBJECT))
