@@ -53,7 +53,7 @@ class BoundedParser(h11.Connection):
             raise
         return event
 
-    def send(self, event: Any) -> bytes | None:
+    def send(self, event: Any) -> Any:
         """As the base class. The answer that goes beyond what may be pipelined says that it is the last."""
         if isinstance(event, h11.Response) and self.is_paused:
             self._pipelined += 1
