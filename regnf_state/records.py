@@ -149,6 +149,15 @@ class FieldRecord:
         """The caller whose field it is."""
         return owner_of(self.sha256)
 
+    @property
+    def kept_bytes(self) -> int:
+        """What counts towards the quota: of a ready field, its upload or what the import made of it, if that is larger.
+
+        A compressed upload may become a field a thousand times as large.
+        """
+        made = self.report.get("field_bytes") if self.state == "ready" else None
+        return max(self.bytes, made) if isinstance(made, int) else self.bytes
+
 
 @dataclass(frozen=True)
 class JobEvent:

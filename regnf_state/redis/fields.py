@@ -38,15 +38,6 @@ def _stored_key(owner: str) -> str:
     return f"{PREFIX}owner:{owner}:stored"
 
 
-def _kept_bytes(record: FieldRecord) -> int:
-    """What counts towards the quota: of a ready field, its upload or what the import made of it, whichever is larger.
-
-    A compressed upload may become a field a thousand times as large.
-    """
-    made = record.report.get("field_bytes") if record.state == "ready" else None
-    return max(record.bytes, made) if isinstance(made, int) else record.bytes
-
-
 def _rejected_key(owner: str) -> str:
     """An owner's rejected fields, by time."""
     return f"{PREFIX}owner:{owner}:rejected"
@@ -95,7 +86,7 @@ class RedisFieldRecords(RedisRejections):
             indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
             indexes.append(("ZREM", rejected, record.sha256))
-            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(_kept_bytes(record))))
+            indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.kept_bytes)))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:

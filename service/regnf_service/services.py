@@ -10,6 +10,7 @@ from anyio import CapacityLimiter
 from redis import Redis
 
 from regnf_service.concurrency import Slots, Waiters
+from regnf_service.fields.under_way import UnderWay
 from regnf_service.job_watch import JobWatch
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore
@@ -66,6 +67,11 @@ class Services:
     def uploads(self) -> Slots:
         """Uploads that are under way."""
         return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")
+
+    @cached_property
+    def under_way(self) -> UnderWay:
+        """The bytes of these uploads."""
+        return UnderWay()
 
     @cached_property
     def streams(self) -> Slots:

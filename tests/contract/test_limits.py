@@ -12,6 +12,7 @@ from redis import Redis
 
 from regnf_service.app import create_app
 from regnf_service.http.rate_limits import RedisRateLimiter
+from regnf_service.problem import Problem
 from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
@@ -136,6 +137,41 @@ def test_a_field_that_grew_counts_as_what_it_became(limited: Callable[..., World
     assert_refused(world.client.post("/fields", content=field_bytes("b")), 403, "QUOTA_STORED_BYTES")
     assert world.client.delete(f"/fields/{name}").status_code == 204
     assert put(world.client, "b").status_code == 201
+
+
+def test_bytes_under_way_count_too(limited: Callable[..., World]) -> None:
+    world = limited(quota_stored_bytes=3000, api_tokens=TOKENS)
+    services = world.app.state.services
+    alice, data = ALICE | {"Content-Type": "application/octet-stream"}, field_bytes("c", 1001)
+    files = {"scene": ("s", field_bytes("s", 601)), "object": ("o", field_bytes("o")), "request": (None, "{}")}
+    assert put(world.client, "a", 1000, **ALICE).status_code == 201
+    with services.under_way.claim("alice", 2000, 500) as claim:
+        claim.arrive(800)
+        assert put(world.client, "b", 1200, **ALICE).status_code == 201, "its own bytes count once"
+        world.client.delete(f"/fields/{sha256(field_bytes('b', 1200))}", headers=ALICE)
+        assert_refused(put(world.client, "b", 1201, **ALICE), 403, "QUOTA_STORED_BYTES")
+        assert put(world.client, "a", 1000, **ALICE).status_code == 200, (
+            "bytes that are held are no more when sent again"
+        )
+        claim.arrive(200)
+        in_pieces = world.client.post("/fields", content=iter([data[:600], data[600:]]), headers=alice)
+        assert_refused(in_pieces, 403, "QUOTA_STORED_BYTES")
+        assert_refused(world.client.post("/fields", files={"file": data}, headers=ALICE), 403, "QUOTA_STORED_BYTES")
+        assert_refused(world.client.post("/register", files=files, headers=ALICE), 403, "QUOTA_STORED_BYTES")
+        assert put(world.client, "b", 3000, **BOB).status_code == 201, "another caller's uploads are its own"
+        with pytest.raises(Problem, match="Quota of bytes"):
+            claim.arrive(1001)
+    assert put(world.client, "b", 2000, **ALICE).status_code == 201
+    with services.under_way.claim("alice", 0, 0):
+        pass
+    with services.under_way.claim("alice", 1, 1), pytest.raises(Problem, match="Quota of bytes"):
+        services.under_way.claim("alice", 1, 1).__enter__()
+
+
+def test_without_a_quota_uploads_under_way_are_not_bounded(limited: Callable[..., World]) -> None:
+    world = limited(api_tokens=TOKENS)
+    with world.app.state.services.under_way.claim("alice", None, 1 << 50):
+        assert put(world.client, "a", **ALICE).status_code == 201
 
 
 # at once

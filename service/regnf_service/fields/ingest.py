@@ -21,20 +21,30 @@ def function_of(description: UploadDescription) -> dict[str, Any]:
     return {name: value for name, value in description.non_default().items() if name != "label"}
 
 
-def check_room(services: Services, caller: str, sha256: str, size: int | None) -> None:
-    """Refuse an upload of ``size`` bytes before it comes if the caller has no room for it. Raises Problem."""
+def check_room(services: Services, caller: str, sha256: str) -> int | None:
+    """Refuse an upload before it comes if the caller has no room for one more field. Raises Problem.
+
+    Returns the room for its bytes, as ``room_for_bytes``.
+    """
     known = _known(services, reference_of(caller, sha256))
     if known is not None and known.state != "rejected":
-        return
+        return room_for_bytes(services, caller, known)
     check_workers(services, caller, CLOSE)
-    quota = services.quota
-    if size is None or (quota.fields is None and quota.stored_bytes is None):
-        return
-    count, stored = services.records.stored(caller)
-    if quota.fields is not None and count >= quota.fields:
+    most = services.quota.fields
+    if most is not None and services.records.stored(caller)[0] >= most:
         raise Problem("QUOTA_FIELDS", headers=CLOSE)
-    if quota.stored_bytes is not None and stored + size > quota.stored_bytes:
-        raise Problem("QUOTA_STORED_BYTES", headers=CLOSE)
+    return room_for_bytes(services, caller)
+
+
+def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = None) -> int | None:
+    """How many bytes the caller may have under way: its quota less what it has stored. None: any number.
+
+    A field that is sent ``again`` takes no more than it has.
+    """
+    most = services.quota.stored_bytes
+    if most is None:
+        return None
+    return most - services.records.stored(caller)[1] + (0 if again is None else again.kept_bytes)
 
 
 def _known(services: Services, reference: str) -> FieldRecord | None:

@@ -16,6 +16,7 @@ import anyio
 from anyio import CapacityLimiter, to_thread
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
+from regnf_service.fields.under_way import Claim
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
@@ -35,19 +36,24 @@ class Received:
 class Upload:
     """Takes an upload's bytes in order. Use ``open_upload``; ``commit`` gives the bytes their name."""
 
-    def __init__(self, writer: BlobWriter, limit: int, limiter: CapacityLimiter) -> None:
+    def __init__(self, writer: BlobWriter, limit: int, limiter: CapacityLimiter, claim: Claim) -> None:
         self._writer = writer
         self._limit = limit
         self._limiter = limiter
+        self._claim = claim
         self._hash = hashlib.sha256()
         self._bytes = 0
         self._pending = bytearray()
         self._recognized = False
 
     async def feed(self, data: bytes | bytearray) -> None:
-        """Take the next bytes. Raises Problem UPLOAD_TOO_LARGE, FIELD_NOT_RECOGNIZED as soon as the bytes show it."""
+        """Take the next bytes.
+
+        Raises Problem UPLOAD_TOO_LARGE, QUOTA_STORED_BYTES, FIELD_NOT_RECOGNIZED as soon as the bytes show it.
+        """
         if self._bytes + len(self._pending) + len(data) > self._limit:
             raise Problem("UPLOAD_TOO_LARGE", f"At most {self._limit} bytes are taken.", headers=CLOSE)
+        self._claim.arrive(len(data))
         self._pending += data
         if not self._recognized and len(self._pending) >= HEAD_BYTES:
             self._recognize()
@@ -66,6 +72,7 @@ class Upload:
     async def commit(self, key: str) -> None:
         """Name the bytes, whole and at once."""
         await self._in_thread(lambda: self._writer.commit(key))
+        self._claim.end()
 
     def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
@@ -88,20 +95,21 @@ class Upload:
 
 
 @asynccontextmanager
-async def open_upload(services: Services, caller: str) -> AsyncIterator[Upload]:
+async def open_upload(services: Services, caller: str, claim: Claim) -> AsyncIterator[Upload]:
     """A new upload of a caller into the blob store, within the settings' limits. Raises Problem TOO_MANY_UPLOADS."""
     with services.uploads.held(caller):
-        async with _writing(services.blobs, services.settings.max_upload_bytes, services.upload_limiter) as upload:
+        limit, limiter = services.settings.max_upload_bytes, services.upload_limiter
+        async with _writing(services.blobs, limit, limiter, claim) as upload:
             yield upload
 
 
 @asynccontextmanager
-async def _writing(blobs: BlobStore, limit: int, limiter: CapacityLimiter) -> AsyncIterator[Upload]:
+async def _writing(blobs: BlobStore, limit: int, limiter: CapacityLimiter, claim: Claim) -> AsyncIterator[Upload]:
     """An upload of at most ``limit`` bytes; ``limiter`` caps the threads that all uploads together may hold."""
     writer = blobs.writer()
     opened = await to_thread.run_sync(writer.__enter__, limiter=limiter)
     try:
-        yield Upload(opened, limit, limiter)
+        yield Upload(opened, limit, limiter, claim)
     finally:
         # also when the request is cancelled: what was written must go
         with anyio.CancelScope(shield=True):

@@ -12,14 +12,14 @@ from regnf_service.problem import CLOSE, Problem
 from regnf_state.settings import Settings
 
 
-def declared_length(request: Request) -> int | None:
-    """The Content-Length, None for a chunked body. Raises Problem INVALID_HEADER."""
+def declared_length(request: Request, besides: int = 0) -> int | None:
+    """The Content-Length less what may come ``besides`` files, None for a chunked body. Raises INVALID_HEADER."""
     text = request.headers.get("content-length")
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and len(text) <= 19):
         raise Problem("INVALID_HEADER", "Content-Length is not a number of bytes.", headers=CLOSE)
-    return int(text)
+    return max(0, int(text) - besides)
 
 
 def refuse_encoding(request: Request) -> None:

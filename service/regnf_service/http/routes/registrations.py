@@ -11,7 +11,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import store_upload
+from regnf_service.fields.ingest import room_for_bytes, store_upload
 from regnf_service.fields.uploads import open_upload
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
@@ -179,9 +179,15 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     """Both files and the request in one body. Nothing is kept before all of it has arrived and been checked."""
     body.refuse_encoding(request)
     settings = services.settings
-    limit = 2 * settings.max_upload_bytes + 2 * settings.max_request_bytes
+    besides = 2 * settings.max_request_bytes
+    limit = 2 * settings.max_upload_bytes + besides
+    declared = body.declared_length(request, besides)
+    room = await in_thread(room_for_bytes, services, caller)
     async with AsyncExitStack() as stack:
-        files = {name: await stack.enter_async_context(open_upload(services, caller)) for name in ("scene", "object")}
+        claim = stack.enter_context(services.under_way.claim(caller, room, declared))
+        files = {
+            name: await stack.enter_async_context(open_upload(services, caller, claim)) for name in ("scene", "object")
+        }
         data = body.chunks(request, limit, settings)
         texts = {"request": settings.max_request_bytes}
         parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)

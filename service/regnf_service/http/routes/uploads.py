@@ -12,7 +12,7 @@ from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import StoredUpload, check_room, store_upload
+from regnf_service.fields.ingest import StoredUpload, check_room, room_for_bytes, store_upload
 from regnf_service.fields.uploads import Received, Upload, open_upload
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
@@ -83,12 +83,14 @@ async def put_field(
     if body.media_type(request).startswith("multipart/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
     digest = announced_digest(content_digest)
-    await in_thread(check_room, services, caller, sha256, body.declared_length(request))
-    async with open_upload(services, caller) as upload:
-        received = await _receive_raw(request, services, upload)
-        if received.sha256 != sha256 or digest not in (None, received.sha256):
-            raise Problem("DIGEST_MISMATCH")
-        taken = await store_upload(services, caller, upload, received)
+    declared = body.declared_length(request)
+    room = await in_thread(check_room, services, caller, sha256)
+    with services.under_way.claim(caller, room, declared) as claim:
+        async with open_upload(services, caller, claim) as upload:
+            received = await _receive_raw(request, services, upload)
+            if received.sha256 != sha256 or digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+            taken = await store_upload(services, caller, upload, received)
     return _answer(taken, prefix)
 
 
@@ -123,14 +125,18 @@ async def post_field(
     if body.media_type(request).startswith("text/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
     digest = announced_digest(content_digest)
-    async with open_upload(services, caller) as upload:
-        if body.media_type(request) == "multipart/form-data":
-            received, description = await _receive_parts(request, services, upload, digest)
-        else:
-            received, description = await _receive_raw(request, services, upload), None
-            if digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
-        taken = await store_upload(services, caller, upload, received, description)
+    in_parts = body.media_type(request) == "multipart/form-data"
+    declared = body.declared_length(request, besides=2 * DESCRIPTION_BYTES if in_parts else 0)
+    room = await in_thread(room_for_bytes, services, caller)
+    with services.under_way.claim(caller, room, declared) as claim:
+        async with open_upload(services, caller, claim) as upload:
+            if in_parts:
+                received, description = await _receive_parts(request, services, upload, digest)
+            else:
+                received, description = await _receive_raw(request, services, upload), None
+                if digest not in (None, received.sha256):
+                    raise Problem("DIGEST_MISMATCH")
+            taken = await store_upload(services, caller, upload, received, description)
     return _answer(taken, prefix)
 
 
