@@ -9,8 +9,8 @@ from functools import cached_property
 from anyio import CapacityLimiter
 from redis import Redis
 
+from regnf_service.bytes_under_way import UnderWay
 from regnf_service.concurrency import Slots, Waiters
-from regnf_service.fields.under_way import UnderWay
 from regnf_service.job_watch import JobWatch
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore

@@ -16,7 +16,7 @@ import anyio
 from anyio import CapacityLimiter, to_thread
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-from regnf_service.fields.under_way import Claim
+from regnf_service.bytes_under_way import Claim
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
