@@ -61,13 +61,14 @@ def choose_reading(converted: ConvertedField) -> ConvertedField:
 
 
 def _misfit(reading: Reading) -> float:
-    description = parse_description(reading.description)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # the map of the upload; only read
-        tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
     try:
+        description = parse_description(reading.description)
+        with warnings.catch_warnings():
+            # the map of the upload is only read
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
+            tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
         measured, _ = check_plausibility(build_field(description, tensors), TRIAL_SAMPLES)
-    except FieldFormatError:  # no surface, or numbers that are not finite
+    except FieldFormatError:  # a layout beyond what a field may have, no surface, or numbers that are not finite
         return math.inf
     norms = [measured[f"gradient_{quantile}"] for quantile in ("p10", "median", "p90")]
     return sum(abs(norm - 1.0) for norm in norms) / len(norms)

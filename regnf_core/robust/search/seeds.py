@@ -13,7 +13,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
 
-_POINTS_AT_ONCE = 1 << 22
+_POINTS_AT_ONCE = 4 * 2**20
 """Turned points: bounds memory, at about 200 MB. The default options stay far below."""
 
 
