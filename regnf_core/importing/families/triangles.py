@@ -8,12 +8,12 @@ import igl
 import numpy as np
 import numpy.typing as npt
 
+from regnf_core.importing.cost.budget import require_within
+from regnf_core.importing.cost.mesh_work import mesh_seconds
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.importing.work.budget import require_within
-from regnf_core.importing.work.mesh_work import mesh_seconds
 
 _MARGIN = 0.05
 """How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""

@@ -13,9 +13,9 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
+from regnf_core.importing.cost.calls import TRIAL_SAMPLES
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.plausibility import check_plausibility
-from regnf_core.importing.work.calls import TRIAL_SAMPLES
 from regnf_core.schema.parsing import parse_description
 
 _CLEARLY_BETTER = 0.05

@@ -49,7 +49,7 @@ def convert_file(
 
     Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
-    from regnf_core.importing.gate.work_estimate import require_affordable
+    from regnf_core.importing.gate.cost_estimate import require_affordable
     from regnf_core.schema.safe_format import write_safe_field
 
     converted = _convert(upload, description, limits)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
-from regnf_core.importing.work.calls import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
+from regnf_core.importing.cost.calls import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
 from regnf_core.surface.projection import newton_step
 
 _SAME = 1e-3

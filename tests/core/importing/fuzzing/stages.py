@@ -13,8 +13,8 @@ from regnf_core.importing.containers.container import read_archive
 from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
+from regnf_core.importing.gate.cost_estimate import require_affordable
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.gate.work_estimate import require_affordable
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription

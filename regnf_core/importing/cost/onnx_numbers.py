@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from regnf_core.importing.work.onnx_values import MAX_KNOWN, Array, Value, known, needed
+from regnf_core.importing.cost.onnx_values import MAX_KNOWN, Array, Value, known, needed
 
 _CAST: dict[int, Any] = {1: np.float32, 10: np.float32, 11: np.float32, 16: np.float32, 9: np.bool_}
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from regnf_core.importing.work.onnx_numbers import range_length, range_of
-from regnf_core.importing.work.onnx_values import (
+from regnf_core.importing.cost.onnx_numbers import range_length, range_of
+from regnf_core.importing.cost.onnx_values import (
     Attributes,
     Inputs,
     Rule,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.work.calls import Calls
+from regnf_core.importing.cost.calls import Calls
 
 _LOOK_S, _STEP_S, _BUILD_S = 3e-7, 2e-6, 4e-6
 """Seconds: a triangle that is looked at, a level of the hierarchy, a triangle's place in it."""

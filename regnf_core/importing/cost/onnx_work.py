@@ -9,10 +9,10 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.work.calls import GRADIENT, Calls
-from regnf_core.importing.work.onnx_numbers import computed
-from regnf_core.importing.work.onnx_shapes import RULES
-from regnf_core.importing.work.onnx_values import Inputs, Value, known, needed
+from regnf_core.importing.cost.calls import GRADIENT, Calls
+from regnf_core.importing.cost.onnx_numbers import computed
+from regnf_core.importing.cost.onnx_shapes import RULES
+from regnf_core.importing.cost.onnx_values import Inputs, Value, known, needed
 from regnf_core.schema.kinds.onnx import NodeDescription, OnnxDescription
 
 _FAULTS = (ArithmeticError, IndexError, KeyError, TypeError, ValueError)

@@ -6,8 +6,8 @@ ValueError, IndexError, KeyError or TypeError where the graph contradicts itself
 
 from __future__ import annotations
 
-from regnf_core.importing.work.onnx_shaping import SHAPING_RULES
-from regnf_core.importing.work.onnx_values import (
+from regnf_core.importing.cost.onnx_shaping import SHAPING_RULES
+from regnf_core.importing.cost.onnx_values import (
     Attributes,
     Inputs,
     Kind,

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.cost.budget import require_within
+from regnf_core.importing.cost.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
+from regnf_core.importing.cost.mesh_work import mesh_work
+from regnf_core.importing.cost.network_work import network_work
+from regnf_core.importing.cost.onnx_work import onnx_work
 from regnf_core.importing.families.converted import ConvertedField, Reading
-from regnf_core.importing.work.budget import require_within
-from regnf_core.importing.work.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
-from regnf_core.importing.work.mesh_work import mesh_work
-from regnf_core.importing.work.network_work import network_work
-from regnf_core.importing.work.onnx_work import onnx_work
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.mesh import MeshDescription
 from regnf_core.schema.kinds.onnx import OnnxDescription

@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 import trimesh
 
+from regnf_core.importing.cost.calls import SAMPLES, calls_of_check
+from regnf_core.importing.cost.mesh_work import mesh_seconds, mesh_work
 from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import ImportLimits
-from regnf_core.importing.work.calls import SAMPLES, calls_of_check
-from regnf_core.importing.work.mesh_work import mesh_seconds, mesh_work
 from tests.core.importing.archives import assert_refused, saved
 
 RANDOM = np.random.default_rng(0)

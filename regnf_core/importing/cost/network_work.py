@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.work.calls import GRADIENT, Calls
+from regnf_core.importing.cost.calls import GRADIENT, Calls
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
