@@ -6,11 +6,13 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
+import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
-from pydantic import AfterValidator, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.labels import LABEL_PATTERN
+from regnf_core.schema.hash_grid_config import MAX_GROWTH
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
@@ -28,6 +30,19 @@ def _whole_sign(sign: int) -> int:
     return sign
 
 
+def _similarity(rows: list[list[float]]) -> list[list[float]]:
+    matrix = np.array(rows)
+    linear = matrix[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    if not scale > 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2):
+        raise ValueError("is not a rotation times one positive factor")
+    if (matrix[3] != (0.0, 0.0, 0.0, 1.0)).any():
+        raise ValueError("its last row is not 0 0 0 1")
+    return rows
+
+
+_Row = Annotated[list[FiniteFloat], Len(4, 4)]
+_Similarity = Annotated[list[_Row], Len(4, 4), AfterValidator(_similarity)]
 _Box = Annotated[list[_Corner], Len(2, 2), AfterValidator(_sound_box)]
 
 
@@ -37,10 +52,26 @@ class GridDescription:
 
     __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
 
+    levels: Annotated[int, Ge(1), Le(32)] | None = None
     features_per_level: Annotated[int, Ge(1), Le(32)] | None = None
+    log2_table_size: Annotated[int, Ge(3), Le(24)] | None = None
     base_resolution: Annotated[int, Ge(2), Le(1024)] | None = None
     top_resolution: Annotated[int, Ge(2), Le(1 << 20)] | None = None
+    per_level_scale: Annotated[float, Ge(1), Le(MAX_GROWTH)] | None = None
+    """Ratio of the resolutions of neighboring levels."""
     interpolation: Literal["linear", "smoothstep"] | None = None
+
+
+@dataclass(frozen=True)
+class EncodingDescription:
+    """What the widths alone may leave open about the sines and cosines of the position."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    degree: Annotated[int, Ge(0), Le(24)] | None = None
+    """Number of frequencies."""
+    two_pi: bool | None = None
+    """Whether the sines' argument is multiplied by 2 pi."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +101,39 @@ class UploadDescription:
     """The factor of the coordinates before the network sees them, where no file has it."""
     output_scale: Annotated[float, Ge(1e-6), Le(1e6)] | None = None
     """The factor of the network's results, where no file has it."""
+    output_bias: Annotated[float, Ge(-1e6), Le(1e6)] | None = None
+    """Added to the network's result, in the checkpoint's unit."""
+    output_column: Annotated[int, Ge(0), Lt(1 << 16)] | None = None
+    """Which column of the last layer's result is the distance, counted from 0."""
+    output_tanh: Annotated[int, Ge(0), Le(2)] | None = None
+    """How often tanh is applied to the last layer's result."""
+    activation: Literal["relu", "softplus", "sine", "tanh", "elu", "gelu", "silu", "leaky_relu"] | None = None
+    """The function between the network's layers."""
+    activation_scale: Annotated[float, Gt(0), Le(1e6)] | None = None
+    """Softplus's beta, the sine's omega, or leaky_relu's slope for negative numbers."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
     """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
+    frame: Literal["dataset", "field"] | None = None
+    """field (the default): coordinates as the network sees them. dataset: those of the dataset, by the transform and
+    the scale that the trainer applied to it, which must be known from its settings or ``dataset_transform``."""
+    dataset_transform: _Similarity | None = None
+    """4 x 4 matrix of a similarity, row by row: takes points of the field's frame to the dataset's."""
+    as_: Annotated[Literal["scene", "object"] | None, Field(alias="as")] = None
+    """scene: a surface seen from within, as a room's. object: a thing seen from around it."""
+    accept_implausible: bool | None = None
+    """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None
+    use_grid: bool | None = None
+    """False: the network has a hash grid's columns, but was trained without it."""
     hash: GridDescription = field(default_factory=GridDescription)
+    positional_encoding: EncodingDescription = field(default_factory=EncodingDescription)
 
     def non_default(self) -> dict[str, Any]:
         """The entries that say something, as plain (JSON) values."""
         values = asdict(self)
-        values["hash"] = {name: value for name, value in values["hash"].items() if value is not None}
+        for name in ("hash", "positional_encoding"):
+            values[name] = {part: value for part, value in values[name].items() if value is not None}
+        values["as"] = values.pop("as_")
         return {name: value for name, value in values.items() if value not in (None, {})}
 
     @classmethod

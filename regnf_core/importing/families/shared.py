@@ -9,7 +9,9 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.upload_description import UploadDescription
 
 UNIT_CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-_SHARED = frozenset({"family", "bounds", "world_scale", "sign", "up_axis", "label"})
+_SHARED = frozenset(
+    {"family", "bounds", "world_scale", "sign", "up_axis", "label", "frame", "dataset_transform", "accept_implausible"}
+)
 """Entries that mean something for every family."""
 
 
@@ -47,3 +49,9 @@ def require_family(overrides: UploadDescription, family: str) -> None:
     if overrides.family not in (None, family):
         message = f"the file is {family}, the description says {overrides.family}"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+
+
+def contradiction(name: str, said: object, found: object) -> FieldFormatError:
+    """The error for an entry of the settings or the description that the tensors exclude: both values, by name."""
+    message = f"{name}: the settings or the description say {said}, the tensors have {found}"
+    return FieldFormatError(message, reason="SETTINGS_CONTRADICT_TENSORS")
