@@ -5,8 +5,9 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import httpx
 import pytest
@@ -133,6 +134,47 @@ def test_state_survives_a_restart(tmp_path: Path) -> None:
     finally:
         second.end()
     eventually(lambda: first.all_gone() and second.all_gone(), "the end of every process", DEADLINE_S)
+
+
+def upload(address: str, content: bytes) -> str:
+    answer = httpx.post(f"{address}/fields", content=b"PK\x03\x04" + content)
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["sha256"])
+
+
+def test_whoever_waits_is_answered_before_the_end(tmp_path: Path) -> None:
+    """Without a worker there is no news: the stop alone ends what is waited for, in order."""
+    service = start(tmp_path / "state", "--workers", "0")
+    try:
+        scene, object_ = (upload(service.address, name) for name in (b"scene", b"object"))
+        asked = {"scene": scene, "object": object_, "detection": {"min": [0, 0, 0], "max": [1, 1, 1]}}
+        job = httpx.post(f"{service.address}/register", json=asked).json()["id"]
+        with ExitStack() as held:
+            waiting = [
+                held.enter_context(sent(service.address, f"GET {path}?wait=30"))
+                for path in (f"/jobs/{job}", f"/fields/{scene}", f"/fields/{object_}")
+            ]
+            stream = held.enter_context(sent(service.address, f"GET /jobs/{job}/events"))
+            told = stream.readline()
+            service.process.terminate()
+            assert [one.readline() for one in waiting] == [b"HTTP/1.1 200 OK\r\n"] * 3
+            assert (told + stream.read()).endswith(b"0\r\n\r\n"), "the stream ends whole"
+        assert service.process.wait(DEADLINE_S) == 0
+    finally:
+        service.end()
+    log = service.log()
+    assert [word for word in ("Traceback", "ERROR", "exceeded", "killed") if word in log] == [], log
+    eventually(service.all_gone, "the end of every process", DEADLINE_S)
+
+
+@contextmanager
+def sent(address: str, asked: str) -> Iterator[BinaryIO]:
+    """What a connection of its own is answered; the request lies in the server's buffers already."""
+    host, _, port = address.removeprefix("http://").partition(":")
+    with socket.create_connection((host, int(port)), DEADLINE_S) as connection:
+        connection.sendall(f"{asked} HTTP/1.1\r\nHost: {host}:{port}\r\nConnection: close\r\n\r\n".encode())
+        with connection.makefile("rb") as answer:
+            yield answer
 
 
 def refused(*arguments: str, state_dir: Path, **settings: object) -> str:

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.records import JobRecord
@@ -166,8 +166,7 @@ def test_the_page_is_shown_in_no_frame_but_a_link_leads_to_it(page: Page, servic
             )
         assert answer.value.status == 403
         page.evaluate("(url) => { location.href = url; }", service.view)
-        page.wait_for_selector("#message-title")
-        assert page.locator("#message-title").inner_text() == "In the queue"
+        expect(page.locator("#message-title")).to_have_text("In the queue", timeout=30_000)
         assert page.evaluate("window.opener === null")
         page.goto("about:blank")
 

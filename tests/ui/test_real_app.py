@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import pytest
 import uvicorn
+from fastapi import FastAPI
 from playwright.sync_api import expect
 
 from regnf_service.app import create_app
@@ -57,12 +58,23 @@ class RealService:
         self.records.update_job(JOB_ID, 1, status="successful")
 
 
+class _Server(uvicorn.Server):
+    """Tells the application first that it stops, as a signal does in a process of its own: threads hear none."""
+
+    def __init__(self, app: FastAPI) -> None:
+        super().__init__(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        self._app = app
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._app.state.services.stopping.set()
+        await super().shutdown(sockets)
+
+
 @contextmanager
 def real_service(detection: dict[str, object], settings: Settings, owner: str = ANONYMOUS) -> Iterator[RealService]:
     with private_stores() as stores:
         accept(stores, detection, owner)
-        app = create_app(settings, stores)
-        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        server = _Server(create_app(settings, stores))
         with socket.create_server(("127.0.0.1", 0)) as listener:
             thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
             thread.start()
@@ -111,8 +123,8 @@ def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:
         assert colored(canvas_pixels(page), "blue").mean() > 0.01
         page.locator("#color").select_option("residual")
         page.wait_for_selector("#legend svg rect")
-        assert page.locator("#box-chip").is_visible()
-        assert "result.json" in page.locator("#files").inner_text()
+        expect(page.locator("#box-chip")).to_be_visible()
+        expect(page.locator("#files")).to_contain_text("result.json")
         expect(page.locator("#field-pictures canvas")).to_have_count(2)
         assert visit.complaints == []
         assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
@@ -125,7 +137,7 @@ def test_failed_job_of_the_real_service(visit: Visit) -> None:
         service.records.update_job(JOB_ID, 1, status="failed", error=error)
         visit.page.goto(service.view.replace("/jobs/", "/v1/jobs/"))
         expect(visit.page.locator("#message-text")).to_have_text("12 points were found; 500 are needed.")
-        assert visit.page.locator("#message-title").inner_text() == "No surface in the detection"
+        expect(visit.page.locator("#message-title")).to_have_text("No surface in the detection")
         visit.page.goto("about:blank")
 
 
@@ -139,5 +151,5 @@ def test_page_of_a_guarded_service_asks_for_the_token(visit: Visit) -> None:
         page.locator("#token").fill("open-sesame")
         page.keyboard.press("Enter")
         page.wait_for_selector("#tools:not([hidden])")
-        assert page.locator("#verdict-word").inner_text() == "Registered"
+        expect(page.locator("#verdict-word")).to_have_text("Registered")
         page.goto("about:blank")

@@ -14,9 +14,9 @@ def test_running_shows_phase_and_progress(visit: Visit) -> None:
     page = visit.page
     page.goto(visit.server.view("running"))
     page.wait_for_selector("#phases [aria-current=step]")
-    assert page.locator("#status").inner_text() == "Running"
-    assert page.locator("#message-title").inner_text() == "Optimizing"
-    assert page.locator("#message-text").inner_text() == "62 % done"
+    expect(page.locator("#status")).to_have_text("Running")
+    expect(page.locator("#message-title")).to_have_text("Optimizing")
+    expect(page.locator("#message-text")).to_have_text("62 % done")
     assert page.locator("#progress").evaluate("bar => bar.value") == pytest.approx(0.62)
     assert page.locator("#phases [data-state=done]").count() == 3
     assert visit.complaints == []
@@ -25,7 +25,7 @@ def test_running_shows_phase_and_progress(visit: Visit) -> None:
 def test_queued_tells_the_place(visit: Visit) -> None:
     visit.page.goto(visit.server.view("queued"))
     visit.page.wait_for_selector("text=3 jobs are before it.")
-    assert visit.page.locator("#message-title").inner_text() == "In the queue"
+    expect(visit.page.locator("#message-title")).to_have_text("In the queue")
 
 
 @pytest.mark.parametrize("story", ["live", "polled"])
@@ -38,7 +38,7 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
         expect(page.locator("#message-title")).to_have_text(phase, timeout=30_000)
     visit.server.stage.advance()
     page.wait_for_selector("#tools:not([hidden])")
-    assert page.locator("#status").inner_text() == "Registered"
+    expect(page.locator("#status")).to_have_text("Registered")
     asked = [url for url in visit.requests if url.endswith("/events")]
     assert len(asked) == 1, asked
     # Only the refused stream may be complained about, and only where it is refused.
@@ -50,7 +50,7 @@ def test_cancel_ends_the_job(visit: Visit) -> None:
     page.goto(visit.server.view("running"))
     page.locator("#cancel").click()
     page.wait_for_selector("text=The job was dismissed")
-    assert page.locator("#status").inner_text() == "Dismissed"
+    expect(page.locator("#status")).to_have_text("Dismissed")
 
 
 def test_failure_tells_reason_and_detail_as_text(visit: Visit) -> None:

@@ -38,29 +38,30 @@ def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Vis
     shown = {matrix}
     for relation in ("172 degrees about z", "180 degrees about x"):
         page.locator("#pose-list label", has_text=relation).click()
+        expect(page.locator("#transform-note")).to_have_text(f"An alternative: {relation}")
         assert changed_share(result, canvas_pixels(page)) > 0.005
-        assert page.locator("#transform-note").inner_text() == f"An alternative: {relation}"
-        assert page.locator("#iteration-text").inner_text() == "Alternative"
+        expect(page.locator("#iteration-text")).to_have_text("Alternative")
         shown.add(page.locator("#matrix").inner_text())
     assert len(shown) == 3
     page.locator("#pose-list label", has_text="The result").click()
+    expect(page.locator("#transform-note")).to_be_hidden()
     assert changed_share(result, canvas_pixels(page)) < 0.001
     assert page.locator("#matrix").inner_text() == matrix
-    assert page.locator("#iteration-text").inner_text() == "Result"
-    expect(page.locator("#transform-note")).to_be_hidden()
+    expect(page.locator("#iteration-text")).to_have_text("Result")
 
 
 def test_residual_colors_say_whose_they_are(visit: Visit) -> None:
     page = visit.open("ambiguous")
     page.locator("#color").select_option("residual")
     page.wait_for_selector("#legend svg rect")
-    assert page.locator("#legend figcaption").inner_text() == "Residual, object units"
+    caption = page.locator("#legend figcaption")
+    expect(caption).to_have_text("Residual, object units")
     page.locator("#pose-list label", has_text="172 degrees").click()
-    assert "of the result’s pose, not of the one shown" in page.locator("#legend figcaption").inner_text()
+    expect(caption).to_contain_text("of the result’s pose, not of the one shown")
     page.locator("#pose-list label", has_text="The result").click()
-    assert page.locator("#legend figcaption").inner_text() == "Residual, object units"
+    expect(caption).to_have_text("Residual, object units")
     page.locator("#iteration").fill("3")
-    assert "of the result’s pose" in page.locator("#legend figcaption").inner_text()
+    expect(caption).to_contain_text("of the result’s pose")
 
 
 def test_deviations_are_the_documents(visit: Visit) -> None:
@@ -140,6 +141,7 @@ def test_without_a_view_the_alternatives_still_have_their_numbers(visit: Visit) 
     page = visit.open("ambiguous")
     matrix = page.locator("#matrix").inner_text()
     page.locator("#pose-list label", has_text="180 degrees about x").click()
+    expect(page.locator("#transform-note")).to_have_text("An alternative: 180 degrees about x")
     assert page.locator("#matrix").inner_text() != matrix
 
 
@@ -147,5 +149,5 @@ def test_alternatives_can_be_chosen_by_keyboard(visit: Visit) -> None:
     page = visit.open("ambiguous")
     page.locator("#pose-list input").first.focus()
     page.keyboard.press("ArrowDown")
-    assert page.locator("#pose-list input").nth(1).is_checked()
-    assert page.locator("#transform-note").inner_text() == "An alternative: 172 degrees about z"
+    expect(page.locator("#pose-list input").nth(1)).to_be_checked()
+    expect(page.locator("#transform-note")).to_have_text("An alternative: 172 degrees about z")

@@ -65,7 +65,7 @@ def test_slider_moves_the_object_from_the_start_into_place(visit: Visit) -> None
     page.locator("#frame-all").click()
     hide(visit, "scene", "box")
     seek(visit, 0)
-    assert page.locator("#iteration-text").inner_text() == "Start"
+    expect(page.locator("#iteration-text")).to_have_text("Start")
     hide(visit, "before")
     start = colored(canvas_pixels(page), "blue")
     hide(visit, "before", "after")
@@ -74,7 +74,7 @@ def test_slider_moves_the_object_from_the_start_into_place(visit: Visit) -> None
     assert math.dist(center_of(start), center_of(ghost)) < 6
     hide(visit, "before", "after")
     seek(visit, 5)
-    assert "Iteration 5" in page.locator("#iteration-text").inner_text()
+    expect(page.locator("#iteration-text")).to_contain_text("Iteration 5")
     halfway = colored(canvas_pixels(page), "blue")
     seek(visit, ITERATIONS + 1)
     end = colored(canvas_pixels(page), "blue")
@@ -103,7 +103,9 @@ def test_numbers_are_the_documents(visit: Visit) -> None:
     assert "SURFACES_AGREE" in page.locator("#verdict-reason").inner_text()
     cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
     assert np.allclose(np.reshape(cells, (4, 4)), result["T_object_scene"]["matrix"], atol=5.1e-6)
+    before = page.locator("#matrix").inner_text()
     page.locator("text=scene ← object").first.click()
+    expect(page.locator("#matrix")).not_to_have_text(before, use_inner_text=True)
     cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
     assert np.allclose(np.reshape(cells, (4, 4)), result["T_scene_object"]["matrix"], atol=5.1e-6)
     figures = page.locator("#figures").inner_text()
@@ -132,8 +134,9 @@ def test_residuals_color_the_clouds(visit: Visit) -> None:
     page.locator("#color").select_option("residual")
     page.wait_for_selector("#legend svg rect")
     assert changed_share(before, canvas_pixels(page)) > 0.02
-    assert page.locator("#legend").is_visible()
+    expect(page.locator("#legend")).to_be_visible()
     page.locator("#color").select_option("layer")
+    expect(page.locator("#legend")).to_be_hidden()
     assert changed_share(before, canvas_pixels(page)) < 0.001
     assert visit.complaints == []
 
@@ -200,7 +203,7 @@ def test_alternatives_can_be_looked_at(visit: Visit) -> None:
     assert changed_share(shown, canvas_pixels(page)) > 0.005
     assert page.locator("#matrix").inner_text() != matrix
     seek(visit, 3)  # the path leads to the result: choosing it again
-    assert page.locator("#pose-list input").first.is_checked()
+    expect(page.locator("#pose-list input").first).to_be_checked()
     assert page.locator("#matrix").inner_text() == matrix
 
 
