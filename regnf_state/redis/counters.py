@@ -32,7 +32,7 @@ def count(redis: Redis, name: str, *labels: str) -> None:
     except ResponseError as error:
         if "WRONGTYPE" in str(error):
             redis.delete(COUNTERS_KEY)
-        elif "not an integer" in str(error):
+        elif "not an integer" in str(error) or "overflow" in str(error):
             redis.hdel(COUNTERS_KEY, counter)
         else:
             raise
@@ -78,7 +78,7 @@ class Counters:
     """All counters as they were at one moment."""
 
     def __init__(self, redis: Redis) -> None:
-        held: Any = redis.hgetall(COUNTERS_KEY)
+        held: Any = _held(redis)
         self._held = {tuple(shown(name).split("|")): _number(shown(value)) for name, value in held.items()}
 
     def counts(self, name: str) -> Iterable[tuple[Sequence[str], float]]:
@@ -94,6 +94,16 @@ class Counters:
                 total += self._held.get((name, *group, bound), 0.0)
                 buckets.append((bound, total))
             yield group, buckets, self._held.get((name, *group, "sum"), 0.0)
+
+
+def _held(redis: Redis) -> Any:
+    """Nothing where the counters are no hash: the next event begins them anew."""
+    try:
+        return redis.hgetall(COUNTERS_KEY)
+    except ResponseError as error:
+        if "WRONGTYPE" not in str(error):
+            raise
+        return {}
 
 
 def _number(value: str) -> float:

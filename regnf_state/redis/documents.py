@@ -17,6 +17,7 @@ from regnf_state.pages import LOOKED_AT, Page, Position
 from regnf_state.record_format import FORMAT, decoded, encoded
 from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.mended_script import MENDED
 from regnf_state.redis.unreadable import UNREADABLE, Stored, UnreadableRecords
 
 _PAGE = 100
@@ -27,20 +28,26 @@ logger = logging.getLogger(__name__)
 
 # A document is a hash of ``document`` (JSON), ``version``, ``format`` and ``token``; other members of the hash stay as
 # they are. The token names the write that made it: when a connection breaks after the script ran and the client runs
-# it again, the second run finds its own token. An index that is no index is set aside, and begun anew. COMPACT is no
-# command of Redis: a stream has four kilobytes set apart with its first event, which are given back here.
-_WRITE = """
+# it again, the second run finds its own token. An index that is no index is set aside, and begun anew: until then it
+# holds nothing. COMPACT is no command of Redis: a stream has four kilobytes set apart with its first event, which are
+# given back here.
+_WRITE = (
+    MENDED
+    + """
+local function size(command, key)
+  local held = redis.pcall(command, key)
+  if command ~= 'HVALS' then return type(held) == 'number' and held or 0 end
+  local sum = 0
+  for _, value in ipairs(held) do sum = sum + (tonumber(value) or 0) end
+  return sum
+end
 local shape = redis.call('TYPE', KEYS[1]).ok
 if shape ~= 'hash' and shape ~= 'none' then return 'CONFLICT' end
 if redis.call('HGET', KEYS[1], 'token') == ARGV[1] then return 'OK' end
 if (redis.call('HGET', KEYS[1], 'version') or '0') ~= ARGV[2] then return 'CONFLICT' end
 for _, cap in ipairs(cjson.decode(ARGV[3])) do
   local held = 0
-  if cap[1] == 'HVALS' then
-    for _, value in ipairs(redis.call('HVALS', cap[2])) do held = held + tonumber(value) end
-  else
-    for key in string.gmatch(cap[2], '%S+') do held = held + redis.call(cap[1], key) end
-  end
+  for key in string.gmatch(cap[2], '%S+') do held = held + size(cap[1], key) end
   if held + cap[3] > cap[4] then return cap[5] end
 end
 for i = 4, #ARGV do
@@ -50,17 +57,13 @@ for i = 4, #ARGV do
     local dumped = redis.pcall('DUMP', command[2])
     if type(dumped) == 'string' then redis.pcall('RESTORE', command[2], 0, dumped, 'REPLACE') end
   else
-    done = redis.pcall(unpack(command))
+    done = mended(command)
   end
-  if type(done) == 'table' and done.err then
-    if not string.find(done.err, 'WRONGTYPE') then return done end
-    redis.call('RENAME', command[2], 'regnf:quarantine:' .. command[2])
-    redis.call('EXPIRE', 'regnf:quarantine:' .. command[2], 604800)
-    redis.call(unpack(command))
-  end
+  if type(done) == 'table' and done.err then return done end
 end
 return 'OK'
 """
+)
 
 Command = tuple[str, ...]
 Cap = tuple[str, str, int, int, str]

@@ -80,9 +80,8 @@ class FairQueue:
         return do()
 
     def _begin_anew(self) -> None:
-        """Drop every key that the script uses; of RQ's lists and the counters those of another type only."""
-        shared = {**dict.fromkeys(_LISTS, b"list"), COUNTERS_KEY: b"hash"}
-        damaged = [key for key, kind in shared.items() if self._redis.type(key) != kind]
+        """Drop every key that the script uses; of RQ's lists those of another type only."""
+        damaged = [key for key in _LISTS if self._redis.type(key) != b"list"]
         held: list[Any] = [*self._redis.scan_iter(f"{_PREFIX}*", count=1000), *damaged]
         if held:
             self._redis.delete(*held)

@@ -14,7 +14,11 @@ Keys, below the prefix:  line:{owner}   list of names        owners        sorte
 An entry: owner, kind, since; once taken: cost, taken; while it waits for a field: parked.
 """
 
-SCRIPT = """
+from regnf_state.redis.mended_script import MENDED
+
+SCRIPT = (
+    MENDED
+    + """
 local P, op, name = KEYS[1], ARGV[1], ARGV[2]
 local FIRST, CREDIT, DAY = tonumber(ARGV[3]), tonumber(ARGV[5]), 86400
 local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
@@ -164,7 +168,7 @@ function steps.finish(seconds)
   local owner, kind, cost = entry[1], entry[2], number(entry[3], nil)
   if not owner or not kind or not cost then return 0 end
   redis.call('HSET', P .. 'costs', owner .. '|' .. kind, seconds)
-  redis.call('HINCRBYFLOAT', ARGV[4], 'worker_seconds|' .. owner .. '|' .. kind, seconds)
+  mended({'HINCRBYFLOAT', ARGV[4], 'worker_seconds|' .. owner .. '|' .. kind, seconds})
   charge(owner, tonumber(seconds) - cost)
   return 1
 end
@@ -202,3 +206,4 @@ local answer = steps[op](unpack(ARGV, 6))
 advance()
 return answer
 """
+)

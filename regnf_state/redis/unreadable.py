@@ -7,13 +7,16 @@ sorted set names both, by the time when they were found; there are at most a tho
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from redis import Redis
+from redis.exceptions import ResponseError
 
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.mended_script import MENDED
 
 logger = logging.getLogger(__name__)
 UNREADABLE = f"{PREFIX}unreadable"
@@ -21,23 +24,26 @@ QUARANTINE = f"{PREFIX}quarantine:"
 KEPT_S = 7 * 24 * 3600
 _MOST = 1000
 # only what is still as it was read: another process may have put a good record in its place
-_SET_ASIDE = """
+_SET_ASIDE = (
+    MENDED
+    + """
 local is_hash = redis.call('TYPE', KEYS[1]).ok == 'hash'
 if is_hash ~= (ARGV[1] == 'hash') or redis.call('EXISTS', KEYS[1]) == 0 then return 0 end
 if is_hash and (redis.call('HGET', KEYS[1], 'document') or '') ~= ARGV[2] then return 0 end
 local now = redis.call('TIME')[1]
-redis.call('ZREMRANGEBYSCORE', KEYS[2], '-inf', now - ARGV[5])
+mended({'ZREMRANGEBYSCORE', KEYS[2], '-inf', now - ARGV[5]})
 local first = redis.call('ZADD', KEYS[2], 'NX', now, KEYS[1])
 if ARGV[3] == 'move' then
   redis.call('RENAME', KEYS[1], ARGV[4] .. KEYS[1])
   redis.call('EXPIRE', ARGV[4] .. KEYS[1], ARGV[5])
 end
-if first == 1 then redis.call('HINCRBY', 'regnf:counters', 'records_unreadable|' .. ARGV[7], 1) end
+if first == 1 then mended({'HINCRBY', 'regnf:counters', 'records_unreadable|' .. ARGV[7], '1'}) end
 while redis.call('ZCARD', KEYS[2]) > tonumber(ARGV[6]) do
   redis.call('DEL', ARGV[4] .. redis.call('ZPOPMIN', KEYS[2])[1])
 end
 return 1 + first
 """
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,17 @@ class UnreadableRecords:
 
     def names(self, key: str) -> bool:
         """Whether what is, or was, under this key is known to be unreadable."""
-        return self._redis.zscore(UNREADABLE, key) is not None
+        return self._ask(lambda: self._redis.zscore(UNREADABLE, key)) is not None
 
     def total(self) -> int:
-        return int(self._redis.zcard(UNREADABLE))
+        return int(self._ask(lambda: self._redis.zcard(UNREADABLE)) or 0)
+
+    @staticmethod
+    def _ask(look: Callable[[], Any]) -> Any:
+        """None where the list itself is none: the next record that is noted begins it anew."""
+        try:
+            return look()
+        except ResponseError as error:
+            if "WRONGTYPE" not in str(error):
+                raise
+            return None

@@ -127,3 +127,20 @@ def test_damaged_counters_begin_anew(redis: Redis, value: str | None) -> None:
         redis.hset(COUNTERS_KEY, "refused|a", value)
     count(redis, "refused", "a")
     assert list(Counters(redis).counts("refused")) == [(("a",), 1.0)]
+
+
+@pytest.mark.parametrize("kind", ["another type", "no number"])
+def test_damaged_counters_do_not_empty_the_queue(redis: Redis, kind: str) -> None:
+    fair = used(redis)
+    name: Any = redis.lpop("rq:queue:regnf")
+    fair.turn()
+    held = {line.owner: line.waiting for line in fair.lines()}
+    redis.delete(COUNTERS_KEY)
+    if kind == "no number":
+        redis.hset(COUNTERS_KEY, "worker_seconds|two|registration", "x")
+        redis.hset(COUNTERS_KEY, "worker_seconds|one|registration", "x")
+    else:
+        redis.set(COUNTERS_KEY, "x")
+    fair.finish(name.decode(), 2.0)
+    assert {line.owner: line.waiting for line in fair.lines()} == held
+    assert [value for _, value in Counters(redis).counts("worker_seconds") if value] == [2.0]

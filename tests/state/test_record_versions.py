@@ -13,7 +13,7 @@ from redis import Redis
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.manifest import read_manifest
 from regnf_state.records import Quota, UnreadableRecordError
-from regnf_state.redis.counters import Counters
+from regnf_state.redis.counters import COUNTERS_KEY, Counters
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from tests.state.captured import members_before, put_back
@@ -259,6 +259,58 @@ def test_an_index_of_another_type_is_begun_anew(store: RedisRecordStore, redis: 
     redis.set(key, "a string")
     assert store.update_job("j1", 1, status="successful").status == "successful"
     assert redis.type(key) in (b"stream", b"zset")
+
+
+def _another_type(redis: Redis) -> None:
+    _string(redis, COUNTERS_KEY)
+
+
+def _no_numbers(redis: Redis) -> None:
+    """Texts, and the greatest of all numbers."""
+    held: Any = redis.hgetall(COUNTERS_KEY)
+    told = [*held, "records_unreadable|job", "jobs_finished|successful||", "job_run_seconds|successful|sum"]
+    redis.hset(COUNTERS_KEY, mapping=dict.fromkeys(told, "x"))
+    redis.hset(COUNTERS_KEY, "job_attempts", str(2**63 - 1))
+
+
+@pytest.mark.parametrize("damage", [_another_type, _no_numbers])
+def test_damaged_counters_keep_no_record_from_being_set_aside_or_written(
+    store: RedisRecordStore, redis: Redis, damage: Callable[[Redis], None]
+) -> None:
+    for name in ("j1", "j2"):
+        started(store, name)
+    redis.hset("regnf:job:j1", "document", "{")
+    damage(redis)
+    assert list(Counters(redis).counts("records_unreadable")) in ([], [(("job",), 0.0)])
+    assert [one.id for one in store.active_jobs()] == ["j2"]
+    assert redis.exists("regnf:quarantine:regnf:job:j1")
+    assert list(Counters(redis).counts("records_unreadable")) == [(("job",), 1.0)]
+    damage(redis)
+    assert store.update_job("j2", 1, status="successful").status == "successful"
+    assert list(Counters(redis).counts("jobs_finished")) == [(("successful", "", ""), 1.0)]
+    damage(redis)
+    started(store, "j3")
+    assert list(Counters(redis).counts("job_attempts")) == [((), 1.0)]
+
+
+def test_a_damaged_list_of_the_unreadable_is_begun_anew(store: RedisRecordStore, redis: Redis) -> None:
+    started(store)
+    redis.hset("regnf:job:j1", "document", "{")
+    redis.set("regnf:unreadable", "a string")
+    assert store.unreadable.total() == 0
+    assert store.active_jobs() == []
+    assert store.unreadable.total() == 1
+    assert redis.exists("regnf:quarantine:regnf:job:j1")
+
+
+@pytest.mark.parametrize("held", ["a string", {"a" * 64: "x"}])
+def test_what_an_owner_has_counts_as_nothing_where_it_is_damaged(
+    store: RedisRecordStore, redis: Redis, held: Any
+) -> None:
+    for key in ("regnf:owner:anonymous:active", "regnf:owner:anonymous:stored"):
+        redis.set(key, held) if isinstance(held, str) else redis.hset(key, mapping=held)
+    assert store.create_job(job(store), 10, Quota(active_jobs=1))[1]
+    assert store.create_field(field(store), Quota(fields=2, stored_bytes=100))[1]
 
 
 def test_a_damaged_message_does_not_keep_the_others(store: RedisRecordStore, redis: Redis) -> None:

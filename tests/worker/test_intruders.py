@@ -204,6 +204,8 @@ def test_with_a_key_only_what_is_signed_runs(tmp_path: Path) -> None:
 def test_a_damaged_record_does_not_end_the_worker_that_takes_its_job(table: Bench, document: str) -> None:
     table.submit("succeed", "damaged")
     table.redis.hset("regnf:job:damaged", "document", document)
+    table.redis.delete("regnf:counters")
+    table.redis.set("regnf:counters", "no counters either")
     worker = table.start_worker()
     table.submit("succeed", "next")
     assert table.finished("next").status == "successful"

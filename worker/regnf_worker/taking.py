@@ -62,19 +62,20 @@ class Taking:
         self._fair.turn()  # the next in turn is for the next worker
         try:
             held: Any = self._redis.hgetall(taken.key)
-            if not held:
-                self._fair.finish(taken.name, 0.0)
-                return None  # it was stopped meanwhile
-            work = payload.read(taken.queue_name, taken.name, held, self._redis, self._key)
-        except payload.PayloadError as error:
-            self._refuse(taken, str(error))
         except ResponseError as error:
             if not str(error).startswith("WRONGTYPE"):
                 raise
             self._refuse(taken, "not a hash")
-        else:
-            return None if work.kind == "registration" and self._is_put_aside(work) else work
-        return None
+            return None
+        if not held:
+            self._fair.finish(taken.name, 0.0)
+            return None  # it was stopped meanwhile
+        try:
+            work = payload.read(taken.queue_name, taken.name, held, self._redis, self._key)
+        except payload.PayloadError as error:
+            self._refuse(taken, str(error))
+            return None
+        return None if work.kind == "registration" and self._is_put_aside(work) else work
 
     def _is_put_aside(self, work: Work) -> bool:
         """Whether the registration waits for an import. One with a record that cannot be read is run, which says so."""
