@@ -30,4 +30,4 @@ def convert_mesh(
         raise malformed(f"the {format_} file holds no triangles")
     from regnf_core.importing.families.point_cloud import convert_cloud  # loads scipy and Open3D
 
-    return convert_cloud(geometry, f"a {format_} file", overrides)
+    return convert_cloud(geometry, f"a {format_} file", overrides, work_s)

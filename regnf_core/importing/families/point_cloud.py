@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mimetypes
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.importing.cost.cloud_work import FINEST, SPAN, affordable_depth
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.triangles import mesh_field
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
@@ -17,17 +19,19 @@ from regnf_core.importing.upload_description import UploadDescription
 _MIN_POINTS = 100
 _MAX_POINTS = 300_000
 """Points beyond this are thinned: they cost time and the surface, 256 cells wide, hardly shows them."""
-_DEPTH = 8
 _REACH_SPACINGS, _REACH_SHARE = 4.0, 0.01
 """The surface ends where no point is within this many times their usual spacing, or this share of their diagonal."""
 _MEASURED = 10_000
 """Points whose distance to the surface is measured: one that is far from it, and as far from all, takes long."""
 
 
-def convert_cloud(geometry: Geometry, origin: str, overrides: UploadDescription) -> ConvertedField:
+def convert_cloud(
+    geometry: Geometry, origin: str, overrides: UploadDescription, work_s: float = math.inf
+) -> ConvertedField:
     """The field of points with normals that point to free space.
 
-    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, and what ``overrides`` is refused for.
+    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, IMPORT_TOO_COSTLY beyond ``work_s`` estimated
+    seconds, and what ``overrides`` is refused for.
     """
     if geometry.normals is None:
         message = f"{origin} with points and no faces needs normals (nx, ny, nz) that point to free space"
@@ -39,17 +43,21 @@ def convert_cloud(geometry: Geometry, origin: str, overrides: UploadDescription)
     unit = (points - low) / diagonal
     places = np.unique(unit, axis=0)  # a tree cannot part points at one place: each would be compared with each
     tree = cKDTree(places)
-    vertices, faces = _poisson(unit, normals)
+    depth = affordable_depth(unit, work_s)
+    vertices, faces = _poisson(unit, normals, depth)
     reach = max(_REACH_SPACINGS * float(np.median(tree.query(places, k=2)[0][:, 1])), _REACH_SHARE)
     near = tree.query(vertices, distance_upper_bound=reach)[0] < reach
     faces = faces[near[faces].all(axis=1)]
     if len(faces) == 0:
         raise malformed("no surface passes near the points: are the normals theirs?")
     surface = Geometry(vertices * diagonal + low, faces, left_out=geometry.left_out)
-    found = mesh_field(surface, "their screened Poisson surface, 256 cells wide", overrides, "point_cloud")
+    width = f"{1 << depth} cells wide"
+    found = mesh_field(surface, f"their screened Poisson surface, {width}", overrides, "point_cloud", work_s)
     beside = 100.0 * np.quantile(cKDTree(vertices[near]).query(_some(unit))[0], 0.95)
     why = (f"{origin}: {len(geometry.vertices)} points with normals", *found.why)
     text = f"what lies between the points is a guess; 19 of 20 points are within {beside:.2g} % of the diagonal of it"
+    if depth < FINEST:
+        text += f"; it is {width} instead of {1 << FINEST}, because its points fill too many cells"
     return replace(found, why=why, warnings=(*found.warnings, f"SURFACE_RECONSTRUCTED: {text}"))
 
 
@@ -76,7 +84,7 @@ def _some(points: Float64Array) -> Float64Array:
     return points[np.random.default_rng(0).choice(len(points), _MEASURED, replace=False)]
 
 
-def _poisson(points: Float64Array, normals: Float64Array) -> tuple[Float64Array, Int64Array]:
+def _poisson(points: Float64Array, normals: Float64Array, depth: int) -> tuple[Float64Array, Int64Array]:
     """The closed surface (V, 3), (F, 3) through the points, faces outward."""
     mimetypes.knownfiles.clear()  # what open3d brings along would read them, which the gate's process may not
     import open3d
@@ -84,5 +92,7 @@ def _poisson(points: Float64Array, normals: Float64Array) -> tuple[Float64Array,
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.normals = open3d.utility.Vector3dVector(normals)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=_DEPTH, n_threads=1)
+        mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(
+            cloud, depth=depth, scale=SPAN, n_threads=1
+        )
     return np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
