@@ -100,6 +100,10 @@ class Settings(BaseSettings):
     """What each caller's imports and jobs may cost the workers in an hour."""
     caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
     """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
+    worker_reserve_s: float = Field(default=300.0, ge=0, le=86400)
+    """How long after a caller's last request or result other callers leave one worker free for it; 0: they do not."""
+    job_niceness: int = Field(default=10, ge=0, le=19)
+    """The most by which jobs and imports of callers above their share give way at the processor; 0: they do not."""
     quota_finished_jobs: int = Field(default=10_000, ge=1)
     """Of each caller; beyond this its oldest finished jobs go before their time."""
     max_finished_jobs: int = Field(default=50_000, ge=1)

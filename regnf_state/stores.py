@@ -37,5 +37,5 @@ def open_stores(settings: Settings, *, retries: int | None, storage_wait_s: floa
     url = redis_address(settings)
     redis = connect_bounded(url) if retries is None else connect(url, retries=retries)
     blobs = open_blobs(settings, storage_wait_s, existing)
-    queue = RqJobQueue(redis, settings.queue_key, settings.caller_weights)
+    queue = RqJobQueue(redis, settings.queue_key, settings.caller_weights, settings.worker_reserve_s)
     return Stores(redis, JournaledRecordStore(redis, settings.retention_s, blobs), blobs, queue)

@@ -20,6 +20,7 @@ from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Work
 from regnf_state.redis.counters import COUNTERS_KEY
 from regnf_state.redis.documents import number, shown
 from regnf_state.redis.fair_script import SCRIPT
+from regnf_state.redis.fair_share import excess
 from regnf_state.redis.keys import PREFIX
 
 _PREFIX = f"{PREFIX}queue:"
@@ -56,16 +57,19 @@ class Line:
 
 
 class FairQueue:
-    """The waiting work of all callers. ``weights``: the shares of callers who have another one than 1."""
+    """The waiting work of all callers. ``weights``: the shares of callers who have another one than 1. ``reserve_s``:
+    how long after a caller's last request or result one worker stays free for it; 0: none does.
+    """
 
-    def __init__(self, redis: Redis, weights: Mapping[str, float] | None = None) -> None:
+    def __init__(self, redis: Redis, weights: Mapping[str, float] | None = None, reserve_s: float = 0.0) -> None:
         self._redis = redis
         self._weights = dict(weights or {})
+        self._reserve_s = reserve_s
         self._script = redis.register_script(SCRIPT)
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
         """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
-        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S]
+        fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S, self._reserve_s]
         return self._mended(lambda: int(self._script(keys=[_PREFIX], args=[*fixed, *arguments])))
 
     def _mended(self, do: Callable[[], _Value]) -> _Value:
@@ -127,6 +131,10 @@ class FairQueue:
         oldest = int(self._redis.time()[0]) // 60 - 60
         minutes = {int(number(minute)): max(0.0, number(seconds)) for minute, seconds in held.items()}
         return {minute: seconds for minute, seconds in sorted(minutes.items()) if minute > oldest}
+
+    def excess(self, name: str) -> float:
+        """How far the owner of work asks for more than its fair share of the workers: ``fair_share.excess``."""
+        return self._mended(lambda: excess(self._redis, name))
 
     def lines(self) -> list[Line]:
         """Every caller with work that waits, those whose turn is next first."""

@@ -7,10 +7,14 @@ RQ's list and does not any more was taken by a worker, and its caller's tag rise
 goes back to the front of its line. Every call ends with ``advance``, which chooses anew. So no call relies on the one
 before it: after the death of any process the next call of any other puts the state in order.
 
+One worker stays free for callers who come back: ``held_back``. Which workers a caller holds is told by what they report
+themselves, and Redis lets expire; no count is kept that a death could leave wrong.
+
 Keys, below the prefix:  line:{owner}   list of names        owners        sorted set: callers with a line, by tag
                          entry:{name}   hash, see below      tags, weights, costs   hashes, by owner
                          parked:{ref}   list of names        parkings      set: fields that something waits for
                          spent:{owner}  hash: worker seconds by minute     clock   hash: now; ready, owner
+                         taken          set: names that workers have       asked   sorted set: callers, by last request
 An entry: owner, kind, since; once taken: cost, taken; while it waits for a field: parked.
 """
 
@@ -20,8 +24,10 @@ SCRIPT = (
     MENDED
     + """
 local P, op, name = KEYS[1], ARGV[1], ARGV[2]
-local FIRST, CREDIT, DAY = tonumber(ARGV[3]), tonumber(ARGV[5]), 86400
+local FIRST, CREDIT, RESERVE, DAY = tonumber(ARGV[3]), tonumber(ARGV[5]), tonumber(ARGV[6]), 86400
+local BEGIN = 15  -- a worker that has taken work reports it within so many seconds
 local LISTS = {import = 'rq:queue:regnf-import', registration = 'rq:queue:regnf'}
+local WORKERS = 'rq:workers:regnf'
 local time = redis.call('TIME')
 local now = time[1] + time[2] / 1e6
 
@@ -65,6 +71,11 @@ local function charge(owner, seconds)
   redis.call('EXPIRE', key, 7200)
 end
 
+local function note_asked(owner)
+  redis.call('ZADD', P .. 'asked', text(now), owner)
+  redis.call('ZREMRANGEBYSCORE', P .. 'asked', '-inf', text(now - DAY))
+end
+
 -- a caller who had no line gains the credit at most for the time without: its first work goes before that of those
 -- who have been served all the while, and not more than that
 local function join(owner, id, push)
@@ -90,13 +101,73 @@ local function settle()
   redis.call('HSET', P .. 'clock', 'now', text(math.max(clock(), tag_of(owner))))
   redis.call('HSET', entry_of(id), 'cost', text(cost), 'taken', text(now))
   redis.call('EXPIRE', entry_of(id), DAY)
+  redis.call('SADD', P .. 'taken', id)
   charge(owner, cost)
+end
+
+-- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
+local function runs(id)
+  if redis.call('TYPE', 'rq:executions:' .. id).ok ~= 'zset' then return false end
+  for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
+    if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
+  end
+  return false
+end
+
+-- how many workers each caller holds, and how many are held in all
+local function held()
+  local by_owner, total = {}, 0
+  for _, id in ipairs(redis.call('SMEMBERS', P .. 'taken')) do
+    local entry = redis.call('HMGET', entry_of(id), 'owner', 'taken')
+    local owner, taken = entry[1], number(entry[2], nil)
+    if owner and taken and (math.abs(now - taken) < BEGIN or runs(id)) then
+      by_owner[owner], total = (by_owner[owner] or 0) + 1, total + 1
+    else
+      redis.call('SREM', P .. 'taken', id)
+    end
+  end
+  return by_owner, total
+end
+
+local function live_workers()
+  local live = 0
+  if redis.call('TYPE', WORKERS).ok ~= 'set' then return 0 end
+  for _, key in ipairs(redis.call('SMEMBERS', WORKERS)) do
+    if redis.call('TYPE', key).ok == 'hash' and redis.call('HEXISTS', key, 'death') == 0 then live = live + 1 end
+  end
+  return live
+end
+
+-- whether another caller who holds no worker has asked for something lately, and would have less with one, by weight,
+-- than the owner with one more
+local function somebody_has_less(owner, by_owner)
+  local share = (by_owner[owner] + 1) / weight_of(owner)
+  for _, other in ipairs(redis.call('ZRANGEBYSCORE', P .. 'asked', text(now - RESERVE), text(now + RESERVE))) do
+    if other ~= owner and not by_owner[other] and 1 / weight_of(other) < share then return true end
+  end
+  return false
+end
+
+-- a caller who holds a worker does not get the last free one while it may be for somebody who has less
+local function held_back(owner, by_owner, total)
+  if not by_owner[owner] then return false end
+  local live = live_workers()
+  return live > 1 and live - total <= 1 and somebody_has_less(owner, by_owner)
+end
+
+local function next_owner()
+  local owners = redis.call('ZRANGE', P .. 'owners', 0, -1)
+  if RESERVE <= 0 or #owners == 0 then return owners[1] end
+  local by_owner, total = held()
+  for _, owner in ipairs(owners) do
+    if not held_back(owner, by_owner, total) then return owner end
+  end
 end
 
 local function advance()
   if redis.call('LLEN', LISTS.import) + redis.call('LLEN', LISTS.registration) > 0 then return end
   while true do
-    local owner = redis.call('ZRANGE', P .. 'owners', 0, 0)[1]
+    local owner = next_owner()
     if not owner then return end
     local id = redis.call('LPOP', line_of(owner))
     set_tag(owner, tag_of(owner))
@@ -114,15 +185,6 @@ local function waits(id)
   if entry[1] and redis.call('LPOS', line_of(entry[1]), id) then return true end
   if entry[2] and redis.call('LPOS', P .. 'parked:' .. entry[2], id) then return true end
   return redis.call('LPOS', LISTS.import, id) or redis.call('LPOS', LISTS.registration, id)
-end
-
--- that a worker reports is told by what Redis lets expire: times in RQ's own lists are of the workers' clocks
-local function runs(id)
-  if redis.call('TYPE', 'rq:executions:' .. id).ok ~= 'zset' then return false end
-  for _, one in ipairs(redis.call('ZRANGE', 'rq:executions:' .. id, 0, -1)) do
-    if redis.call('EXISTS', 'rq:execution:' .. id .. ':' .. one) == 1 then return true end
-  end
-  return false
 end
 
 local function remove(id)
@@ -147,6 +209,7 @@ function steps.enqueue(owner, kind, weight, ...)
   redis.call('HSET', 'rq:job:' .. name, ...)
   redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'since', text(now))
   redis.call('HSET', P .. 'weights', owner, weight)
+  note_asked(owner)
   join(owner, name, 'RPUSH')
   return 1
 end
@@ -170,6 +233,7 @@ function steps.finish(seconds)
   redis.call('HSET', P .. 'costs', owner .. '|' .. kind, seconds)
   mended({'HINCRBYFLOAT', ARGV[4], 'worker_seconds|' .. owner .. '|' .. kind, seconds})
   charge(owner, tonumber(seconds) - cost)
+  note_asked(owner)
   return 1
 end
 
@@ -202,7 +266,7 @@ function steps.release()
 end
 
 settle()
-local answer = steps[op](unpack(ARGV, 6))
+local answer = steps[op](unpack(ARGV, 7))
 advance()
 return answer
 """

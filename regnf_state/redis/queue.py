@@ -17,12 +17,20 @@ from regnf_state.redis.fair_queue import FairQueue, Line
 
 
 class RqJobQueue:
-    """A JobQueue over RQ's lists and the fair queue before them. ``key`` signs what is put into Redis."""
+    """A JobQueue over RQ's lists and the fair queue before them, which has ``weights`` and ``reserve_s``. ``key`` signs
+    what is put into Redis.
+    """
 
-    def __init__(self, redis: Redis, key: str | None = None, weights: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        redis: Redis,
+        key: str | None = None,
+        weights: Mapping[str, float] | None = None,
+        reserve_s: float = 0.0,
+    ) -> None:
         self._redis = redis
         self._key = key
-        self.fair = FairQueue(redis, weights)
+        self.fair = FairQueue(redis, weights, reserve_s)
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS) -> None:
         self._enqueue(Work("registration", job_id, attempt), owner)

@@ -16,6 +16,7 @@ from typing import TypeVar
 from redis import Redis
 
 from regnf_state.blobs.local import LocalBlobStore
+from regnf_state.ownership import ANONYMOUS, reference_of
 from regnf_state.records import FINISHED, FieldRecord, JobRecord
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
@@ -70,22 +71,22 @@ class Bench:
     def log(self) -> str:
         return "\n".join(path.read_text() for path in sorted(self.folder.glob("worker-*.log")))
 
-    def add_ready_fields(self) -> None:
-        for sha256 in (SCENE, OBJECT):
+    def add_ready_fields(self, owner: str = ANONYMOUS) -> None:
+        for sha256 in (reference_of(owner, SCENE), reference_of(owner, OBJECT)):
             now = self.context.records.now()
             self.context.records.create_field(FieldRecord(sha256, "validating", 1, now, now))
             self.context.blobs.put(f"fields/{sha256}/field.safetensors", sha256[:1].encode())
             self.context.records.update_field(sha256, state="ready")
 
-    def submit(self, do: str, job_id: str = "j1") -> JobRecord:
+    def submit(self, do: str, job_id: str = "j1", owner: str = ANONYMOUS) -> JobRecord:
         """Record and queue a job whose engine shall do this."""
         now = self.context.records.now()
-        request = request_record(SCENE, OBJECT, do)
+        request = request_record(reference_of(owner, SCENE), reference_of(owner, OBJECT), do)
         record, created = self.context.records.create_job(
             JobRecord(job_id, "registration", "accepted", request, {}, now, now), 100
         )
         assert created
-        self.context.queue.enqueue_registration(job_id, record.attempt)
+        self.context.queue.enqueue_registration(job_id, record.attempt, owner)
         return record
 
     def job(self, job_id: str = "j1") -> JobRecord:
@@ -117,7 +118,11 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
         given = {"redis_url": url, "state_dir": folder / "state", "heartbeat_s": 0.2} | settings
         environment |= {f"REGNF_{name.upper()}": str(value) for name, value in given.items()}
         values = Settings(**given)  # type: ignore[arg-type]
-        stores = RedisRecordStore(redis), LocalBlobStore(values.blob_dir), RqJobQueue(redis)
+        stores = (
+            RedisRecordStore(redis),
+            LocalBlobStore(values.blob_dir),
+            RqJobQueue(redis, reserve_s=values.worker_reserve_s),
+        )
         made = Bench(Context(values, *stores), redis, folder, environment)
         try:
             yield made

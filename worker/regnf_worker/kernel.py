@@ -1,4 +1,7 @@
-"""What the worker asks of the operating system: to end with its parent, to share cores, to report kills for memory."""
+"""What the worker asks of the operating system: to end with its parent, to share cores, to give way.
+
+It also reports kills for memory.
+"""
 
 from __future__ import annotations
 
@@ -78,6 +81,12 @@ def prefer_as_oom_victim() -> None:
     """When memory runs out, the kernel kills this process first, not the worker or Redis."""
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE)
+
+
+def give_way(niceness: int) -> None:
+    """Have the kernel prefer other processes to this one and its children, where both want a core."""
+    with suppress(OSError):
+        os.nice(niceness)
 
 
 def oom_kills() -> int:

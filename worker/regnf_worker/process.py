@@ -70,7 +70,7 @@ class RegnfWorker(ResilientWorker):
         self._context = context
         self._scratch = scratch
         self._functions = functions
-        self._fair = FairQueue(redis, context.settings.caller_weights)
+        self._fair = FairQueue(redis, context.settings.caller_weights, context.settings.worker_reserve_s)
         self._taking = Taking(redis, self._fair, context.settings.queue_key)
         self._settlers: dict[Kind, Callable[[Context, str, int, str, ChildExit], None]] = {
             "import": settle_import,
@@ -82,6 +82,7 @@ class RegnfWorker(ResilientWorker):
         }
         self._job_limits = JobLimits.of(context.settings)
         self._exceeded: str | None = None
+        self._niceness = 0
         self._started = 0.0
         self._limit_s = 0.0
         self._late = False
@@ -126,6 +127,7 @@ class RegnfWorker(ResilientWorker):
         self._late = self._given_back = False
         self._exceeded = None
         oom_kills = kernel.oom_kills()
+        self._niceness = self._niceness_of(work)
         self.begin_job(job)
         try:
             end = self._run_child(job, queue)
@@ -143,6 +145,15 @@ class RegnfWorker(ResilientWorker):
         """Have the caller pay for the time. When Redis refuses, the estimate stands."""
         seconds = time.monotonic() - self._started
         self._if_possible("charging for the time", lambda: self._fair.finish(work.name, seconds))
+
+    def _niceness_of(self, work: Work) -> int:
+        """By how much the work gives way at the processor: the more, the further its caller is above its share."""
+        most = self._context.settings.job_niceness
+        try:
+            return min(most, round(most * self._fair.excess(work.name))) if most else 0
+        except RedisError as error:
+            self.log.warning("job %s runs with the usual priority: %s", work.name, error)
+            return 0
 
     def main_work_horse(self, job: Any, queue: Any) -> None:
         """What the child does: it runs one of our functions, never what RQ would import. Does not return."""
@@ -171,6 +182,7 @@ class RegnfWorker(ResilientWorker):
             os.setpgrp()
             kernel.die_with_parent(parent)
             kernel.prefer_as_oom_victim()
+            kernel.give_way(self._niceness)
             self._scratch.use()
             if limited:
                 self._job_limits.hold_here()

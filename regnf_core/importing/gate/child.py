@@ -59,6 +59,7 @@ def run_child(
         start_new_session=True,
         close_fds=True,
     )
+    _inherit_priority(process.pid)
     stopped: Stopped | None = "late"
     watch = Watch(folder, folder_bytes)
     said = (bytearray(), bytearray())
@@ -77,6 +78,12 @@ def run_child(
         stderr=bytes(said[1]),
         cpu_seconds=cpu_seconds,
     )
+
+
+def _inherit_priority(pid: int) -> None:
+    """Where Linux schedules sessions as groups, the child's new one gives way as much as this process does."""
+    with contextlib.suppress(OSError):
+        Path(f"/proc/{pid}/autogroup").write_text(str(os.getpriority(os.PRIO_PROCESS, 0)))
 
 
 def _end(process: subprocess.Popen[bytes]) -> tuple[int, float]:
