@@ -1,4 +1,8 @@
-"""Processes killed at random while fields are imported and registered: what was accepted has to end whole."""
+"""Processes killed at random while fields are imported and registered: what was accepted has to end whole.
+
+It has to end within four minutes of the last death. It may end without a result only if processes have died more often
+meanwhile than the service repeats work.
+"""
 
 from __future__ import annotations
 
@@ -12,34 +16,32 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from typing import Any
 
-import httpx
 import numpy as np
 
+from benchmarks.attacks.deaths import Deaths
 from benchmarks.attacks.outcome import Outcome
+from benchmarks.attacks.persistent_client import PersistentClient
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_state.manifest import manifest_key
 from tests.worker.bench import children_of
 
 _CLIENTS = 4
-_MOST_S = 240.0
 _SETTINGS: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 8.0, "rate_limit_per_s": 0}
 
 
 def attack_by_kills(folder: Path, kills: int, seed: int) -> Outcome:
     """Clients upload a new room and register in it, over and over, until ``kills`` processes were killed."""
-    outcome, stop = Outcome(), threading.Event()
+    outcome, stop, deaths = Outcome(), threading.Event(), Deaths()
     with running_house(folder, workers=2, **_SETTINGS) as house:
         pair = write_small_pair(folder)
-        chair = _upload(house, pair.object.read_bytes(), outcome)
+        client = PersistentClient(house, outcome, deaths)
+        chair = client.upload(pair.object.read_bytes())
         with ThreadPoolExecutor(_CLIENTS + 1) as pool:
-            killer = pool.submit(_kill, house, kills, seed, outcome, stop)
-            clients = [pool.submit(_client, house, pair, chair, n, outcome, stop) for n in range(_CLIENTS)]
-            killer.result()
-            for client in clients:
-                client.result()
+            killer = pool.submit(_kill, house, kills, Random(seed), outcome, stop, deaths)
+            goings = [pool.submit(_go_on, client, pair, chair, number, stop) for number in range(_CLIENTS)]
+            for going in (killer, *goings):
+                going.result()
         end = time.monotonic() + 60
         while (left := house.temporary_files()) and time.monotonic() < end:
             time.sleep(0.5)
@@ -47,8 +49,7 @@ def attack_by_kills(folder: Path, kills: int, seed: int) -> Outcome:
     return outcome
 
 
-def _kill(house: House, kills: int, seed: int, outcome: Outcome, stop: threading.Event) -> None:
-    random = Random(seed)
+def _kill(house: House, kills: int, random: Random, outcome: Outcome, stop: threading.Event, deaths: Deaths) -> None:
     deeds: dict[str, Callable[[], bool]] = {
         "worker": lambda: _worker(house, random),
         "process of a job or import": lambda: _inner(house, random, deep=False),
@@ -63,7 +64,7 @@ def _kill(house: House, kills: int, seed: int, outcome: Outcome, stop: threading
         while outcome.kills < kills:
             time.sleep(random.uniform(1.0, 6.0))
             name = random.choice(list(deeds))
-            if deeds[name]():
+            if deaths.during(name, deeds[name]):
                 outcome.kills += 1
                 outcome.ends[f"killed: {name}"] += 1
     finally:
@@ -125,17 +126,17 @@ def _redis(house: House) -> bool:
     return True
 
 
-def _client(house: House, pair: SmallPair, chair: str, number: int, outcome: Outcome, stop: threading.Event) -> None:
+def _go_on(client: PersistentClient, pair: SmallPair, chair: str, number: int, stop: threading.Event) -> None:
     """Upload a room nobody has uploaded, register in it, check the result; until told to stop."""
     turn = 0
     while not stop.is_set():
         turn += 1
         try:
-            room = _upload(house, _variant(pair, number * 100_000 + turn), outcome)
-            request = {"scene": room, "object": chair, "detection": pair.detection, "seed": turn}
-            _register(house, request, outcome)
+            room = client.upload(_variant(pair, number * 100_000 + turn))
+            if room is not None:
+                client.register({"scene": room, "object": chair, "detection": pair.detection, "seed": turn})
         except (TimeoutError, AssertionError) as error:
-            outcome.fault(f"client {number}, turn {turn}: {error}")
+            client.outcome.fault(f"client {number}, turn {turn}: {error}")
 
 
 def _variant(pair: SmallPair, number: int) -> bytes:
@@ -150,63 +151,3 @@ def _variant(pair: SmallPair, number: int) -> bytes:
     data = path.read_bytes()
     path.unlink()
     return data
-
-
-def _upload(house: House, data: bytes, outcome: Outcome) -> str:
-    answer = _ask(lambda: httpx.post(f"{house.address}/fields", content=data, timeout=60), (200, 201, 202), outcome)
-    place = f"{house.address}{answer.headers['Location']}"
-    outcome.inputs += 1
-    document = _followed(place, lambda one: one["state"] != "validating", outcome)
-    outcome.ends[f"field {document['state']}"] += 1
-    assert document["state"] == "ready", f"an upload ended as {document.get('error')}"
-    return str(document["sha256"])
-
-
-def _register(house: House, request: dict[str, Any], outcome: Outcome) -> None:
-    answer = _ask(lambda: httpx.post(f"{house.address}/register", json=request, timeout=60), (200, 202), outcome)
-    job = answer.json()["id"]
-    outcome.inputs += 1
-    document = _followed(f"{house.address}/jobs/{job}", lambda one: one["status"] in _ENDS, outcome)
-    reason = (document.get("error") or {}).get("reason", "")
-    outcome.ends[f"job {document['status']} {reason}".strip()] += 1
-    if document["status"] == "failed":
-        assert reason == "WORKER_LOST", f"job {job} failed: {reason}"
-        return
-    result = _ask(lambda: httpx.get(f"{house.address}/jobs/{job}/result", timeout=60), (200,), outcome).json()
-    assert result["verdict"] == "registered", f"job {job}: {result['verdict']}"
-    manifests = list((house.folder / "state" / "blobs").glob(manifest_key(job)))
-    assert len(manifests) == 1, f"job {job} has {len(manifests)} manifests"
-
-
-_ENDS = ("successful", "failed", "dismissed")
-
-
-def _followed(place: str, ended: Callable[[dict[str, Any]], bool], outcome: Outcome) -> dict[str, Any]:
-    end = time.monotonic() + _MOST_S
-    while True:
-        document: dict[str, Any] = _ask(lambda: httpx.get(place, timeout=60), (200,), outcome).json()
-        if ended(document):
-            return document
-        if time.monotonic() > end:
-            raise TimeoutError(f"{place} has not ended after {_MOST_S:.0f} s: {str(document)[:400]}")
-        time.sleep(0.2)
-
-
-def _ask(call: Callable[[], httpx.Response], statuses: tuple[int, ...], outcome: Outcome) -> httpx.Response:
-    """An answer with one of the statuses: asked for again while the service is away, as a client should."""
-    end = time.monotonic() + _MOST_S
-    while True:
-        try:
-            answer = call()
-        except httpx.TransportError as error:
-            outcome.ends[f"asked again: {type(error).__name__}"] += 1
-        else:
-            if answer.status_code in statuses:
-                return answer
-            reason = answer.json().get("reason", "")
-            outcome.ends[f"asked again: {answer.status_code} {reason}"] += 1
-            if answer.status_code not in (404, 409, 429, 503, 507):
-                raise AssertionError(f"{answer.request.url}: {answer.status_code} {reason}")
-        if time.monotonic() > end:
-            raise TimeoutError(f"no answer within {_MOST_S:.0f} s")
-        time.sleep(0.3)
