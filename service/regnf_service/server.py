@@ -44,6 +44,7 @@ class GuardedServer(uvicorn.Server):
             log_config=None,
             access_log=False,
             server_header=False,
+            proxy_headers=False,  # any client on loopback could choose the address that its requests count for
             lifespan="on",
             timeout_graceful_shutdown=_DRAIN_S,
         )

@@ -1,4 +1,7 @@
-"""What routes are given: the services, and the small readings of a request that several of them share."""
+"""What routes are given: the services, and the small readings of a request that several of them share.
+
+All are coroutines: the framework would run a plain function in a thread, which costs more than most answers.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,19 @@ from starlette.requests import Request
 from regnf_service.services import Services
 
 
-def services_of(request: Request) -> Services:
+async def services_of(request: Request) -> Services:
     services: Services = request.app.state.services
     return services
 
 
-def prefix_of(request: Request) -> str:
+async def prefix_of(request: Request) -> str:
     """What the caller's paths begin with: "" or "/v1", behind whatever a proxy put in front."""
     root = str(request.scope.get("root_path", ""))
     path = request.scope["path"].removeprefix(root)
     return root + ("/v1" if path == "/v1" or path.startswith("/v1/") else "")
 
 
-def caller_of_request(request: Request) -> str:
+async def caller_of_request(request: Request) -> str:
     """Whose call it is."""
     caller: str = request.state.caller
     return caller

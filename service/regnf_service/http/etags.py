@@ -48,7 +48,7 @@ def parse_if_none_match(header: str | None) -> IfNoneMatch:
     return IfNoneMatch(True, frozenset(_TAG.findall(header)))
 
 
-def _of_request(
+async def _of_request(
     if_none_match: Annotated[
         str | None, Header(description="One or several ETags, or `*`: 304 when one of them is the current one.")
     ] = None,
