@@ -21,6 +21,7 @@ from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
 from regnf_service.http.request_gate import RequestGate
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
+from regnf_service.http.turns import TurnGate
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics
 from regnf_service.services import Services
@@ -79,7 +80,6 @@ def _middleware(
     settings = services.settings
     gate = Middleware(
         TokenGate,
-        callers=callers,
         needs_token=settings.needs_token,
         allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
@@ -87,7 +87,8 @@ def _middleware(
     if limiter is not None:
         limits.append(Middleware(RateGate, limiter=limiter))
     hosts = Middleware(OriginGate, hosts=allowed_hosts(settings))
-    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), hosts, gate, *limits]
+    turns = Middleware(TurnGate, callers=callers if settings.needs_token else {})
+    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), turns, hosts, gate, *limits]
 
 
 def _include_routers(app: FastAPI, **how: Any) -> None:

@@ -12,6 +12,7 @@ from redis import Redis
 from regnf_service.bytes_under_way import UnderWay
 from regnf_service.concurrency import Slots, Waiters
 from regnf_service.job_watch import JobWatch
+from regnf_service.upload_slots import UploadSlots
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
@@ -64,9 +65,9 @@ class Services:
         return Slots(self.settings.max_requests_per_caller, "TOO_MANY_REQUESTS_AT_ONCE")
 
     @cached_property
-    def uploads(self) -> Slots:
+    def uploads(self) -> UploadSlots:
         """Uploads that are under way."""
-        return Slots(self.settings.max_uploads_per_caller, "TOO_MANY_UPLOADS")
+        return UploadSlots(self.settings.max_uploads_per_caller)
 
     @cached_property
     def under_way(self) -> UnderWay:

@@ -13,7 +13,7 @@ from redis import Redis
 
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.test_slow_clients import ended, submit
-from tests.contract.world import World, assert_refused, make_world
+from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
 MOST = 8
 TOKENS = frozenset({"alice:the-secret-of-alice", "bob:the-secret-of-bob"})
@@ -40,7 +40,10 @@ def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
 def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """A real API where an address has few requests in progress."""
     folder = tmp_path_factory.mktemp("narrow")
-    limits = {"max_requests_per_caller": MOST, "max_connections": 3 * MOST, "max_connections_per_address": 2 * MOST}
+    limits = {
+        "max_requests_per_caller": MOST, "max_connections": 3 * MOST, "max_connections_per_address": 2 * MOST,
+        "max_uploads_per_caller": 3,
+    }  # fmt: skip
     with live_service(folder, with_worker=False, **limits) as started:
         yield started
 
@@ -104,19 +107,53 @@ def at_hand(connection: socket.socket) -> bytes:
         return b""
 
 
-@pytest.mark.parametrize("count", [3, 40])
-def test_requests_that_do_not_wait_for_answers_are_not_all_answered(narrow: Live, count: int) -> None:
+def test_requests_sent_ahead_are_answered_one_after_the_other(narrow: Live) -> None:
+    last = REQUEST.replace(b"localhost\r\n", b"localhost\r\nConnection: close\r\n")
     with narrow.connect() as connection:
-        connection.sendall(REQUEST * count)
-        text = ended(connection)
-    first, second = text.lower().split(b"http/1.1 200 ")[1:]
-    assert b"connection: close" not in first.partition(b"\r\n\r\n")[0]
-    assert b"connection: close" in second.partition(b"\r\n\r\n")[0]
+        connection.sendall(REQUEST * 30 + last)
+        assert ended(connection).count(b"HTTP/1.1 200 ") == 31
 
 
-def test_two_requests_at_once_are_answered_and_more_one_by_one(narrow: Live) -> None:
-    with narrow.client() as client, narrow.connect() as connection:
-        for _ in range(5):
-            assert client.get("/version").status_code == 200
-        connection.sendall(REQUEST + REQUEST.replace(b"localhost\r\n", b"localhost\r\nConnection: close\r\n"))
-        assert ended(connection).count(b"HTTP/1.1 200 ") == 2
+def test_connections_that_ask_ahead_make_room(narrow: Live) -> None:
+    """As many as an address may have, each with something to answer all the time, and a client that does not read."""
+    with ExitStack() as stack:
+        for _ in range(2 * MOST):
+            stack.enter_context(narrow.connect()).sendall(REQUEST * 200)
+        with narrow.client() as honest:
+            assert eventually(lambda: answered(honest, "/version"), "an answer", 10)
+
+
+def test_a_client_does_not_choose_the_address_it_counts_for(narrow: Live) -> None:
+    with narrow.client() as client, ExitStack() as stack:
+        job = submit(client)
+        held = []
+        for number in range(2 * MOST):
+            head = f"GET /jobs/{job}?wait=30 HTTP/1.1\r\nHost: localhost\r\nX-Forwarded-For: 10.0.0.{number}\r\n\r\n"
+            one = stack.enter_context(
+                socket.create_connection(("127.0.0.1", narrow.port), timeout=20, source_address=("127.0.0.4", 0))
+            )
+            one.sendall(head.encode())
+            held.append(one)
+        refused = 0
+
+        def all_refused() -> bool:
+            nonlocal refused
+            refused += sum(b"TOO_MANY_REQUESTS_AT_ONCE" in at_hand(one) for one in held)
+            return refused >= MOST
+
+        assert eventually(all_refused, "the refusals", 10)
+        client.post(f"/jobs/{job}/cancel")
+
+
+def test_slow_uploads_make_room_for_another_of_the_same_address(narrow: Live) -> None:
+    """Each would have half a minute for its next byte, if nobody else asked."""
+    data = field_bytes("honest beside slow uploads", 1 << 20)
+    with ExitStack() as stack, narrow.client() as honest:
+        slow = [stack.enter_context(narrow.connect()) for _ in range(3)]
+        for one in slow:
+            one.sendall(b"POST /fields HTTP/1.1\r\nHost: localhost\r\nContent-Length: 4000000\r\n\r\n" + data[:600])
+        assert honest.put(f"/fields/{sha256(data)}", content=data).status_code == 201
+        assert honest.delete(f"/fields/{sha256(data)}").status_code == 204
+        told = [text for text in map(at_hand, slow) if text]
+    assert len(told) == 1
+    assert b"UPLOAD_STALLED" in told[0]

@@ -19,7 +19,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, s
 from regnf_service.bytes_under_way import Claim
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.blobs.base import BlobStore, BlobWriter
+from regnf_state.blobs.base import BlobWriter
 
 _BLOCK_BYTES = 1 << 20
 _Result = TypeVar("_Result")
@@ -95,18 +95,10 @@ class Upload:
 
 
 @asynccontextmanager
-async def open_upload(services: Services, caller: str, claim: Claim) -> AsyncIterator[Upload]:
-    """A new upload of a caller into the blob store, within the settings' limits. Raises Problem TOO_MANY_UPLOADS."""
-    with services.uploads.held(caller):
-        limit, limiter = services.settings.max_upload_bytes, services.upload_limiter
-        async with _writing(services.blobs, limit, limiter, claim) as upload:
-            yield upload
-
-
-@asynccontextmanager
-async def _writing(blobs: BlobStore, limit: int, limiter: CapacityLimiter, claim: Claim) -> AsyncIterator[Upload]:
-    """An upload of at most ``limit`` bytes; ``limiter`` caps the threads that all uploads together may hold."""
-    writer = blobs.writer()
+async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
+    """A new upload into the blob store, within the settings' limits."""
+    limit, limiter = services.settings.max_upload_bytes, services.upload_limiter
+    writer = services.blobs.writer()
     opened = await to_thread.run_sync(writer.__enter__, limiter=limiter)
     try:
         yield Upload(opened, limit, limiter, claim)

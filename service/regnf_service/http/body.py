@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from collections.abc import AsyncIterator
 
 from starlette.requests import Request
 
+from regnf_service.http.pace import Pace
 from regnf_service.problem import CLOSE, Problem
 from regnf_state.settings import Settings
 
@@ -33,29 +32,19 @@ def media_type(request: Request) -> str:
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
-async def chunks(
-    request: Request, limit: int, settings: Settings, too_large: str = "UPLOAD_TOO_LARGE"
-) -> AsyncIterator[bytes]:
+async def chunks(request: Request, limit: int, pace: Pace, too_large: str = "UPLOAD_TOO_LARGE") -> AsyncIterator[bytes]:
     """The body as it arrives, at most ``limit`` bytes of it.
 
-    Raises Problem: ``too_large`` by header or by count, UPLOAD_STALLED when nothing comes for the settings' time or all
-    of it is slower than their rate, UPLOAD_INCOMPLETE when the client leaves or the count is not what it declared. Only
-    time spent waiting for the client counts.
+    Raises Problem: ``too_large`` by header or by count, UPLOAD_STALLED when its ``pace`` is too slow, UPLOAD_INCOMPLETE
+    when the client leaves or the count is not what it declared.
     """
     declared = declared_length(request)
     if declared is not None and declared > limit:
         raise Problem(too_large, f"At most {limit} bytes are taken.", headers=CLOSE)
-    received, waited = 0, 0.0
+    received = 0
     more = True
     while more:
-        left = settings.upload_stall_s + received / settings.min_bytes_per_s - waited
-        began = time.monotonic()
-        try:
-            async with asyncio.timeout(min(settings.upload_stall_s, max(0.0, left))):
-                message = await request.receive()
-        except TimeoutError as error:
-            raise Problem("UPLOAD_STALLED", headers=CLOSE) from error
-        waited += time.monotonic() - began
+        message = await pace.next(request)
         if message["type"] == "http.disconnect":
             raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
         data: bytes = message.get("body", b"")
@@ -73,6 +62,6 @@ async def read_small(request: Request, settings: Settings) -> bytes:
     """A whole body for JSON, of at most the settings' size. Raises as ``chunks``, with REQUEST_TOO_LARGE."""
     refuse_encoding(request)
     body = bytearray()
-    async for data in chunks(request, settings.max_request_bytes, settings, "REQUEST_TOO_LARGE"):
+    async for data in chunks(request, settings.max_request_bytes, Pace(settings), "REQUEST_TOO_LARGE"):
         body += data
     return bytes(body)

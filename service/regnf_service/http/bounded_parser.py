@@ -1,4 +1,4 @@
-"""The server's HTTP parser with bounds on what a few bytes may cost it: heads, tiny chunks, requests sent ahead."""
+"""The server's HTTP parser with bounds on what a few bytes may cost it: heads, tiny chunks."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ _MOST_HEAD_LINES = 128
 _FREE_CHUNKS = 256
 _LEAST_CHUNK_BYTES = 256
 """A body of more chunks than those must have chunks of this size on average."""
-_MOST_PIPELINED = 1
-"""Answers of a connection while its next request waits already, but for the last: HTTP clients do not pipeline."""
 _BLANK_LINE = re.compile(rb"\n\r?\n")
 _HEAD_TOO_LARGE = 431
 
@@ -30,7 +28,6 @@ class BoundedParser(h11.Connection):
         super().__init__(h11.SERVER, _MOST_HEAD_BYTES)
         self._clock = clock
         self._chunks = 0
-        self._pipelined = 0
         self.request_at = 0.0
         self.body_bytes = 0
         self.is_paused = False
@@ -53,14 +50,6 @@ class BoundedParser(h11.Connection):
             raise
         return event
 
-    def send(self, event: Any) -> Any:
-        """As the base class. The answer that goes beyond what may be pipelined says that it is the last."""
-        if isinstance(event, h11.Response) and self.is_paused:
-            self._pipelined += 1
-            if self._pipelined > _MOST_PIPELINED:
-                event = _last(event)
-        return super().send(event)
-
     def _check_head(self) -> None:
         data = self.trailing_data[0]
         end = _BLANK_LINE.search(data)
@@ -73,13 +62,6 @@ class BoundedParser(h11.Connection):
         self._chunks += event.chunk_start
         if self._chunks > _FREE_CHUNKS and self.body_bytes < _LEAST_CHUNK_BYTES * (self._chunks - _FREE_CHUNKS):
             raise h11.RemoteProtocolError("the chunks are too small")
-
-
-def _last(response: h11.Response) -> h11.Response:
-    headers = [(name, value) for name, value in response.headers if name != b"connection"]
-    return h11.Response(
-        status_code=response.status_code, headers=[*headers, (b"connection", b"close")], reason=response.reason
-    )
 
 
 def _check_framing(request: h11.Request) -> None:

@@ -43,6 +43,10 @@ class Guarded(Protocol):
         """The loop's time by which its client must be done; infinite while it is served."""
         ...
 
+    def must_make_room_by(self) -> float:
+        """The same if another connection has no place. Who is due first has to go."""
+        ...
+
     def has_sent(self) -> bool:
         """Whether something of its client waits to be read."""
         ...
@@ -118,7 +122,7 @@ class Connections:
         candidates = self._ranked.get(site, [])
         while candidates:
             one = candidates.pop()
-            if one in self._open and one.due() < math.inf and not one.has_sent():
+            if one in self._open and one.must_make_room_by() < math.inf and not one.has_sent():
                 self._end(one, politely=False)
                 return True
         return False
@@ -130,7 +134,7 @@ class Connections:
             return
         ranked: dict[str, list[tuple[float, Guarded]]] = defaultdict(list)
         for one in self._open:
-            if (due := one.due()) < math.inf:
+            if (due := one.must_make_room_by()) < math.inf:
                 ranked[one.site].append((due, one))
         self._ranked = {
             site: [one for _, one in sorted(found, key=lambda pair: -pair[0])] for site, found in ranked.items()

@@ -34,13 +34,15 @@ class GuardedProtocol(H11Protocol):
         self._clock = clock
         self._admitted = False
         self._inbox = bytearray()
-        self._waiting_since = self._paused_at = 0.0
+        self.app_state = {**self.app_state, "connection": self}
+        self.quiet_since = self._paused_at = 0.0
+        """When its client was answered last, or connected."""
         self._paused_with = 0
         self._closing_since: float | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self.site = site_of(str((transport.get_extra_info("peername") or ("",))[0]))
-        self._waiting_since = self.loop.time()
+        self.quiet_since = self.loop.time()
         self.transport = transport
         self._admitted = self._held.admit(self)
         if not self._admitted:
@@ -53,6 +55,7 @@ class GuardedProtocol(H11Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self._held.remove(self)
         self._inbox.clear()
+        self.app_state = {}
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -68,7 +71,7 @@ class GuardedProtocol(H11Protocol):
             super().data_received(piece)
 
     def on_response_complete(self) -> None:
-        self._waiting_since = self.loop.time()
+        self.quiet_since = self.loop.time()
         super().on_response_complete()
         self._feed()
 
@@ -97,11 +100,15 @@ class GuardedProtocol(H11Protocol):
         if self.flow.write_paused:
             return self._clock.due(self._paused_at, max(0, self._paused_with - self.unread()))
         if self.cycle is None or self.cycle.response_complete:
-            return self._waiting_since + self._clock.head_s
+            return self.quiet_since + self._clock.head_s
         if self.cycle.more_body and not self.flow.read_paused:
             # the application answers 408 before: this is for what it does not read, and for making room
             return self._clock.due(self.conn.request_at, self.conn.body_bytes) + self._clock.stall_s
         return math.inf
+
+    def must_make_room_by(self) -> float:
+        """The same if another connection has no place: a client that asks ahead counts as one that waits."""
+        return self.quiet_since + self._clock.head_s if self.conn.is_paused else self.due()
 
     def has_sent(self) -> bool:
         """Whether something of the client waits to be read: many connections come in before the first is read."""

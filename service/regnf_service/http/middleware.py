@@ -15,7 +15,6 @@ from regnf_service.http.problems import problem_response
 from regnf_service.http.security_headers import secure
 from regnf_service.http.wrong_tokens import WrongTokens
 from regnf_service.problem import CLOSE, Problem
-from regnf_service.tokens import Callers, caller_of
 from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
 
@@ -99,15 +98,14 @@ def _came_from_outside(scope: Scope) -> bool:
 
 
 class TokenGate:
-    """Refuses every call without one of the tokens, and tells whose it was: ``caller`` in the request's state.
+    """Refuses every call without an ``owner`` in its state, and tells whose it was: ``caller`` in the request's state.
 
     Without tokens it refuses what arrives from beyond loopback, unless ``allow_unauthenticated``: whichever server runs
     the application, wherever it was told to listen.
     """
 
-    def __init__(self, app: ASGIApp, callers: Callers, needs_token: bool, allow_unauthenticated: bool = False) -> None:
+    def __init__(self, app: ASGIApp, needs_token: bool, allow_unauthenticated: bool = False) -> None:
         self._app = app
-        self._callers = callers
         self._needs_token = needs_token
         self._allow_unauthenticated = allow_unauthenticated
         self._wrong = WrongTokens()
@@ -118,11 +116,11 @@ class TokenGate:
             return
         caller = ANONYMOUS
         if self._needs_token:
-            found = caller_of(self._callers, Headers(scope=scope).get("authorization", ""))
-            caller, known = found or ANONYMOUS, found is not None
+            owner = scope["state"]["owner"]
+            caller, known = owner or ANONYMOUS, owner is not None
         else:
             known = self._allow_unauthenticated or not _came_from_outside(scope)
-        scope.setdefault("state", {})["caller"] = caller
+        scope["state"]["caller"] = caller
         problem = None if known or is_open(scope) else self._refusal(scope)
         with log_context(caller=caller):
             if problem is not None:

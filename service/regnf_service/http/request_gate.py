@@ -5,11 +5,10 @@ from __future__ import annotations
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from regnf_service.concurrency import Slots
-from regnf_service.http.connections import site_of
 from regnf_service.http.middleware import is_open
 from regnf_service.http.problems import problem_response
+from regnf_service.http.turns import fair_key
 from regnf_service.problem import Problem
-from regnf_state.ownership import ANONYMOUS
 
 
 class RequestGate:
@@ -26,7 +25,7 @@ class RequestGate:
         if scope["type"] != "http" or is_open(scope):
             await self._app(scope, receive, send)
             return
-        who = _who(scope)
+        who = fair_key(scope, scope["state"]["caller"])
         try:
             self._slots.take(who)
         except Problem as problem:
@@ -36,9 +35,3 @@ class RequestGate:
             await self._app(scope, receive, send)
         finally:
             self._slots.free(who)
-
-
-def _who(scope: Scope) -> str:
-    """A caller's name has no space in it, so that no caller is taken for an address."""
-    caller = str(scope["state"]["caller"])
-    return caller if caller != ANONYMOUS else f"{ANONYMOUS} {site_of((scope.get('client') or ('',))[0])}"

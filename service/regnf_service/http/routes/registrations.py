@@ -16,6 +16,7 @@ from regnf_service.fields.uploads import open_upload
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
+from regnf_service.http.pace import Pace
 from regnf_service.http.parsing import read_body
 from regnf_service.http.routes.documentation import (
     FILE,
@@ -31,6 +32,7 @@ from regnf_service.http.routes.jobs import job_answer
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
+from regnf_service.http.turns import fair_key
 from regnf_service.http.waiting import wait_for
 from regnf_service.jobs.identity import job_id_of
 from regnf_service.jobs.submit import check_fields, check_idempotency_key, submit
@@ -182,13 +184,13 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     besides = 2 * settings.max_request_bytes
     limit = 2 * settings.max_upload_bytes + besides
     declared = body.declared_length(request, besides)
-    room = await in_thread(room_for_bytes, services, caller)
+    pace = Pace(settings)
     async with AsyncExitStack() as stack:
+        await stack.enter_async_context(services.uploads.held(fair_key(request.scope, caller), pace, count=2))
+        room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
-        files = {
-            name: await stack.enter_async_context(open_upload(services, caller, claim)) for name in ("scene", "object")
-        }
-        data = body.chunks(request, limit, settings)
+        files = {name: await stack.enter_async_context(open_upload(services, claim)) for name in ("scene", "object")}
+        data = body.chunks(request, limit, pace)
         texts = {"request": settings.max_request_bytes}
         parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
         missing = [name for name in ("scene", "object", "request") if name not in parts]

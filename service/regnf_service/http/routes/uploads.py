@@ -18,6 +18,7 @@ from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.multipart import boundary_of, read_parts
+from regnf_service.http.pace import Pace
 from regnf_service.http.routes.documentation import (
     FIELD_LINKS,
     FILE,
@@ -29,6 +30,7 @@ from regnf_service.http.routes.documentation import (
 from regnf_service.http.schemas.fields import FieldDocument, field_document
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.schemas.references import reference
+from regnf_service.http.turns import fair_key
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.records import FieldRecord
@@ -84,13 +86,15 @@ async def put_field(
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
     digest = announced_digest(content_digest)
     declared = body.declared_length(request)
-    room = await in_thread(check_room, services, caller, sha256)
-    with services.under_way.claim(caller, room, declared) as claim:
-        async with open_upload(services, caller, claim) as upload:
-            received = await _receive_raw(request, services, upload)
-            if received.sha256 != sha256 or digest not in (None, received.sha256):
-                raise Problem("DIGEST_MISMATCH")
-            taken = await store_upload(services, caller, upload, received)
+    pace = Pace(services.settings)
+    async with services.uploads.held(fair_key(request.scope, caller), pace):
+        room = await in_thread(check_room, services, caller, sha256)
+        with services.under_way.claim(caller, room, declared) as claim:
+            async with open_upload(services, claim) as upload:
+                received = await _receive_raw(request, services, upload, pace)
+                if received.sha256 != sha256 or digest not in (None, received.sha256):
+                    raise Problem("DIGEST_MISMATCH")
+                taken = await store_upload(services, caller, upload, received)
     return _answer(taken, prefix)
 
 
@@ -127,34 +131,34 @@ async def post_field(
     digest = announced_digest(content_digest)
     in_parts = body.media_type(request) == "multipart/form-data"
     declared = body.declared_length(request, besides=2 * DESCRIPTION_BYTES if in_parts else 0)
-    room = await in_thread(room_for_bytes, services, caller)
-    with services.under_way.claim(caller, room, declared) as claim:
-        async with open_upload(services, caller, claim) as upload:
-            if in_parts:
-                received, description = await _receive_parts(request, services, upload, digest)
-            else:
-                received, description = await _receive_raw(request, services, upload), None
-                if digest not in (None, received.sha256):
-                    raise Problem("DIGEST_MISMATCH")
-            taken = await store_upload(services, caller, upload, received, description)
+    pace = Pace(services.settings)
+    async with services.uploads.held(fair_key(request.scope, caller), pace):
+        room = await in_thread(room_for_bytes, services, caller)
+        with services.under_way.claim(caller, room, declared) as claim:
+            async with open_upload(services, claim) as upload:
+                if in_parts:
+                    received, description = await _receive_parts(request, services, upload, pace, digest)
+                else:
+                    received, description = await _receive_raw(request, services, upload, pace), None
+                    if digest not in (None, received.sha256):
+                        raise Problem("DIGEST_MISMATCH")
+                taken = await store_upload(services, caller, upload, received, description)
     return _answer(taken, prefix)
 
 
-async def _receive_raw(request: Request, services: Services, upload: Upload) -> Received:
+async def _receive_raw(request: Request, services: Services, upload: Upload, pace: Pace) -> Received:
     body.refuse_encoding(request)
-    settings = services.settings
-    async for data in body.chunks(request, settings.max_upload_bytes, settings):
+    async for data in body.chunks(request, services.settings.max_upload_bytes, pace):
         await upload.feed(data)
     return await upload.finish()
 
 
 async def _receive_parts(
-    request: Request, services: Services, upload: Upload, digest: str | None
+    request: Request, services: Services, upload: Upload, pace: Pace, digest: str | None
 ) -> tuple[Received, UploadDescription | None]:
     body.refuse_encoding(request)
-    settings = services.settings
-    limit = settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
-    data = body.chunks(request, limit, settings)
+    limit = services.settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
+    data = body.chunks(request, limit, pace)
     if digest is not None:
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES}

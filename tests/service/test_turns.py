@@ -1,0 +1,78 @@
+"""In which order requests begin that came in at the same time."""
+
+from __future__ import annotations
+
+import asyncio
+
+from regnf_service.http.turns import Turns, fair_key
+
+
+def order(arrivals: list[tuple[str, float]]) -> list[tuple[str, float]]:
+    """Of these callers and times, after one that nobody waits for."""
+    seen: list[tuple[str, float]] = []
+
+    async def ask(turns: Turns, who: str, quiet_since: float) -> None:
+        await turns.come(who, quiet_since)
+        seen.append((who, quiet_since))
+
+    async def all_at_once() -> None:
+        turns = Turns()
+        await turns.come("somebody", 0.0)
+        async with asyncio.TaskGroup() as group:
+            for who, quiet_since in arrivals:
+                group.create_task(ask(turns, who, quiet_since))
+
+    asyncio.run(all_at_once())
+    return seen
+
+
+def test_callers_take_turns() -> None:
+    """The first of them comes at once: nobody waits when it asks."""
+    greedy = [("greedy", float(number)) for number in range(50)]
+    names = [who for who, _ in order([*greedy, ("honest", 99.0), ("honest", 98.0)])]
+    assert len(names) == 52
+    assert names[:6].count("honest") == 2
+
+
+def test_who_was_answered_longest_ago_comes_first() -> None:
+    times = [since for _, since in order([("one", since) for since in (5.0, 9.0, 1.0, 7.0, 3.0, 8.0)])]
+    assert times[1:] == sorted(times[1:])
+    assert times[-1] == 9.0
+
+
+def test_one_begins_in_each_turn_of_the_loop() -> None:
+    async def counted() -> int:
+        turns, begun = Turns(), 0
+
+        async def ask() -> None:
+            nonlocal begun
+            await turns.come("caller", 0.0)
+            begun += 1
+
+        asking = [asyncio.create_task(ask()) for _ in range(100)]
+        for _ in range(10):
+            await asyncio.sleep(0)
+        seen = begun
+        await asyncio.gather(*asking)
+        assert begun == 100
+        return seen
+
+    assert asyncio.run(counted()) <= 10
+
+
+def test_who_leaves_keeps_nobody_waiting() -> None:
+    async def leave() -> None:
+        turns = Turns()
+        asking = [asyncio.create_task(turns.come("caller", 0.0)) for _ in range(5)]
+        await asyncio.sleep(0)
+        asking[1].cancel()
+        await asyncio.gather(*asking, return_exceptions=True)
+        await turns.come("caller", 0.0)
+
+    asyncio.run(leave())
+
+
+def test_an_address_is_no_callers_name() -> None:
+    assert fair_key({"client": ("10.1.2.3", 5)}, "anonymous") == "anonymous 10.1.2.3"
+    assert fair_key({"client": ("10.1.2.3", 5)}, "alice") == "alice"
+    assert fair_key({"client": None}, "anonymous") == "anonymous "
