@@ -15,7 +15,7 @@ from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.onnx.elementwise import ELEMENTWISE, Operator
 from regnf_core.fields.onnx.linear import LINEAR
 from regnf_core.fields.onnx.shaping import SHAPING
-from regnf_core.schema.kinds.onnx import OnnxDescription
+from regnf_core.schema.kinds.onnx import OnnxDescription, last_uses
 from regnf_core.schema.onnx_operators import MAX_ELEMENTS
 
 OPERATOR_FUNCTIONS: dict[str, Operator] = ELEMENTWISE | SHAPING | LINEAR
@@ -33,6 +33,8 @@ class Step:
     attributes: dict[str, Any]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    last: tuple[str, ...] = ()
+    """What no later step reads: it is let go of."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,8 @@ class OnnxFunction:
         values: dict[str, Tensor | None] = {**self.known, self.input: filled, "": None}
         for step in self.steps:
             values |= run_step(step, values)
+            for name in step.last:
+                del values[name]
         result = values[self.output]
         if result is None or result.shape not in ((self.batch,), (self.batch, 1)):
             shape = None if result is None else tuple(result.shape)
@@ -136,15 +140,21 @@ def build_onnx(description: OnnxDescription, tensors: Mapping[str, Tensor]) -> F
         known[name] = torch.tensor(constant.values, dtype=_TYPES[constant.type]).reshape(constant.shape)
     steps = []
     shapes_known = {**known, "": None}
+    read_later: set[str] = set()
+    last = last_uses(description.nodes, description.output)
     for number, node in enumerate(description.nodes):
         attributes = {**node.attributes, "outputs": len(node.outputs)}
         where = f"node {number} ({node.op})"
-        step = Step(where, OPERATOR_FUNCTIONS[node.op], attributes, node.inputs, node.outputs)
+        step = Step(where, OPERATOR_FUNCTIONS[node.op], attributes, node.inputs, node.outputs, last[number])
         if all(name in shapes_known for name in node.inputs):
             shapes_known |= run_step(step, shapes_known)
         else:
             steps.append(step)
-    kept = {name for step in steps for name in step.inputs} | {description.output}
+            read_later.update(node.inputs)
+        for name in last[number]:
+            if name not in read_later:
+                shapes_known.pop(name, None)
+    kept = read_later | {description.output}
     settled = {name: value for name, value in shapes_known.items() if name in kept and value is not None}
     function = OnnxFunction(tuple(steps), settled, description.input, description.output, description.batch)
     bounds = torch.tensor(description.function_bounds, dtype=torch.float64)

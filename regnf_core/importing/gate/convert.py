@@ -54,7 +54,7 @@ def convert_file(
 
     converted = _convert(upload, description, limits)
     _require_text(converted.description)
-    require_affordable(converted, limits.work_s)
+    require_affordable(converted, limits)
     converted = _settled(converted)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)

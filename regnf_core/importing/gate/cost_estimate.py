@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.cost.budget import require_within
+from regnf_core.importing.cost.budget import require_room, require_within
 from regnf_core.importing.cost.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
 from regnf_core.importing.cost.mesh_work import mesh_work
 from regnf_core.importing.cost.network_work import network_work
+from regnf_core.importing.cost.onnx_memory import onnx_bytes
 from regnf_core.importing.cost.onnx_work import onnx_work
 from regnf_core.importing.families.converted import ConvertedField, Reading
+from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.mesh import MeshDescription
 from regnf_core.schema.kinds.onnx import OnnxDescription
@@ -19,17 +21,21 @@ from regnf_core.schema.parsing import parse_description
 from regnf_core.schema.safe_format import tensor_specs
 
 
-def require_affordable(converted: ConvertedField, work_s: float) -> float:
+def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float:
     """The estimated seconds of one core for every evaluation of the import.
 
-    Raises FieldFormatError: IMPORT_TOO_COSTLY beyond ``work_s``, and what the description is refused for.
+    Raises FieldFormatError: IMPORT_TOO_COSTLY beyond the limits on work and memory, and what the description is
+    refused for.
     """
     if converted.readings:
         seconds = sum(_seconds_of_reading(reading, TRIAL_SAMPLES) for reading in converted.readings)
         seconds += max(_seconds_of_reading(reading, SAMPLES) for reading in converted.readings)
     else:
         seconds = _seconds(converted.description, converted.tensors, calls_of_check(SAMPLES))
-    require_within(seconds, work_s)
+    require_within(seconds, limits.work_s)
+    description = parse_description(converted.description)
+    if isinstance(description, OnnxDescription):
+        require_room(onnx_bytes(description, converted.tensors), limits.memory_bytes)
     return seconds
 
 

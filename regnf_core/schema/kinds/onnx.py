@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -88,3 +88,13 @@ class OnnxDescription(FieldDescription):
             require(settled, f"{where}: its shape would depend on the points")
             by_points |= dict.fromkeys(node.outputs, any(moving) and node.op not in SHAPE_ONLY)
         require(by_points.get(self.output, False), "the output does not depend on the points")
+
+
+def last_uses(nodes: Sequence[NodeDescription], output: str) -> list[tuple[str, ...]]:
+    """For each node the names that nothing after it reads; ``output`` is read in the end."""
+    read = {"", output}
+    found = []
+    for node in reversed(nodes):
+        found.append(tuple(dict.fromkeys(name for name in (*node.inputs, *node.outputs) if name not in read)))
+        read.update(found[-1])
+    return found[::-1]

@@ -123,7 +123,7 @@ def _file(data: bytes, folder: Path) -> None:
     try:
         converted = convert._convert(upload, None, _LIMITS)
         convert._require_text(converted.description)
-        require_affordable(converted, _LIMITS.work_s)
+        require_affordable(converted, _LIMITS)
         write_safe_field(out, converted.description, converted.tensors)
     finally:
         upload.unlink()
