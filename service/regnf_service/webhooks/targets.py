@@ -18,8 +18,13 @@ _PORTS = {"http": 80, "https": 443}
 _MAX_URL_CHARS = 2000
 _UNICAST = ipaddress.ip_network("2000::/3")
 """All of IPv6 that is given out to the Internet: what lies beyond is local, translated, or not in use."""
-_SPECIAL = tuple(map(ipaddress.ip_network, ("2001::/23", "2001:db8::/32", "2002::/16", "3fff::/20")))
-"""Within it: protocols' own (Teredo among them), examples, addresses that carry IPv4 ones, and examples again."""
+_SPECIAL_NAMES = (
+    "192.0.0.0/24 192.31.196.0/24 192.52.193.0/24 192.88.99.0/24 192.175.48.0/24 "
+    "2001::/23 2001:db8::/32 2002::/16 2620:4f:8000::/48 3fff::/20"
+)
+_SPECIAL = tuple(map(ipaddress.ip_network, _SPECIAL_NAMES.split()))
+"""Within the rest, by IANA's registries of special-purpose addresses: protocols' own (Teredo among them), anycast of
+AS112, AMT and relays of 6to4, addresses that carry IPv4 ones, examples. Python counts some of them as global."""
 
 
 class Target(NamedTuple):
@@ -83,8 +88,6 @@ def _plain(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
 def is_public(address: str) -> bool:
     """Whether an address belongs to the public Internet, those that carry another address inside aside."""
     found = _plain(address)
-    if isinstance(found, ipaddress.IPv6Address) and (
-        found not in _UNICAST or any(found in network for network in _SPECIAL)
-    ):
+    if any(found in network for network in _SPECIAL) or (found.version == 6 and found not in _UNICAST):
         return False
     return found.is_global and not found.is_multicast and not found.is_reserved
