@@ -21,7 +21,8 @@ SETTINGS = {f"REGNF_{name.upper()}" for name in Settings.model_fields}
 OPEN = ["auth.allowUnauthenticated=true"]
 S3 = ["storage.kind=s3", "storage.s3.url=s3://bucket/regnf"]
 FULL = ["auth.existingSecret=callers", "redis.existingSecret=redis", "autoscaling.enabled=true", *S3,
-        "storage.s3.existingSecret=keys", "metrics.serviceMonitor=true", "worker.device=cuda",
+        "queue.existingSecret=signer", "storage.s3.existingSecret=keys", "metrics.serviceMonitor=true",
+        "worker.device=cuda",
         "webhooks.hosts={hooks.example.org,http://10.0.0.1:80}", "webhooks.existingSecret=hooks",
         "api.ingress.enabled=true", "api.ingress.host=regnf.example.org", "api.ingress.tlsSecret=tls",
         "settings.REGNF_RETENTION_S=3600"]  # fmt: skip
@@ -153,6 +154,19 @@ def test_full_uses_what_is_there() -> None:
     assert "replicas" not in full["Deployment", "demo-worker"]["spec"], "the autoscaler's to say"
 
 
+def test_front_end_and_workers_sign_the_queue_with_one_key() -> None:
+    for settings, name in ((OPEN, "demo-queue"), (FULL, "signer")):
+        rendered = render(settings)
+        told = [environment(pods(rendered)[pod])["REGNF_QUEUE_KEY"] for pod in ("demo-api", "demo-worker")]
+        assert told == [{"secretKeyRef": {"name": name, "key": "key"}}] * 2
+        assert (("Secret", name) in rendered) == (settings is OPEN)
+    drawn = [render(OPEN)["Secret", "demo-queue"]["stringData"]["key"] for _ in range(2)]
+    assert [len(key) for key in drawn] == [48, 48]
+    assert drawn[0] != drawn[1]
+    given = render([*OPEN, "queue.key=abcdefghijklmnop"])["Secret", "demo-queue"]["stringData"]
+    assert given == {"key": "abcdefghijklmnop"}
+
+
 def test_workers_are_scaled_by_what_is_unfinished() -> None:
     full = render(FULL)
     scaled = full["ScaledObject", "demo-worker"]["spec"]
@@ -170,6 +184,8 @@ def test_workers_are_scaled_by_what_is_unfinished() -> None:
         ([], "auth.existingSecret"),
         ([*OPEN, "storage.kind=nfs"], "storage"),
         ([*OPEN, "redis.password=a b"], "password"),
+        ([*OPEN, "queue.key=short"], "queue"),
+        ([*OPEN, "settings.REGNF_QUEUE_KEY=abcdefghijklmnop"], "settings"),
         ([*OPEN, "storage.kind=s3"], "storage.s3.url"),
         ([*OPEN, "worker.device=tpu"], "device"),
         ([*OPEN, "api.replicas=0"], "replicas"),

@@ -30,6 +30,8 @@ capabilities: {drop: [ALL]}
 {{- define "regnf.environment" -}}
 - name: REGNF_REDIS_URL
   valueFrom: {secretKeyRef: {name: {{ .Values.redis.existingSecret | default (printf "%s-redis" (include "regnf.name" .)) }}, key: url}}
+- name: REGNF_QUEUE_KEY
+  valueFrom: {secretKeyRef: {name: {{ .Values.queue.existingSecret | default (printf "%s-queue" (include "regnf.name" .)) }}, key: key}}
 - {name: REGNF_STATE_DIR, value: /var/lib/regnf}
 - {name: REGNF_LOG_FORMAT, value: json}
 {{- if eq .Values.storage.kind "s3" }}
