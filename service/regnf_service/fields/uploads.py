@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import anyio
@@ -19,7 +20,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, s
 from regnf_service.bytes_under_way import Claim
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.blobs.base import BlobWriter
+from regnf_state.blobs.base import BlobStore, BlobWriter
 
 _BLOCK_BYTES = 1 << 20
 _Result = TypeVar("_Result")
@@ -36,8 +37,11 @@ class Received:
 class Upload:
     """Takes an upload's bytes in order. Use ``open_upload``; ``commit`` gives the bytes their name."""
 
-    def __init__(self, writer: BlobWriter, limit: int, limiter: CapacityLimiter, claim: Claim) -> None:
-        self._writer = writer
+    def __init__(self, blobs: BlobStore, limit: int, limiter: CapacityLimiter, claim: Claim) -> None:
+        self._blobs = blobs
+        self._opened = ExitStack()
+        self._writer: BlobWriter | None = None
+        """From the first block on: an upload that never sends as much costs the store nothing."""
         self._limit = limit
         self._limiter = limiter
         self._claim = claim
@@ -71,8 +75,14 @@ class Upload:
 
     async def commit(self, key: str) -> None:
         """Name the bytes, whole and at once."""
-        await self._in_thread(lambda: self._writer.commit(key))
+        assert self._writer is not None, "commit comes after finish"
+        await self._in_thread(partial(self._writer.commit, key))
         self._claim.end()
+
+    async def close(self) -> None:
+        """What has no name goes."""
+        if self._writer is not None:
+            await self._in_thread(self._opened.close)
 
     def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
@@ -86,6 +96,8 @@ class Upload:
         await self._in_thread(lambda: self._take(block))
 
     def _take(self, block: bytearray) -> None:
+        if self._writer is None:
+            self._writer = self._opened.enter_context(self._blobs.writer())
         self._hash.update(block)
         self._writer.write(bytes(block))
         self._bytes += len(block)
@@ -97,12 +109,10 @@ class Upload:
 @asynccontextmanager
 async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
     """A new upload into the blob store, within the settings' limits."""
-    limit, limiter = services.settings.max_upload_bytes, services.upload_limiter
-    writer = services.blobs.writer()
-    opened = await to_thread.run_sync(writer.__enter__, limiter=limiter)
+    upload = Upload(services.blobs, services.settings.max_upload_bytes, services.upload_limiter, claim)
     try:
-        yield Upload(opened, limit, limiter, claim)
+        yield upload
     finally:
         # also when the request is cancelled: what was written must go
         with anyio.CancelScope(shield=True):
-            await to_thread.run_sync(lambda: writer.__exit__(None, None, None), limiter=limiter)
+            await upload.close()
