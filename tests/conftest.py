@@ -10,7 +10,7 @@ from functools import cache
 import pytest
 from redis import Redis
 
-from regnf_state.records import RecordStore
+from regnf_state.record_store import RecordStore
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.grouping import pytest_collection_modifyitems

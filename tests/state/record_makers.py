@@ -1,6 +1,7 @@
 """Records of jobs and fields for tests of record stores."""
 
-from regnf_state.records import FieldRecord, JobRecord, RecordStore
+from regnf_state.record_store import RecordStore
+from regnf_state.records import FieldRecord, JobRecord
 
 SCENE, OBJECT = "a" * 64, "b" * 64
 

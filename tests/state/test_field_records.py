@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 
 from regnf_state.ownership import reference_of
-from regnf_state.records import Quota, QuotaError, RecordStore, StaleAttemptError
+from regnf_state.record_store import RecordStore
+from regnf_state.records import Quota, QuotaError, StaleAttemptError
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
 from tests.state.record_makers import OBJECT, SCENE, field, job, started

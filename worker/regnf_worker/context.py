@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.queue import JobQueue
-from regnf_state.records import RecordStore
+from regnf_state.record_store import RecordStore
 from regnf_state.settings import Settings
 from regnf_state.stores import open_stores
 

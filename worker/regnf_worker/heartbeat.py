@@ -13,7 +13,8 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError
-from regnf_state.records import JobRecord, RecordStore, StaleAttemptError
+from regnf_state.record_store import RecordStore
+from regnf_state.records import JobRecord, StaleAttemptError
 from regnf_worker.retry import retry_until_available
 
 STOP_WITHIN_S = 5.0

@@ -22,7 +22,8 @@ from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.rebuild import Rebuilder
 from regnf_state.problems import problem_document
 from regnf_state.queue import JobQueue
-from regnf_state.records import FieldRecord, JobRecord, RecordStore, StaleAttemptError
+from regnf_state.record_store import RecordStore
+from regnf_state.records import FieldRecord, JobRecord, StaleAttemptError
 from regnf_state.redis.keys import PREFIX
 from regnf_state.settings import Settings
 

@@ -10,7 +10,8 @@ from regnf_service.times import rfc3339
 from regnf_service.webhooks.sender import Sender, SendError
 from regnf_service.webhooks.signing import Secrets, signed_headers
 from regnf_service.webhooks.targets import AllowList
-from regnf_state.records import FINISHED, JobRecord, RecordStore, UnreadableRecordError
+from regnf_state.record_store import RecordStore
+from regnf_state.records import FINISHED, JobRecord, UnreadableRecordError
 from regnf_state.redis.webhook_outbox import Delivery, Message, RedisOutbox
 
 logger = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from regnf_service.webhooks.policy import Webhooks
 from regnf_service.webhooks.sender import HttpSender
 from regnf_service.webhooks.signing import read_secrets
 from regnf_service.webhooks.targets import AllowList
-from regnf_state.records import RecordStore
+from regnf_state.record_store import RecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
 from regnf_state.settings import Settings
 

@@ -1,0 +1,160 @@
+"""The store that keeps the records of fields and jobs: what every kind of store can do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+from regnf_state.ownership import ANONYMOUS
+from regnf_state.pages import Page, Position
+from regnf_state.records import NO_QUOTA, FieldRecord, JobEvent, JobNews, JobRecord, Quota
+
+
+class RecordStore(Protocol):
+    """Where records live. Every method is blocking; the API calls them off the event loop or through short threads."""
+
+    def now(self) -> float:
+        """The store's clock, seconds since the epoch."""
+        ...
+
+    def set_if_absent(self, key: str, value: str, ttl_s: int, owner: str = ANONYMOUS) -> str:
+        """Bind ``value`` to ``key`` for ``ttl_s`` seconds unless it is bound already; returns what is bound. Atomic.
+
+        It counts as one of the owner's, who has ten thousand at most: beyond that the oldest is forgotten.
+        """
+        ...
+
+    # jobs
+    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
+        """Store a new job, or return the one that exists under its id (False).
+
+        A finished job that failed or was dismissed is started anew as the next attempt (True): enqueue what is
+        returned, with its attempt. A webhook of ``record`` that the job does not have yet is added to it, and told at
+        once if the job has finished. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
+        QuotaError when the owner, or the job of webhooks, has as many as it may.
+        """
+        ...
+
+    def get_job(self, job_id: str) -> JobRecord | None: ...
+
+    def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
+        """Whether a job of this id and owner was kept once and has outlived its retention."""
+        ...
+
+    def list_jobs(
+        self, status: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[JobRecord]:
+        """Newest first, older than ``before`` = (created, id); ``owner`` None: everybody's."""
+        ...
+
+    def update_job(self, job_id: str, attempt: int, **changes: Any) -> JobRecord:
+        """Compare-and-set: applies ``changes`` if ``attempt`` is current and the state machine allows it.
+
+        A change of status must be a move: the second attempt to set ``running`` fails, so it serves as a claim.
+        Raises StaleAttemptError. Publishes an event whenever status, phase or progress changes.
+        """
+        ...
+
+    def heartbeat(self, job_id: str, attempt: int) -> JobRecord:
+        """Say that the running attempt lives; the record returned tells whether to stop. Raises StaleAttemptError."""
+        ...
+
+    def requeue_job(self, job_id: str, attempt: int, *, lost: bool = True) -> JobRecord:
+        """A running job back to accepted as its next attempt, fencing the old one off. Raises StaleAttemptError.
+
+        ``lost``: its worker vanished, which counts in ``requeues``; otherwise the worker gave it back in good order.
+        """
+        ...
+
+    def request_cancel(self, job_id: str) -> JobRecord | None:
+        """Set cancel_requested; an accepted job is dismissed at once, a running one when its worker notices."""
+        ...
+
+    def delete_job(self, job_id: str) -> bool:
+        """Forget a finished job wholly; False when there is none. Raises StaleAttemptError while it is active."""
+        ...
+
+    def active_jobs(self) -> list[JobRecord]:
+        """Every accepted or running job."""
+        ...
+
+    def expire_jobs(self) -> list[str]:
+        """Delete what is left of finished jobs after their retention; their ids, so that their files go too."""
+        ...
+
+    def queue_position(self, job_id: str) -> int | None:
+        """1 for the accepted job that is next; None for a job that does not wait."""
+        ...
+
+    def events(self, job_id: str, after: str | None) -> list[JobEvent]:
+        """Events after the given id (None: from the start). Raises ValueError when ``after`` is no event id."""
+        ...
+
+    def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
+        """For each (job id, event id): the job, and its events after that one. One round trip for all of them."""
+        ...
+
+    # fields
+    def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
+        """Store a new field, or return the one that exists (False).
+
+        A rejected field starts anew with what ``record`` says, as the next attempt (True): enqueue its import.
+        Rejected ones count towards no quota. Raises QuotaError.
+        """
+        ...
+
+    def stored(self, owner: str) -> tuple[int, int]:
+        """How many fields that were not rejected an owner has, and the bytes that are kept of them.
+
+        Of a ready field these are the bytes of its upload or of what the import made, whichever are more.
+        """
+        ...
+
+    def importing(self, owner: str) -> int:
+        """How many of an owner's imports wait or run."""
+        ...
+
+    def remember_rejection(self, field: FieldRecord, error: dict[str, Any]) -> None:
+        """Keep why this upload was rejected, also beyond the field's deletion."""
+        ...
+
+    def known_rejection(self, field: FieldRecord) -> dict[str, Any] | None:
+        """Why the same upload of the same owner was rejected lately: bytes, description and gate are the same."""
+        ...
+
+    def get_field(self, sha256: str) -> FieldRecord | None: ...
+
+    def get_fields(self, references: Sequence[str]) -> list[FieldRecord | None]:
+        """Several fields in one round trip, in the order asked for."""
+        ...
+
+    def list_fields(
+        self, label: str | None, limit: int, before: Position | None, owner: str | None = None
+    ) -> Page[FieldRecord]:
+        """Newest first, older than ``before`` = (created, reference); ``owner`` None: everybody's."""
+        ...
+
+    def update_field(self, sha256: str, *, attempt: int | None = None, **changes: Any) -> FieldRecord:
+        """Compare-and-set. Raises StaleAttemptError for a field that is gone, or past ``attempt`` (None: any).
+
+        ready and rejected are final within an attempt.
+        """
+        ...
+
+    def delete_field(self, sha256: str) -> bool: ...
+
+    def validating_fields(self) -> list[FieldRecord]:
+        """Every field whose import has not ended."""
+        ...
+
+    def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
+        """Start an import anew as the next attempt; ``lost`` as in requeue_job. Raises StaleAttemptError."""
+        ...
+
+    def jobs_using_field(self, sha256: str) -> Iterator[str]:
+        """Ids of active jobs that need this field."""
+        ...
+
+    def probe(self) -> None:
+        """Returns when the store takes a write."""
+        ...
