@@ -6,14 +6,14 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.labels import LABEL_PATTERN
-from regnf_core.schema.hash_grid_config import MAX_GROWTH
 
+_UNSIMILAR = 1e-4
+"""Of the squared scale: how far a similarity's rows may be from orthogonal and equally long."""
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
 
@@ -31,12 +31,14 @@ def _whole_sign(sign: int) -> int:
 
 
 def _similarity(rows: list[list[float]]) -> list[list[float]]:
-    matrix = np.array(rows)
-    linear = matrix[:3, :3]
-    scale = np.cbrt(np.linalg.det(linear))
-    if not scale > 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2):
+    linear = [row[:3] for row in rows[:3]]
+    (a, b, c), (d, e, f), (g, h, i) = linear
+    volume = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    square = max(volume, 0.0) ** (2 / 3)
+    products = [[sum(x * y for x, y in zip(u, v, strict=True)) - square * (u is v) for v in linear] for u in linear]
+    if square == 0 or max(abs(value) for row in products for value in row) > _UNSIMILAR * square:
         raise ValueError("is not a rotation times one positive factor")
-    if (matrix[3] != (0.0, 0.0, 0.0, 1.0)).any():
+    if rows[3] != [0.0, 0.0, 0.0, 1.0]:
         raise ValueError("its last row is not 0 0 0 1")
     return rows
 
@@ -57,7 +59,7 @@ class GridDescription:
     log2_table_size: Annotated[int, Ge(3), Le(24)] | None = None
     base_resolution: Annotated[int, Ge(2), Le(1024)] | None = None
     top_resolution: Annotated[int, Ge(2), Le(1 << 20)] | None = None
-    per_level_scale: Annotated[float, Ge(1), Le(MAX_GROWTH)] | None = None
+    per_level_scale: Annotated[float, Ge(1), Le(8)] | None = None
     """Ratio of the resolutions of neighboring levels."""
     interpolation: Literal["linear", "smoothstep"] | None = None
 
