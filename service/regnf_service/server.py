@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import gc
 import logging
 import socket
 from functools import partial
@@ -23,6 +24,8 @@ _DRAIN_S = 5
 _MOST_UNREAD = 128 * MIB
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _SHED = 64
+_COLLECTIONS = (2_000, 50, 1_000)
+"""After so many new objects these are looked through, every 50th time older ones too, every 50,000th time all."""
 logger = logging.getLogger(__name__)
 
 
@@ -56,6 +59,7 @@ class GuardedServer(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         asyncio.get_running_loop().set_exception_handler(self._note)
         await super().startup(sockets)
+        _collect_seldom()
 
     def _note(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         """The loop reports each connection that it cannot accept, with a traceback: make room instead."""
@@ -65,3 +69,13 @@ class GuardedServer(uvicorn.Server):
             self._connections.shed(_SHED)
         else:
             loop.default_exception_handler(context)
+
+
+def _collect_seldom() -> None:
+    """Thousands of connections are many objects: each full garbage collection stops every answer for .2 to .5 s.
+
+    What is loaded by now stays for good and is left out.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*_COLLECTIONS)

@@ -84,9 +84,14 @@ def prefer_as_oom_victim() -> None:
 
 
 def give_way(niceness: int) -> None:
-    """Have the kernel prefer other processes to this one and its children, where both want a core."""
+    """Have the kernel prefer other processes to this one and its children, where both want a core.
+
+    Linux may schedule each session as a group of its own: the leader of one gives way with its whole group.
+    """
     with suppress(OSError):
-        os.nice(niceness)
+        reached = os.nice(niceness)
+        if os.getsid(0) == os.getpid():
+            Path("/proc/self/autogroup").write_text(str(reached))
 
 
 def oom_kills() -> int:

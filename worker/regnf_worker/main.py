@@ -11,7 +11,7 @@ from regnf_state.logs import configure_logging
 from regnf_state.redis.address import NoRedisError
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
-from regnf_worker.kernel import share_cores
+from regnf_worker.kernel import give_way, share_cores
 from regnf_worker.preload import PreloadError, preload
 from regnf_worker.process import RegnfWorker
 from regnf_worker.scratch import Scratch
@@ -26,6 +26,7 @@ def run_worker(settings: Settings) -> None:
     """
     configure_logging(settings.log_format)
     share_cores(os.environ, settings.threads, settings.workers)
+    give_way(settings.job_niceness // 2)  # to the front end: an answer takes milliseconds, a job seconds
     context = Context.from_settings(settings)
     check_storage(settings)
     if settings.preload:

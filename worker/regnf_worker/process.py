@@ -147,8 +147,9 @@ class RegnfWorker(ResilientWorker):
         self._if_possible("charging for the time", lambda: self._fair.finish(work.name, seconds))
 
     def _niceness_of(self, work: Work) -> int:
-        """By how much the work gives way at the processor: the more, the further its caller is above its share."""
-        most = self._context.settings.job_niceness
+        """By how much the work gives way to other work: the more, the further its caller is above its share."""
+        whole = self._context.settings.job_niceness
+        most = whole - whole // 2  # all work gives way to the front end by the other half
         try:
             return min(most, round(most * self._fair.excess(work.name))) if most else 0
         except RedisError as error:

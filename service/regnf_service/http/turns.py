@@ -1,7 +1,7 @@
 """In which order requests begin, when more come in than can be answered at once.
 
-One begins in each turn of the event loop. Callers take turns. Of one caller the connection goes first that was answered
-longest ago: somebody who asks now and then is not behind connections that ask without a pause, or are made anew.
+A few begin in each turn of the event loop. Callers take turns. Of one caller the connection goes first that was
+answered longest ago: who asks now and then is not behind connections that ask without a pause, or are made anew.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from regnf_service.http.connections import site_of
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.ownership import ANONYMOUS
 
+AT_ONCE = 4
+"""In one turn of the event loop: a turn in which thousands of slow clients are read takes milliseconds."""
 _Waiting = list[tuple[float, int, asyncio.Future[None]]]
 
 
@@ -49,16 +51,19 @@ class Turns:
         await turn
 
     def _next(self) -> None:
-        while self._waiting:
+        begun = 0
+        while self._waiting and begun < AT_ONCE:
             who, waiting = self._waiting.popitem(last=False)
             _, _, turn = heapq.heappop(waiting)
             if waiting:
                 self._waiting[who] = waiting
             if not turn.done():
                 turn.set_result(None)
-                asyncio.get_running_loop().call_soon(self._next)
-                return
-        self._is_taken = False
+                begun += 1
+        if begun:
+            asyncio.get_running_loop().call_soon(self._next)
+        else:
+            self._is_taken = False
 
 
 class TurnGate:
