@@ -42,11 +42,14 @@ class MeshField:
     The mesh need not be watertight. Computed in float64 on the CPU whatever device the points come from; several times
     slower than a small network, see docs/families.md.
     vertices: (V, 3), own frame · faces: (F, 3) indices, normals outward · bounds: (2, 3), lowest and highest corner of
-    the region where the field has meaning; None: the mesh's own bounding box.
+    the region where the field has meaning; None: the mesh's own bounding box · inside_above: the winding number above
+    which a point is inside.
     Raises FieldFormatError (MESH_INVALID) when the arrays do not form a mesh.
     """
 
-    def __init__(self, vertices: ArrayLike, faces: ArrayLike, bounds: ArrayLike | None = None) -> None:
+    def __init__(
+        self, vertices: ArrayLike, faces: ArrayLike, bounds: ArrayLike | None = None, inside_above: float = _INSIDE
+    ) -> None:
         self.vertices: NDArray[np.float64] = np.ascontiguousarray(vertices, dtype=np.float64)
         self.faces: NDArray[np.int64] = np.ascontiguousarray(faces, dtype=np.int64)
         if self.vertices.ndim != 2 or self.vertices.shape[1] != 3 or not np.isfinite(self.vertices).all():
@@ -55,6 +58,7 @@ class MeshField:
             raise FieldFormatError("mesh faces are not (F, 3) with at least one triangle", reason="MESH_INVALID")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise FieldFormatError("a mesh face names a vertex that does not exist", reason="MESH_INVALID")
+        self._inside_above = inside_above
         self._bounds = None if bounds is None else torch.as_tensor(np.asarray(bounds, dtype=np.float64))
 
     @classmethod
@@ -80,7 +84,7 @@ class MeshField:
     def transformed(self, matrix: ArrayLike) -> MeshField:
         """The field of the mesh carried by a (4, 4) affine matrix."""
         carry = np.asarray(matrix, dtype=np.float64)
-        return MeshField(self.vertices @ carry[:3, :3].T + carry[:3, 3], self.faces)
+        return MeshField(self.vertices @ carry[:3, :3].T + carry[:3, 3], self.faces, None, self._inside_above)
 
     @property
     def bounds(self) -> Tensor:
@@ -119,7 +123,7 @@ class MeshField:
             return torch.zeros(0), torch.zeros(0, 3)
         nearest, winding = self._trees
         squared, triangles, closest = nearest.squared_distance(self.vertices, self.faces, queries)
-        inside = winding.winding_number(queries) > _INSIDE
+        inside = winding.winding_number(queries) > self._inside_above
         sign = np.where(inside, -1.0, 1.0)
         distance = np.sqrt(squared)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -160,7 +164,8 @@ def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor]) -> M
 
     Raises FieldFormatError (MESH_INVALID) for a face that names a vertex that does not exist.
     """
-    return MeshField(tensors["vertices"].cpu().numpy(), tensors["faces"].cpu().numpy(), description.function_bounds)
+    vertices, faces = tensors["vertices"].cpu().numpy(), tensors["faces"].cpu().numpy()
+    return MeshField(vertices, faces, description.function_bounds, description.inside_above)
 
 
 def _as_float32(values: NDArray[Any]) -> Tensor:

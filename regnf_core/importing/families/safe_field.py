@@ -17,6 +17,8 @@ from regnf_core.schema.safe_format import read_description
 
 FAMILY = "regnf"
 _OVERRULED = frozenset({"contraction", "level_mask"})
+_NOT_KEPT = frozenset({"family", "as", "frame", "dataset_transform", "accept_implausible"})
+"""What is said about the import or the upload, not about the function in the file."""
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
 
 
@@ -41,8 +43,8 @@ def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dic
     refuse_other_entries(
         overrides, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
     )
-    changed = description | overrides.non_default()
-    changed.pop("family", None)
+    said = {name: value for name, value in overrides.non_default().items() if name not in _NOT_KEPT}
+    changed = description | said
     if overrides.bounds is None:
         ratio = changed["world_scale"] / description["world_scale"]
         changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]

@@ -10,7 +10,18 @@ from regnf_core.importing.upload_description import UploadDescription
 
 UNIT_CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 _SHARED = frozenset(
-    {"family", "bounds", "world_scale", "sign", "up_axis", "label", "frame", "dataset_transform", "accept_implausible"}
+    {
+        "family",
+        "bounds",
+        "world_scale",
+        "sign",
+        "up_axis",
+        "label",
+        "frame",
+        "dataset_transform",
+        "accept_implausible",
+        "as",
+    }
 )
 """Entries that mean something for every family."""
 

@@ -1,24 +1,22 @@
-"""Triangles as an exact distance field: welded, without triangles of no area, normals outward."""
+"""Triangles as an exact distance field: welded, without triangles of no area, normals towards free space."""
 
 from __future__ import annotations
 
 import math
 
-import igl
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
 from regnf_core.importing.families.converted import ConvertedField
+from regnf_core.importing.families.facing import SAMPLES, facing_of
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
 
 _MARGIN = 0.05
 """How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""
-_PROBES = 2_000
-_INSIDE = 0.5
 _FAR = 1e4
 """Coordinates beyond this many diagonals leave float32 too few digits."""
 
@@ -31,10 +29,9 @@ def mesh_field(
     refuse_other_entries(overrides, family)
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
-    require_within(mesh_seconds(vertices, faces, _PROBES), work_s)
-    inside_out = _is_inside_out(vertices, faces)
-    if inside_out:
-        faces = faces[:, ::-1]
+    require_within(mesh_seconds(vertices, faces, 3 * SAMPLES), work_s)
+    facing = facing_of(vertices.astype(np.float64), faces, overrides.as_)
+    faces = facing.faces
     low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
     diagonal = float(np.linalg.norm(high - low))
     bounds = [(low - _MARGIN * diagonal).tolist(), (high + _MARGIN * diagonal).tolist()]
@@ -44,14 +41,20 @@ def mesh_field(
         "watertight"
         if loose == 0.0
         else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
+        *facing.why,
         *(f"ignored: {what}" for what in geometry.left_out),
     )
     return ConvertedField(
         family,
         why,
-        {"kind": "mesh", "source": {"family": family}, **shared_entries(overrides, bounds)},
+        {
+            "kind": "mesh",
+            "source": {"family": family},
+            "inside_above": facing.level,
+            **shared_entries(overrides, bounds),
+        },
         {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
-        _warnings(inside_out, max(np.abs(low).max(), np.abs(high).max()) / diagonal),
+        (*facing.warnings, *_warnings(max(np.abs(low).max(), np.abs(high).max()) / diagonal)),
     )
 
 
@@ -78,16 +81,6 @@ def _welded(vertices: Float64Array, faces: Int64Array) -> tuple[npt.NDArray[np.f
     return places[first][kept], corners.reshape(-1, 3)
 
 
-def _is_inside_out(vertices: npt.NDArray[np.float32], faces: Int64Array) -> bool:
-    """Whether the winding number says "inside" nowhere, but does where the faces are turned round."""
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    probes = low + (high - low) * np.random.default_rng(0).random((_PROBES, 3))
-    tree = igl.FastWindingNumberBVH()
-    tree.init(np.ascontiguousarray(vertices, np.float64), np.ascontiguousarray(faces, np.int64))
-    winding = tree.winding_number(np.ascontiguousarray(probes, np.float64))
-    return bool((winding < -_INSIDE).sum() > (winding > _INSIDE).sum())
-
-
 def _open_edge_share(faces: Int64Array, vertices: int) -> float:
     """Share of the directed edges that no neighbor runs through the other way, exactly once."""
     start, end = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
@@ -97,12 +90,8 @@ def _open_edge_share(faces: Int64Array, vertices: int) -> float:
     return float(1.0 - matched.sum() / len(start))
 
 
-def _warnings(inside_out: bool, reach: float) -> tuple[str, ...]:
-    warnings = []
-    if inside_out:
-        text = "its faces point inwards and were turned round; of a room seen from within say sign: -1"
-        warnings.append(f"MESH_INSIDE_OUT: {text}")
-    if reach > _FAR:
-        text = f"its coordinates reach {reach:.0f} diagonals from the origin, which costs digits: move it there"
-        warnings.append(f"FAR_FROM_ORIGIN: {text}")
-    return tuple(warnings)
+def _warnings(reach: float) -> tuple[str, ...]:
+    if reach <= _FAR:
+        return ()
+    text = f"its coordinates reach {reach:.0f} diagonals from the origin, which costs digits: move it there"
+    return (f"FAR_FROM_ORIGIN: {text}",)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Le
 
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require_names, require_shape
@@ -12,9 +14,11 @@ from regnf_core.schema.tensor_check import TensorSpec, count_rows, require_names
 
 @dataclass(frozen=True, kw_only=True)
 class MeshDescription(FieldDescription):
-    """A triangle mesh; see :class:`regnf_core.fields.mesh.MeshField`. No entries of its own."""
+    """A triangle mesh; see :class:`regnf_core.fields.mesh.MeshField`."""
 
     kind: Literal["mesh"]
+    inside_above: Annotated[float, Ge(-1), Le(1)] = 0.5
+    """Matter is where the generalized winding number exceeds this."""
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
