@@ -11,7 +11,7 @@ import numpy.typing as npt
 from regnf_core.errors import FieldFormatError
 
 Float32Array = npt.NDArray[np.float32]
-StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.int32]
+StoredArray = npt.NDArray[np.float32] | npt.NDArray[np.float16] | npt.NDArray[np.int32]
 """What a safe field holds."""
 
 _FINITE_CHUNK = 1 << 20

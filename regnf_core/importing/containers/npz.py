@@ -62,12 +62,12 @@ class ArraySource:
             raise tensor_error(f"{name} holds {values.dtype.name}; whole numbers are needed", "TENSOR_DTYPE")
         return np.ascontiguousarray(values, dtype=np.int64)
 
-    def positive(self, name: str) -> npt.NDArray[np.bool_]:
-        """Where an array's numbers, of either sort, are above zero. Raises what :meth:`array` raises."""
+    def weights(self, name: str) -> Float32Array:
+        """An array's numbers, of either sort, none below zero. Raises what :meth:`array` raises."""
         values = self._read(name)
         if values.dtype.kind not in "iuf":
             raise tensor_error(f"{name} holds {values.dtype.name}; numbers are needed", "TENSOR_DTYPE")
-        return np.asarray(values > 0)
+        return np.maximum(finite_float32(name, values), np.float32(0.0))
 
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
         """A few numbers of either sort, in double precision, in their own shape. Raises what :meth:`array` raises."""

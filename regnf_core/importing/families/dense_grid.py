@@ -9,14 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import require_shape, tensor_error
+from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
 from regnf_core.importing.containers.npz import ArraySource
+from regnf_core.importing.containers.voxel_maps import fill_unseen_nodes, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "dense_sdf_grid"
 _VALUES = ("sdf", "values")
+_WEIGHTS = ("weight", "weights")
 _SPACINGS = ("spacing", "voxel_size")
 _Vector = npt.NDArray[np.float64]
 
@@ -36,6 +38,10 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     require_shape(name, values, (None, None, None))
     if min(values.shape) < 2:
         raise tensor_error(f"{name} has shape {values.shape}, expected two nodes an axis at least", "TENSOR_SHAPE")
+    weights = _weights(arrays, values.shape)
+    tensors: dict[str, StoredArray] = {"values": values}
+    if weights is not None:
+        tensors["weights"] = stored_weights(weights)
     origin, spacing, told = _placement(arrays, np.array(values.shape))
     far = origin + spacing * (np.array(values.shape) - 1)
     description = {
@@ -47,7 +53,22 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     }
     nodes = " x ".join(map(str, values.shape))
     why = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
-    return ConvertedField(FAMILY, why, description, {"values": values}, sign_is_open=True)
+    if weights is not None and not weights.all():
+        fill_unseen_nodes(values, weights > 0, spacing, overrides.sign or 1)
+        why = (*why, f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were seen, the rest is free space")
+    return ConvertedField(FAMILY, why, description, tensors, sign_is_open=True)
+
+
+def _weights(arrays: ArraySource, shape: tuple[int, ...]) -> Float32Array | None:
+    """How much was seen of each node, where an array says so."""
+    name = next((name for name in _WEIGHTS if name in arrays), None)
+    if name is None:
+        return None
+    weights = arrays.weights(name)
+    require_shape(name, weights, shape)
+    if not weights.any():
+        raise tensor_error(f"no node was ever seen: all of {name} is zero", "TENSOR_SHAPE")
+    return weights
 
 
 def _placement(arrays: ArraySource, nodes: npt.NDArray[np.int64]) -> tuple[_Vector, _Vector, str]:

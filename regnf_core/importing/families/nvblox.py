@@ -10,7 +10,7 @@ import numpy.typing as npt
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
 from regnf_core.importing.containers.sqlite_source import TableSource
-from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray, fill_unseen, seen_extent
+from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray, fill_unseen, seen_extent, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
@@ -34,7 +34,8 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY)
     voxel_size = _block_size(tables, layer) / _EDGE
-    blocks, values, seen = _read(tables, layer, tensor_bytes)
+    blocks, values, weights = _read(tables, layer, tensor_bytes)
+    seen: BoolArray = weights > 0
     fill_unseen(values, seen, voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks, seen)
     middle = voxel_size / 2.0
@@ -50,6 +51,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
         "values belong to the voxels' middles, in meters",
     )
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.astype(np.int32)}
+    tensors["weights"] = stored_weights(weights)
     return ConvertedField(FAMILY, why, description, tensors)
 
 
@@ -76,8 +78,8 @@ def _block_size(tables: TableSource, layer: str) -> float:
     return size
 
 
-def _read(tables: TableSource, layer: str, tensor_bytes: int) -> tuple[IntArray, Float32Array, BoolArray]:
-    """The blocks (B, 3) in which something was seen, their distances (B, 8, 8, 8), x first, and which were seen."""
+def _read(tables: TableSource, layer: str, tensor_bytes: int) -> tuple[IntArray, Float32Array, Float32Array]:
+    """The blocks (B, 3) in which something was seen, their distances (B, 8, 8, 8), x first, and their weights."""
     most = min(_MAX_BLOCKS, tensor_bytes // (_EDGE**3 * 4))
     indices: list[tuple[int, ...]] = []
     parts: list[npt.NDArray[Any]] = []
@@ -95,4 +97,5 @@ def _read(tables: TableSource, layer: str, tensor_bytes: int) -> tuple[IntArray,
     voxels = np.stack(parts).reshape(-1, _EDGE, _EDGE, _EDGE)
     seen: BoolArray = np.asarray(voxels["weight"] > 0)
     values = finite_float32("the map", np.where(seen, voxels["distance"], np.float32(0.0)))
-    return np.array(indices, dtype=np.int64), values, seen
+    weights = np.where(seen, np.minimum(voxels["weight"], np.float32(3e38)), np.float32(0.0))
+    return np.array(indices, dtype=np.int64), values, weights

@@ -9,15 +9,16 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, tensor_error
 from regnf_core.importing.containers.npz import ArraySource
+from regnf_core.importing.containers.truncation import USUAL, truncation_evidence
 from regnf_core.importing.containers.voxel_maps import (
-    BoolArray,
     IntArray,
     fill_unseen,
     require_shape_of_blocks,
     seen_extent,
-    tell_truncation,
+    stored_weights,
 )
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
@@ -27,18 +28,18 @@ FAMILY = "open3d_voxel_block_grid"
 _NEEDED = ("key", "block_resolution", "voxel_size", "attr_name_tsdf")
 _INDEX = re.compile(r"[0-9]{1,3}")
 _LARGEST_EDGE = 256
-_DOUBTFUL = 0.15
-"""A slope that is farther from 1 than this does not tell the truncation."""
+_LARGEST = 1.001
+"""Values beyond this were not divided by the truncation."""
 
 _T = TypeVar("_T", bound=np.generic)
 
 
 @dataclass(frozen=True)
 class _Blocks:
-    """tsdf: (B, R, R, R), cut off at 1, and which voxels were seen, both x first · keys: (B, 3)."""
+    """tsdf: (B, R, R, R), cut off at 1, and how much was seen of the voxels, both x first · keys: (B, 3)."""
 
     tsdf: Float32Array
-    seen: BoolArray
+    weights: Float32Array
     keys: IntArray
     voxel_size: float
 
@@ -46,8 +47,8 @@ class _Blocks:
 def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
     """The map in ``arrays``, or None where they are not those of a VoxelBlockGrid with truncated distances.
 
-    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE and what
-    ArraySource raises.
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, INVALID_DESCRIPTION, TENSOR_MISSING, TENSOR_SHAPE,
+    TRUNCATION_UNKNOWN and what ArraySource raises.
     """
     if not all(name in arrays for name in _NEEDED):
         return None
@@ -56,8 +57,9 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     blocks = _read(arrays)
     truncation, why, warnings = _truncation(blocks, overrides)
     values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
-    fill_unseen(values, blocks.seen, blocks.voxel_size, overrides.sign or 1)
-    low, high = seen_extent(blocks.keys, blocks.seen)
+    seen = blocks.weights > 0
+    fill_unseen(values, seen, blocks.voxel_size, overrides.sign or 1)
+    low, high = seen_extent(blocks.keys, seen)
     description = {
         "kind": "voxel_blocks",
         **shared_entries(overrides, [(blocks.voxel_size * corner).tolist() for corner in (low, high)]),
@@ -66,6 +68,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     }
     told = f"arrays key, block_resolution and attr_name_tsdf: {len(blocks.keys)} blocks of {values.shape[1]}^3 voxels"
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.keys.astype(np.int32)}
+    tensors["weights"] = stored_weights(blocks.weights)
     return ConvertedField(FAMILY, (told, why), description, tensors, warnings)
 
 
@@ -78,28 +81,45 @@ def _read(arrays: ArraySource) -> _Blocks:
     if keys.ndim != 2 or keys.shape[1] != 3 or not keys.size or keys.max() >= 1 << 31 or keys.min() < -(1 << 31):
         raise tensor_error(f"key has shape {keys.shape}, expected (any, 3) block indices", "TENSOR_SHAPE")
     tsdf = _voxels(arrays.array(_attribute(arrays, "tsdf")))
-    seen = _voxels(arrays.positive(_attribute(arrays, "weight"))) if "attr_name_weight" in arrays else np.isfinite(tsdf)
-    for name, voxels in (("tsdf", tsdf), ("weight", seen)):
+    weighted = "attr_name_weight" in arrays
+    weights = _voxels(arrays.weights(_attribute(arrays, "weight"))) if weighted else np.ones_like(tsdf)
+    for name, voxels in (("tsdf", tsdf), ("weight", weights)):
         require_shape_of_blocks(name, voxels, len(keys), int(edge))
-    kept = seen.any(axis=(1, 2, 3))
+    kept = (weights > 0).any(axis=(1, 2, 3))
     if not kept.any():
         raise tensor_error("no voxel was ever seen: all weights are zero", "TENSOR_SHAPE")
-    return _Blocks(tsdf[kept], seen[kept], keys[kept], voxel_size)
+    return _Blocks(tsdf[kept], weights[kept], keys[kept], voxel_size)
 
 
 def _truncation(blocks: _Blocks, overrides: UploadDescription) -> tuple[float, str, tuple[str, ...]]:
-    """The distance that the value 1 stands for, how it was told, and warnings."""
+    """The distance that the value 1 stands for, how it was told, and warnings.
+
+    Raises FieldFormatError (TRUNCATION_UNKNOWN).
+    """
     if overrides.truncation is not None:
-        return overrides.truncation, "the description gives the truncation", ()
-    voxels, slope = tell_truncation(blocks.tsdf, blocks.seen)
-    distance = voxels * blocks.voxel_size
-    if slope is None:
-        why = f"truncation of {voxels:g} voxels, as usual: there is too little surface to tell it from"
-    else:
-        why = f"truncation of {voxels:g} voxels: under it the values' slope at the surface is {slope:.2f}"
-    certain = slope is not None and abs(slope - 1.0) <= _DOUBTFUL
-    warning = f"TRUNCATION_ASSUMED: distances are cut off at {distance:g}; if not so, say 'truncation'"
-    return distance, why, () if certain else (warning,)
+        return overrides.truncation, f"truncation {overrides.truncation:g}, as the settings or the description say", ()
+    largest = float(np.abs(blocks.tsdf[blocks.weights > 0]).max())
+    if largest > _LARGEST:
+        said = f"values up to {largest:.3g}, where those of a map divided by its truncation end at 1"
+        raise _unknown(f"{said}; say 'truncation', the distance that the value 1 stands for")
+    found = truncation_evidence(blocks.tsdf, blocks.weights, blocks.keys)
+    if found.settled is not None:
+        why = f"truncation of {found.settled:g} voxels: the distances to the surface give {found.voxels:.3g}"
+        return found.settled * blocks.voxel_size, why, ()
+    if not found.allows_usual:
+        likely = found.nearest * blocks.voxel_size
+        said = f"the voxels that a camera faced give about {found.voxels:.2g} voxels, not Open3D's default of {USUAL:g}"
+        raise _unknown(f"{said}; say 'truncation', most likely {likely:.4g} ({found.nearest:g} voxels)")
+    distance = USUAL * blocks.voxel_size
+    told = (
+        "there is too little surface to tell" if found.voxels is None else f"the values give about {found.voxels:.2g}"
+    )
+    text = f"distances are cut off at {distance:.4g}, Open3D's default of {USUAL:g} voxels; if not so, say 'truncation'"
+    return distance, f"truncation of {USUAL:g} voxels, Open3D's default: {told}", (f"TRUNCATION_ASSUMED: {text}",)
+
+
+def _unknown(message: str) -> FieldFormatError:
+    return FieldFormatError(f"the map's truncation is not in the file: {message}", reason="TRUNCATION_UNKNOWN")
 
 
 def _attribute(arrays: ArraySource, name: str) -> str:

@@ -23,6 +23,7 @@ from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
+from regnf_core.schema.kinds.voxel_grid import WEIGHTS
 from regnf_core.schema.observation_grid import OBSERVATION
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from regnf_core.importing.families.converted import ConvertedField
 
 FIELD_NAME = "field.safetensors"
+_SEEN = (OBSERVATION, WEIGHTS)
+"""Tensors that say how much was seen; they are no parameters of the function."""
 _ALL_ROUND = 0.95
 _SIGN_UNCERTAIN = (
     "all round the bounds the values are negative: a room seen from within, or an object trained with its sign turned"
@@ -58,7 +61,7 @@ def convert_file(
     converted = _settled(converted)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
-    parameters = sum(array.size for name, array in converted.tensors.items() if name != OBSERVATION)
+    parameters = sum(array.size for name, array in converted.tensors.items() if name not in _SEEN)
     family, why, warnings = converted.family, converted.why, converted.warnings
     kind = str(converted.description["kind"])
     bounds, label = converted.description["bounds"], converted.description["label"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from regnf_core.schema.description import FieldDescription
-from regnf_core.schema.kinds.voxel_grid import Length, Place
+from regnf_core.schema.kinds.voxel_grid import WEIGHTS, Length, Place
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
 
 
@@ -23,9 +23,11 @@ class VoxelBlocksDescription(FieldDescription):
 
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
-        require_names(tensors, {"values", "blocks"}, integers={"blocks"})
+        require_names(tensors, {"values", "blocks"} | (tensors.keys() & {WEIGHTS}), integers={"blocks"})
         blocks = count_rows(tensors, "blocks")
         require_shape(tensors, "blocks", (blocks, 3))
         shape = tensors["values"].shape
         require(len(shape) == 4 and shape[1] >= 1, f"values has shape {shape}, expected blocks of voxels")
         require_shape(tensors, "values", (blocks, shape[1], shape[1], shape[1]))
+        if WEIGHTS in tensors:
+            require_shape(tensors, WEIGHTS, shape)

@@ -149,3 +149,20 @@ def test_a_grid_of_a_chair_registers_in_a_grid_of_a_room(tmp_path: Path) -> None
     result = run(fields[0], fields[1], detection())
     assert result.verdict == "registered"
     assert placement_error(result, truth) < 0.01
+
+
+@pytest.mark.parametrize("outward", [1, -1])
+def test_nodes_without_weight_are_free_space_beyond_what_was_seen(tmp_path: Path, outward: int) -> None:
+    weights = np.full(BALL.shape, 3.0)
+    weights[:, :, :4] = 0.0
+    values = np.where(weights > 0, outward * BALL, 7.0)
+    report = converted(tmp_path, {"sign": outward}, sdf=values, weight=weights, origin=LOW, spacing=SPACING)
+    assert any("of the nodes were seen" in why for why in report["why"])
+    seen_low = LOW + np.array([0.0, 0.0, 4 * SPACING[2]])
+    deep = torch.tensor(seen_low - np.array([0.0, 0.0, 3 * SPACING[2]])).float()
+    corner = float(np.linalg.norm(seen_low) - 0.5)
+    opened = open_field(tmp_path / FIELD_NAME)
+    assert float(opened.signed_distance(deep[None])) == pytest.approx(corner + 3 * SPACING[2], abs=1e-4)
+    arrays = {"sdf": BALL, "origin": LOW, "spacing": SPACING}
+    assert_refused(lambda: converted(tmp_path, weights=weights[1:], **arrays), "TENSOR_SHAPE")
+    assert_refused(lambda: converted(tmp_path, weights=0 * weights, **arrays), "TENSOR_SHAPE")

@@ -6,9 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import open3d
 import pytest
 import torch
+import trimesh
 from numpy.typing import NDArray
+from safetensors import safe_open
 
 from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
@@ -65,7 +68,9 @@ def near_surface(count: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("voxels", [4.0, 8.0])
-def test_the_truncation_is_told_by_the_slope_and_voxels_lie_where_they_should(tmp_path: Path, voxels: float) -> None:
+def test_the_truncation_is_told_by_exact_distances_and_voxels_lie_where_they_should(
+    tmp_path: Path, voxels: float
+) -> None:
     report = converted(tmp_path, ball(voxels))
     assert report["family"] == "open3d_voxel_block_grid"
     assert report["warnings"] == []
@@ -117,9 +122,79 @@ def test_the_uploader_may_tell_the_truncation(tmp_path: Path) -> None:
     assert float(open_field(tmp_path / FIELD_NAME).signed_distance(surface)) == pytest.approx(0.25, abs=0.02)
 
 
-def test_a_doubtful_truncation_is_warned_of(tmp_path: Path) -> None:
-    report = converted(tmp_path, ball(40.0))
-    assert "TRUNCATION_ASSUMED" in [warning.split(":")[0] for warning in report["warnings"]]
+def fused(voxels: float, aslant: float = 0.0) -> dict[str, Any]:
+    """A map of a box and the floor under it, fused by Open3D at ``voxels`` voxels, as cameras round it see it."""
+    shell = trimesh.util.concatenate(
+        [
+            trimesh.creation.box(bounds=[[-0.3, -0.25, 0.0], [0.3, 0.25, 0.5]]),
+            trimesh.creation.box(bounds=[[-1.0, -1.0, -0.1], [1.0, 1.0, 0.0]]),
+        ]
+    )
+    rays = open3d.t.geometry.RaycastingScene()
+    triangles = shell.vertices.astype(np.float32), shell.faces.astype(np.uint32)
+    rays.add_triangles(*(open3d.core.Tensor(part) for part in triangles))
+    grid = open3d.t.geometry.VoxelBlockGrid(
+        ("tsdf", "weight"), (open3d.core.float32,) * 2, ((1), (1)), 0.02, 16, 2000, open3d.core.Device("CPU:0")
+    )
+    K = open3d.core.Tensor(np.array([[160.0, 0.0, 79.5], [0.0, 160.0, 59.5], [0.0, 0.0, 1.0]]))
+    for turn in np.arange(8) * np.pi / 4 + aslant:
+        forward = -np.array([1.3 * np.cos(turn), 1.3 * np.sin(turn), 0.25])
+        z = forward / np.linalg.norm(forward)
+        x = np.cross(z, [0.0, 0.0, 1.0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z], axis=1)
+        pose[:3, 3] = np.array([0.0, 0.0, 0.25]) - forward
+        T = open3d.core.Tensor(np.linalg.inv(pose))
+        depth = rays.cast_rays(rays.create_rays_pinhole(K, T, 160, 120))["t_hit"].numpy()
+        image = open3d.t.geometry.Image(open3d.core.Tensor((np.where(depth < 5, depth, 0) * 1e4).astype(np.uint16)))
+        blocks = grid.compute_unique_block_coordinates(image, K, T, 1e4, 4.0, voxels)
+        grid.integrate(blocks, image, K, T, 1e4, 4.0, voxels)
+    tables = {name: grid.attribute(name).cpu().numpy() for name in ("tsdf", "weight")}
+    rows = grid.hashmap().active_buf_indices().cpu().numpy().astype(np.int64)
+    return {
+        "value_000": tables["tsdf"][rows],
+        "value_001": tables["weight"][rows],
+        "key": grid.hashmap().key_tensor().cpu().numpy()[rows],
+        "attr_name_tsdf": np.array([0]),
+        "attr_name_weight": np.array([1]),
+        "block_resolution": np.array([16]),
+        "voxel_size": np.array([0.02]),
+    }
+
+
+def test_the_default_truncation_is_assumed_where_fused_distances_allow_it(tmp_path: Path) -> None:
+    report = converted(tmp_path, fused(8.0))
+    assert report["warnings"][0].startswith("TRUNCATION_ASSUMED: ")
+    assert "0.16" in report["warnings"][0]
+    before_a_side = torch.tensor([[0.3 + 0.06, 0.0, 0.25], [-0.3 - 0.04, 0.0, 0.25]])
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(before_a_side)
+    np.testing.assert_allclose(distance.numpy(), [0.06, 0.04], rtol=0.1)
+
+
+@pytest.mark.parametrize("voxels", [4.0, 5.0, 12.0, 16.0])
+def test_fused_distances_of_another_truncation_are_asked_about(tmp_path: Path, voxels: float) -> None:
+    arrays = fused(voxels, aslant=0.2)
+    assert_refused(lambda: converted(tmp_path, arrays), "TRUNCATION_UNKNOWN")
+    report = converted(tmp_path, arrays, {"truncation": 0.02 * voxels})
+    assert "TRUNCATION_ASSUMED" not in [warning.split(":")[0] for warning in report["warnings"]]
+    assert f"truncation {0.02 * voxels:g}, as the settings or the description say" in report["why"]
+
+
+def test_values_that_were_not_divided_by_a_truncation_are_asked_about(tmp_path: Path) -> None:
+    arrays = ball(4.0)
+    arrays["value_000"] = 40.0 * arrays["value_000"]
+    assert_refused(lambda: converted(tmp_path, arrays), "TRUNCATION_UNKNOWN")
+
+
+def test_weights_are_kept_and_zero_where_nothing_was_seen(tmp_path: Path) -> None:
+    arrays = ball(4.0)
+    arrays["value_001"] = arrays["value_001"] * 7.0
+    converted(tmp_path, arrays)
+    with safe_open(tmp_path / FIELD_NAME, framework="numpy") as file:
+        weights = file.get_tensor("weights")
+    seen = arrays["value_001"][..., 0].transpose(0, 3, 2, 1)
+    np.testing.assert_array_equal(weights, seen[seen.any(axis=(1, 2, 3))])
+    assert set(np.unique(weights)) == {0.0, 7.0}
 
 
 @pytest.mark.parametrize(
