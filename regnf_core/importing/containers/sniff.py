@@ -62,8 +62,6 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "LEGACY_TORCH_FILE", "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
         return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
-    if head.lstrip()[:1] == b"{" and b'"asset"' in head:
-        return "FORMAT_NOT_SUPPORTED", "glTF in several files; export it as one .glb"
     if head.startswith(_VDB_MAGICS):
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER):

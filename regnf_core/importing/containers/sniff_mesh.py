@@ -1,12 +1,17 @@
-"""Whether a file's first bytes are those of a mesh. Two formats have no magic number: their content decides."""
+"""Whether a file's first bytes are those of a mesh. Some formats have no magic number: their content decides."""
 
 from __future__ import annotations
 
 import math
+import re
 import struct
 
-MESH_FORMATS = ("glb", "obj", "ply", "stl")
+MESH_FORMATS = ("dae", "glb", "gltf", "obj", "off", "pcd", "ply", "stl", "xyz")
 
+_HEAD = 512
+_BLANK = b"\xef\xbb\xbf \t\r\n"
+_OFF = re.compile(rb"(ST)?C?N?4?n?OFF(?![A-Za-z])")
+_GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
 _OBJ_NUMBERS = {b"v": 3, b"vn": 3, b"vt": 1}
@@ -15,16 +20,47 @@ _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
 
 
 def sniff_mesh(head: bytes) -> str | None:
-    """``"ply"``, ``"glb"``, ``"stl"`` or ``"obj"``, or None. ``head``: the file's first 512 bytes, or all of it."""
+    """One of MESH_FORMATS, or None. ``head``: the file's first 512 bytes, or all of it."""
     if head.startswith((b"ply\n", b"ply\r")):
         return "ply"
     if head.startswith(b"glTF"):
         return "glb"
+    if _OFF.match(head):
+        return "off"
+    if b"<COLLADA" in head and head.lstrip(_BLANK).startswith(b"<"):
+        return "dae"
+    if head.lstrip(_BLANK).startswith(b"{") and any(word in head for word in _GLTF_WORDS):
+        return "gltf"
+    if _is_pcd(head):
+        return "pcd"
     if head.startswith(b"solid") and b"facet" in head:
         return "stl"
     if _is_obj(head):
         return "obj"
-    return "stl" if _is_binary_stl(head) else None
+    if _is_binary_stl(head):
+        return "stl"
+    return "xyz" if _is_xyz(head) else None
+
+
+def _is_pcd(head: bytes) -> bool:
+    """Text whose first line that is not a comment names a version, and then the fields of a point."""
+    lines = [line.split() for line in head.splitlines() if line.strip() and not line.startswith(b"#")]
+    named = head.startswith(b"# .PCD") or bool(lines and lines[0][:1] == [b"VERSION"])
+    return named and any(words[:1] == [b"FIELDS"] for words in lines)
+
+
+def _is_xyz(head: bytes) -> bool:
+    """Lines of as many numbers each, three at least; the first may be their count alone, the last is cut off."""
+    if _CONTROL & set(head):
+        return False
+    lines = head.splitlines()
+    if len(head) >= _HEAD and not head.endswith(b"\n"):
+        lines = lines[:-1]
+    said = [line.replace(b",", b" ").replace(b";", b" ").split() for line in lines if line.strip()]
+    said = [words for words in said if not words[0].startswith((b"#", b"//"))]
+    if said and len(said[0]) == 1 and said[0][0].isdigit():
+        said = said[1:]
+    return bool(said) and len(said[0]) >= 3 and all(len(w) == len(said[0]) and all(map(_is_number, w)) for w in said)
 
 
 def _is_obj(head: bytes) -> bool:

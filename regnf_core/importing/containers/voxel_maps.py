@@ -35,12 +35,13 @@ def fill_unseen(values: Float32Array, seen: BoolArray, voxel_size: float, outwar
         values[chosen] = values[chosen][tuple(nearest)] + np.float32(outward * voxel_size) * distance.astype(np.float32)
 
 
-def fill_unseen_nodes(values: Float32Array, seen: BoolArray, spacing: npt.NDArray[np.float64], outward: int) -> None:
-    """The same of one grid (X, Y, Z), in place; its nodes are ``spacing`` (3,) apart."""
+def filled_nodes(values: Float32Array, seen: BoolArray, spacing: npt.NDArray[np.float64], outward: int) -> Float32Array:
+    """The same of one grid (X, Y, Z), as a new array; its nodes are ``spacing`` (3,) apart."""
     from scipy import ndimage
 
     distance, nearest = ndimage.distance_transform_edt(~seen, sampling=tuple(spacing), return_indices=True)
-    values[...] = values[tuple(nearest)] + np.float32(outward) * distance.astype(np.float32)
+    filled: Float32Array = values[tuple(nearest)] + np.float32(outward) * distance.astype(np.float32)
+    return filled
 
 
 def seen_extent(blocks: IntArray, seen: BoolArray) -> tuple[IntArray, IntArray]:

@@ -8,25 +8,31 @@ import numpy as np
 
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.triangles import mesh_field
-from regnf_core.importing.meshes import MESH_READERS
-from regnf_core.importing.meshes.geometry import malformed
+from regnf_core.importing.meshes import CLOUD_FORMATS, read_mesh
+from regnf_core.importing.meshes.geometry import Siblings, malformed
 from regnf_core.importing.upload_description import UploadDescription
 
 
 def convert_mesh(
-    format_: str, data: memoryview, overrides: UploadDescription, work_s: float = math.inf
+    format_: str,
+    data: memoryview,
+    overrides: UploadDescription,
+    work_s: float = math.inf,
+    siblings: Siblings | None = None,
 ) -> ConvertedField:
     """The exact distance to the mesh in ``data``, a file of the format that ``sniff_format`` named.
+
+    siblings: the files that came with it in one archive, by their names relative to it.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED,
     POINT_CLOUD_WITHOUT_NORMALS, IMPORT_TOO_COSTLY beyond ``work_s`` estimated seconds, and what ``overrides`` is
     refused for.
     """
     with np.errstate(all="ignore"):  # numbers that overflow are refused as not finite
-        geometry = MESH_READERS[format_](data)
+        geometry = read_mesh(format_, data, siblings)
     if len(geometry.faces) > 0:
         return mesh_field(geometry, f"a {format_} file", overrides, work_s=work_s)
-    if format_ != "ply" or len(geometry.vertices) == 0:
+    if format_ not in CLOUD_FORMATS or len(geometry.vertices) == 0:
         raise malformed(f"the {format_} file holds no triangles")
     from regnf_core.importing.families.point_cloud import convert_cloud  # loads scipy and Open3D
 

@@ -40,7 +40,7 @@ _SIGN_UNCERTAIN = (
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
-_THREADED_FORMATS = ("ply",)
+_THREADED_FORMATS = ("ply", "pcd", "xyz", "off")
 """May be clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 

@@ -1,19 +1,41 @@
-"""Strict readers of mesh files: numbers alone, from the bytes given. None opens another file or inflates anything."""
+"""Strict readers of mesh files: numbers alone, from the bytes given. None opens another file or inflates anything but
+the points of a compressed PCD file, to exactly the size that its header says."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from regnf_core.importing.meshes.geometry import Geometry
-from regnf_core.importing.meshes.glb import read_glb
+from regnf_core.importing.meshes.dae import read_dae
+from regnf_core.importing.meshes.geometry import Geometry, Siblings
+from regnf_core.importing.meshes.glb import read_glb, read_gltf
 from regnf_core.importing.meshes.obj import read_obj
+from regnf_core.importing.meshes.off import read_off
+from regnf_core.importing.meshes.pcd import read_pcd
 from regnf_core.importing.meshes.ply import read_ply
 from regnf_core.importing.meshes.stl import read_stl
+from regnf_core.importing.meshes.xyz import read_xyz
 
-MESH_READERS: dict[str, Callable[[memoryview], Geometry]] = {
-    "glb": read_glb,
+CLOUD_FORMATS = ("ply", "pcd", "xyz", "off")
+"""Formats that may hold points alone."""
+_IN_PARTS: dict[str, Callable[[memoryview, Siblings], Geometry]] = {"glb": read_glb, "gltf": read_gltf}
+_WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
+    "dae": read_dae,
     "obj": read_obj,
+    "off": read_off,
+    "pcd": read_pcd,
     "ply": read_ply,
     "stl": read_stl,
+    "xyz": read_xyz,
 }
-"""By the name that ``sniff_format`` gives the file."""
+MESH_READERS = (*_WHOLE, *_IN_PARTS)
+"""The names that ``sniff_format`` gives files with a reader here."""
+
+
+def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None) -> Geometry:
+    """What a file of this format holds. ``siblings``: the files that came with it in one archive, by relative name.
+
+    Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED.
+    """
+    if format_ in _IN_PARTS:
+        return _IN_PARTS[format_](data, siblings or {})
+    return _WHOLE[format_](data)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,9 @@ from regnf_core.errors import FieldFormatError
 
 Float64Array = npt.NDArray[np.float64]
 Int64Array = npt.NDArray[np.int64]
+
+Siblings = Mapping[str, memoryview]
+"""The files that came with a mesh in one archive, by their names relative to it."""
 
 MAX_TRIANGLES = 2_000_000
 MAX_VERTICES = 6_000_000
@@ -60,3 +64,23 @@ def fans(polygons: npt.NDArray[Any]) -> Int64Array:
     parts = [corners[:, [0, i, i + 1]] for i in range(1, corners.shape[1] - 1)]
     triangles: Int64Array = np.concatenate(parts) if parts else np.zeros((0, 3), np.int64)
     return triangles
+
+
+def strips(order: npt.NDArray[Any]) -> Int64Array:
+    """(F, 3) triangles from corners (N,) in strips, which -1 parts; every second triangle of a strip is turned."""
+    corners = np.asarray(order, dtype=np.int64)
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int64)
+    place = np.arange(len(corners))
+    begun = np.maximum.accumulate(np.where(corners == -1, place + 1, 0))
+    triangles = np.stack((corners[:-2], corners[1:-1], corners[2:]), axis=1)
+    turned = ((place - begun)[:-2] % 2 == 1)[:, None]
+    triangles = np.where(turned, triangles[:, [1, 0, 2]], triangles)
+    whole: Int64Array = triangles[(triangles != -1).all(axis=1)]
+    return whole
+
+
+def fan(order: npt.NDArray[Any]) -> Int64Array:
+    """(N - 2, 3) triangles of corners (N,) round the first of them."""
+    corners = np.asarray(order, dtype=np.int64)
+    return fans(corners[None]) if len(corners) >= 3 else np.zeros((0, 3), np.int64)

@@ -1,4 +1,4 @@
-"""glTF 2.0 in its binary form: the triangles of all nodes at their poses. Textures, skins and morphs are ignored."""
+"""glTF 2.0, binary or text: the triangles of all nodes at their poses. Textures, skins and morphs are ignored."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from regnf_core.importing.meshes.geometry import (
     Float64Array,
     Geometry,
     Int64Array,
+    Siblings,
+    fan,
     malformed,
     require_room,
+    strips,
     unsupported,
 )
 from regnf_core.importing.meshes.glb_buffers import Accessors
@@ -25,15 +28,24 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_punctual", "KHR_mesh_quantization")
 
 
-def read_glb(data: memoryview) -> Geometry:
-    """The triangles of a .glb file's scene.
+def read_glb(data: memoryview, siblings: Siblings | None = None) -> Geometry:
+    """The triangles of a .glb file's scene. ``siblings``: the files that came with it, by name.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, FORMAT_NOT_SUPPORTED for compressed or sparse buffers, or
-    MESH_EXTERNAL_REFERENCE for buffers in other files.
+    MESH_EXTERNAL_REFERENCE for buffers in files that did not come with it.
     """
     document, binary = _chunks(data)
+    return _geometry(document, binary, siblings or {})
+
+
+def read_gltf(data: memoryview, siblings: Siblings | None = None) -> Geometry:
+    """The triangles of a .gltf file's scene, its buffers within it or beside it. Raises as :func:`read_glb`."""
+    return _geometry(_document(data), None, siblings or {})
+
+
+def _geometry(document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> Geometry:
     try:
-        return _scene(document, Accessors(document, binary))
+        return _scene(document, Accessors(document, binary, siblings))
     except (AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise malformed(f"the glTF document contradicts itself ({type(error).__name__})") from error
 
@@ -51,15 +63,21 @@ def _chunks(data: memoryview) -> tuple[dict[str, Any], memoryview]:
         found.setdefault(kind, data[at : at + length])
         at += length
     text = found.get(_JSON)
-    if text is None or len(text) > _MAX_JSON:
-        raise malformed("the glTF file has no JSON chunk, or too long a one")
+    if text is None:
+        raise malformed("the glTF file has no JSON chunk")
+    return _document(text), found.get(_BIN, memoryview(b""))
+
+
+def _document(text: memoryview) -> dict[str, Any]:
+    if len(text) > _MAX_JSON:
+        raise malformed("the glTF file's JSON is too long")
     try:
-        document = json.loads(bytes(text).decode("utf-8"))
+        document = json.loads(bytes(text).decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise malformed("the glTF file's JSON is malformed") from error
     if not isinstance(document, dict):
         raise malformed("the glTF file's JSON is not an object")
-    return document, found.get(_BIN, memoryview(b""))
+    return document
 
 
 def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
@@ -100,14 +118,7 @@ def _triangles(primitive: dict[str, Any], accessors: Accessors, vertices: int) -
         if len(order) % 3:
             raise malformed("glTF triangles without three corners")
         return order.reshape(-1, 3)
-    if len(order) < 3:
-        return np.zeros((0, 3), np.int64)
-    if mode == _FAN:
-        first = np.broadcast_to(order[:1], order[2:].shape)
-        return np.stack((first, order[1:-1], order[2:]), axis=1)
-    strip = np.stack((order[:-2], order[1:-1], order[2:]), axis=1)
-    strip[1::2] = strip[1::2, [1, 0, 2]]
-    return strip
+    return fan(order) if mode == _FAN else strips(order)
 
 
 def _left_out(document: dict[str, Any]) -> tuple[str, ...]:

@@ -1,12 +1,24 @@
-"""The numbers of a glTF document: accessors into the file's own binary chunk, every extent checked first."""
+"""The numbers of a glTF document: accessors into its buffers, every extent checked first.
+
+A buffer is the file's own binary chunk, text within the document, or a file that came with it. None is ever looked for.
+"""
 
 from __future__ import annotations
 
+import base64
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import MAX_TRIANGLES, Float64Array, elsewhere, malformed, unsupported
+from regnf_core.importing.meshes.geometry import (
+    MAX_TRIANGLES,
+    Float64Array,
+    Siblings,
+    elsewhere,
+    malformed,
+    unsupported,
+)
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3}
@@ -15,13 +27,15 @@ _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 
 
 class Accessors:
-    """Reads accessors of ``document``; ``binary`` is the file's binary chunk."""
+    """Reads accessors of ``document``. binary: the file's chunk, None in text form · siblings: files beside it."""
 
-    def __init__(self, document: dict[str, Any], binary: memoryview) -> None:
+    def __init__(self, document: dict[str, Any], binary: memoryview | None, siblings: Siblings) -> None:
         self._accessors = document.get("accessors", [])
         self._views = document.get("bufferViews", [])
         self._buffers = document.get("buffers", [])
         self._binary = binary
+        self._siblings = siblings
+        self._read: dict[int, memoryview] = {}
 
     def array(self, number: object, width: int) -> Float64Array:
         """The items (N, width) of accessor ``number``.
@@ -49,15 +63,43 @@ class Accessors:
     def _view(self, view: dict[str, Any]) -> memoryview:
         if any(name in view.get("extensions", {}) for name in _COMPRESSED):
             raise unsupported("the glTF file's buffers are compressed: export it without mesh compression")
-        buffer = self._buffers[_whole(view["buffer"])]
-        if "uri" in buffer:
-            raise elsewhere("the glTF file keeps its geometry in another file or address: export it as one .glb")
-        if _whole(view["buffer"]) != 0:
-            raise malformed("a glTF buffer without data")
+        data = self._buffer(_whole(view["buffer"]))
         start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])
-        if start + size > min(len(self._binary), _whole(buffer["byteLength"])):
+        if start + size > len(data):
             raise malformed("a glTF buffer view reaches beyond its buffer")
-        return self._binary[start : start + size]
+        return data[start : start + size]
+
+    def _buffer(self, number: int) -> memoryview:
+        """The bytes of a buffer, no more than it claims."""
+        if number not in self._read:
+            buffer = self._buffers[number]
+            claimed = _whole(buffer["byteLength"])
+            if "uri" in buffer:
+                data = self._elsewhere(buffer["uri"], claimed)
+            elif number == 0 and self._binary is not None:
+                data = self._binary
+            else:
+                raise malformed("a glTF buffer without data")
+            self._read[number] = data[: min(len(data), claimed)]
+        return self._read[number]
+
+    def _elsewhere(self, uri: object, claimed: int) -> memoryview:
+        """The bytes that a buffer's ``uri`` holds, or that came under this name."""
+        if not isinstance(uri, str):
+            raise malformed("a glTF buffer's uri is not text")
+        if uri.startswith("data:"):
+            head, comma, text = uri.partition(",")
+            if not comma or not head.endswith(";base64") or len(text) * 3 // 4 > claimed + 3:
+                raise malformed("a glTF buffer's data is not base64 of the length that it claims")
+            try:
+                return memoryview(base64.b64decode(text, validate=True))
+            except ValueError as error:
+                raise malformed("a glTF buffer's data is not base64") from error
+        name = unquote(uri).removeprefix("./")
+        if name not in self._siblings:
+            missing = "the glTF file keeps its geometry in another file or address: "
+            raise elsewhere(missing + "give both in one archive, or export it as one .glb")
+        return self._siblings[name]
 
 
 def _scaled(items: Float64Array, component: str, normalized: bool) -> Float64Array:

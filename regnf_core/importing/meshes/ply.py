@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from regnf_core.importing.meshes.geometry import Float64Array, Geometry, malformed, require_room
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed, require_room, strips
 from regnf_core.importing.meshes.ply_body import BinaryBody, TextBody
 from regnf_core.importing.meshes.ply_header import Element, read_ply_header
 
@@ -13,7 +16,7 @@ _MAX_ROWS = 50_000_000
 
 
 def read_ply(data: memoryview) -> Geometry:
-    """The vertices and polygons (as fans) of a PLY file; without faces it is a point cloud.
+    """The vertices and polygons (as fans) or strips of a PLY file; without faces it is a point cloud.
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE.
     """
@@ -32,13 +35,21 @@ def read_ply(data: memoryview) -> Geometry:
                 normals = _columns(table, ("nx", "ny", "nz"))
         elif element.name == "face":
             require_room(0, element.count)
-            faces = body.triangles(element, _index_property(element))
+            faces = np.concatenate([faces, body.triangles(element, _index_property(element))])
+        elif element.name == "tristrips":
+            require_room(0, element.count)
+            faces = np.concatenate([faces, *(_strip(order) for order in body.lists(element, _index_property(element)))])
         elif element.count > _MAX_ROWS:
             raise malformed(f"the PLY file claims {element.count} rows of {element.name[:40]}")
         else:
             body.skip(element)
             left_out.append(f"elements {element.name[:40]}")
     return Geometry(vertices, faces, normals, tuple(left_out))
+
+
+def _strip(order: npt.NDArray[Any]) -> Int64Array:
+    require_room(0, len(order))
+    return strips(order)
 
 
 def _columns(table: dict[str, Float64Array], names: tuple[str, ...]) -> Float64Array:
@@ -50,5 +61,5 @@ def _columns(table: dict[str, Float64Array], names: tuple[str, ...]) -> Float64A
 def _index_property(element: Element) -> str:
     found = [p.name for p in element.properties if p.count_type is not None and p.name in _INDEX_NAMES]
     if len(found) != 1:
-        raise malformed("PLY faces without one list of vertex indices")
+        raise malformed("PLY faces or strips without one list of vertex indices")
     return found[0]

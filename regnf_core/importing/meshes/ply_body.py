@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.importing.meshes.geometry import Float64Array, Int64Array, fans, malformed, require_room
+from regnf_core.importing.meshes.number_text import numbers_of
 from regnf_core.importing.meshes.ply_header import ByteOrder, Element
 
 _USUAL_CORNERS = (3, 4)
@@ -38,6 +38,11 @@ class Body(ABC):
         else:
             for _ in self._rows(element):
                 pass
+
+    def lists(self, element: Element, name: str) -> Iterator[Int64Array]:
+        """The list called ``name`` of every row, of any length."""
+        for row in self._rows(element):
+            yield np.asarray(row[name], dtype=np.int64)
 
     def triangles(self, element: Element, name: str) -> Int64Array:
         """(F, 3) indices from the lists called ``name``, longer ones as fans."""
@@ -121,12 +126,7 @@ class TextBody(Body):
     """Rows of numbers between spaces."""
 
     def __init__(self, data: memoryview) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                self._numbers = np.fromstring(bytes(data).decode("ascii"), dtype=np.float64, sep=" ")
-        except (ValueError, DeprecationWarning) as error:
-            raise malformed("the PLY file holds a word that is not a number") from error
+        self._numbers = numbers_of(bytes(data), "PLY")
 
     def scalars(self, element: Element) -> dict[str, Float64Array]:
         if any(p.count_type is not None for p in element.properties):

@@ -163,12 +163,16 @@ def fused(voxels: float, aslant: float = 0.0) -> dict[str, Any]:
 
 
 def test_the_default_truncation_is_assumed_where_fused_distances_allow_it(tmp_path: Path) -> None:
-    report = converted(tmp_path, fused(8.0))
+    arrays = fused(8.0)
+    report = converted(tmp_path, arrays)
     assert report["warnings"][0].startswith("TRUNCATION_ASSUMED: ")
     assert "0.16" in report["warnings"][0]
-    before_a_side = torch.tensor([[0.3 + 0.06, 0.0, 0.25], [-0.3 - 0.04, 0.0, 0.25]])
-    distance = open_field(tmp_path / FIELD_NAME).signed_distance(before_a_side)
-    np.testing.assert_allclose(distance.numpy(), [0.06, 0.04], rtol=0.1)
+    seen = np.argwhere(arrays["value_001"][..., 0] > 0)[::997]
+    block, z, y, x = seen.T
+    nodes = 0.02 * (16 * arrays["key"][block] + np.stack((x, y, z), axis=1))
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(nodes))
+    expected = 0.16 * arrays["value_000"][tuple(seen.T)][:, 0]
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("voxels", [4.0, 5.0, 12.0, 16.0])

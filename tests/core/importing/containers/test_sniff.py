@@ -30,6 +30,12 @@ def test_names_meshes() -> None:
     assert sniff_format(b"# Blender v2.92\n# \xc3\xa9\nmtllib a.mtl\no Cube\n") == "obj"
     assert sniff_format(b"\r\nv 1.0 -2e-3 .5\r\n") == "obj"
     assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"
+    assert sniff_format(b"COFF BINARY\n") == sniff_format(b"OFF8 12 0\n") == "off"
+    assert sniff_format(b"\xef\xbb\xbf<?xml version='1.0'?>\n<COLLADA version='1.4.1'>") == "dae"
+    assert sniff_format(b'{"asset": {"version": "2.0"}, "buffers": []}') == "gltf"
+    assert sniff_format(b"VERSION 0.7\nFIELDS x y z\n") == sniff_format(b"# .PCD v.7\nFIELDS x\n") == "pcd"
+    assert sniff_format(b"1 2 3\n4e1 5 6\n") == sniff_format(b"# x y z\n2\n1,2,3\n") == "xyz"
+    assert sniff_format(b"1.5 2.5 3.5 0.1 0.2 0.3\n" * 30) == "xyz"
 
 
 def test_arrays_and_databases_are_named() -> None:
@@ -50,7 +56,12 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (LEGACY_TORCH[:10], "RAW_PICKLE"),
         (LEGACY_TAR, "LEGACY_TORCH_FILE"),
         (b"\x80\x04\x95\x05", "RAW_PICKLE"),
-        (b'{"asset": {"version": "2.0"}, "buffers": []}', "FORMAT_NOT_SUPPORTED"),
+        (b'{"frames": [], "camera_model": "OPENCV"}', "FORMAT_NOT_RECOGNIZED"),
+        (b"<?xml version='1.0'?><svg/>", "FORMAT_NOT_RECOGNIZED"),
+        (b"OFFICE hours", "FORMAT_NOT_RECOGNIZED"),
+        (b"VERSION 3\n", "FORMAT_NOT_RECOGNIZED"),
+        (b"1 2\n3 4\n", "FORMAT_NOT_RECOGNIZED"),
+        (b"1 2 3\n4 5\n", "FORMAT_NOT_RECOGNIZED"),
         (b"v is for vertex", "FORMAT_NOT_RECOGNIZED"),
         (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNIZED"),
         (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNIZED"),  # an STL file's facets have corners

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import tempfile
 from pathlib import Path
@@ -21,7 +22,7 @@ from tests.core.importing import (
 )
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
-from tests.core.importing.meshes import test_point_clouds
+from tests.core.importing.meshes import mesh_files, test_point_clouds
 
 
 def make_others() -> dict[str, dict[str, bytes]]:
@@ -50,9 +51,17 @@ def _array_files() -> dict[str, bytes]:
 
 def _mesh_files() -> dict[str, bytes]:
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
+    around = test_point_clouds.directions(150)
     files = {kind: _bytes(ball.export(file_type=kind)) for kind in ("ply", "stl", "stl_ascii", "obj", "glb")}
     files["ply_ascii"] = _bytes(ball.export(file_type="ply", encoding="ascii"))
-    around = test_point_clouds.directions(150)
+    files |= {"off": mesh_files.off(), "off_binary": mesh_files.off_binary(colors=1), "dae": mesh_files.dae()}
+    document, parts = mesh_files.glb_parts()
+    for name, data in parts.items():
+        document = document.replace(name.encode(), b"data:;base64," + base64.b64encode(data))
+    files |= {"gltf": document, "strips": mesh_files.strips_ply(), "strips_binary": mesh_files.strips_ply(binary=True)}
+    for form in ("ascii", "binary", "binary_compressed"):
+        files[f"pcd_{form}"] = mesh_files.pcd(0.5 * around, around, form)
+    files["xyz"] = "\n".join(" ".join(f"{v:.4f}" for v in row) for row in np.hstack([around, around])).encode()
     return files | {"cloud": test_point_clouds.ply(0.5 * around, around)}
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import trimesh
 
 from regnf_core.importing.containers.sniff import sniff_format
@@ -13,6 +16,7 @@ from regnf_core.importing.meshes import MESH_READERS
 from regnf_core.importing.upload_description import UploadDescription
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+FACES = BALL.faces.tolist()
 PLY_TRIANGLE = (
     "ply\nformat ascii 1.0\ncomment by hand\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
@@ -28,3 +32,93 @@ def converted(data: bytes, **said: Any) -> ConvertedField:
 def exported(kind: str, **options: Any) -> bytes:
     data = BALL.export(file_type=kind, **options)
     return data.encode() if isinstance(data, str) else bytes(data)
+
+
+def glb_parts() -> tuple[bytes, dict[str, memoryview]]:
+    """BALL as glTF in several files: the document, and the files beside it."""
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(BALL))  # type: ignore[no-untyped-call]
+    return files.pop("model.gltf"), {name: memoryview(data) for name, data in files.items()}
+
+
+def strips_ply(binary: bool = False) -> bytes:
+    """A tetrahedron as two strips."""
+    strips = [0, 2, 1, 3, -1, 3, 0, 2, -1, 0, 1, 3]
+    header = (
+        f"ply\nformat {'binary_big_endian' if binary else 'ascii'} 1.0\nelement vertex 4\nproperty float x\n"
+        "property float y\nproperty float z\nelement tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+    )
+    corners = [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
+    if binary:
+        body = b"".join(struct.pack(">3f", *corner) for corner in corners)
+        return header.encode() + body + struct.pack(f">{len(strips) + 1}i", len(strips), *strips)
+    text = "".join(f"{x} {y} {z}\n" for x, y, z in corners)
+    return (header + text + " ".join(map(str, [len(strips), *strips])) + "\n").encode()
+
+
+def off(magic: str = "OFF", extra: str = "") -> bytes:
+    """BALL as text; ``extra`` stands behind each vertex."""
+    lines = [magic, "# a ball", f"{len(BALL.vertices)} {len(BALL.faces)} 0"]
+    lines += [f"{x!r} {y!r} {z!r}{extra}" for x, y, z in BALL.vertices.tolist()]
+    return "\n".join([*lines, *(f"3 {a} {b} {c} 255 0 0" for a, b, c in BALL.faces.tolist())]).encode()
+
+
+def off_binary(colors: int = 0) -> bytes:
+    rows = b"".join(
+        struct.pack(">5i", 3, *face, colors) + struct.pack(f">{colors}f", *[1.0] * colors) for face in FACES
+    )
+    counts = struct.pack(">3i", len(BALL.vertices), len(FACES), 0)
+    return b"OFF BINARY\n" + counts + BALL.vertices.astype(">f4").tobytes() + rows
+
+
+def dae(body: str = "", nodes: str = '<node id="n"><instance_geometry url="#g"/></node>', head: str = "") -> bytes:
+    """BALL as COLLADA; ``body`` replaces its list of triangles, ``nodes`` its scene."""
+    places = " ".join(repr(value) for value in BALL.vertices.reshape(-1).tolist())
+    corners = " ".join(f"{i} 0" for face in FACES for i in face)
+    body = body or (
+        f'<triangles count="{len(FACES)}"><input semantic="VERTEX" source="#v" offset="0"/>'
+        f'<input semantic="NORMAL" source="#n" offset="1"/><p>{corners}</p></triangles>'
+    )
+    return f"""<?xml version="1.0" encoding="utf-8"?>{head}
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="meter" meter="1"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="{3 * len(BALL.vertices)}">{places}</float_array>
+<technique_common><accessor source="#a" count="{len(BALL.vertices)}" stride="3"/></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>{body}</mesh></geometry></library_geometries>
+<library_nodes><node id="shared"><instance_geometry url="#g"/></node></library_nodes>
+<library_visual_scenes><visual_scene id="s">{nodes}</visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()
+
+
+def pcd(points: npt.NDArray[np.float64], normals: npt.NDArray[np.float64] | None, data: str) -> bytes:
+    names = "x y z" + (" normal_x normal_y normal_z curvature" if normals is not None else "")
+    columns = points if normals is None else np.hstack([points, normals, np.zeros((len(points), 1))])
+    width = columns.shape[1]
+    header = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {names}\nSIZE {'4 ' * width}\n"
+        f"TYPE {'F ' * width}\nCOUNT {'1 ' * width}\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(points)}\nDATA {data}\n"
+    ).encode()
+    if data == "ascii":
+        return header + "\n".join(" ".join(map(repr, row)) for row in columns.tolist()).encode()
+    if data == "binary":
+        return header + columns.astype("<f4").tobytes()
+    raw = columns.T.astype("<f4").tobytes()
+    packed = literal_lzf(raw)
+    return header + struct.pack("<II", len(packed), len(raw)) + packed
+
+
+def literal_lzf(raw: bytes) -> bytes:
+    """LZF that copies nothing but runs of zeros."""
+    packed = b""
+    at = 0
+    while at < len(raw):
+        run = len(raw[at : at + 200]) - len(raw[at : at + 200].lstrip(b"\0"))
+        if at and raw[at - 1] == 0 and run > 9:
+            packed += bytes([7 << 5, run - 9, 0])
+            at += run
+        else:
+            piece = raw[at : at + (1 if raw[at] == 0 else 32)]
+            packed += bytes([len(piece) - 1]) + piece
+            at += len(piece)
+    return packed

@@ -80,7 +80,7 @@ def test_the_triangle_alone_is_taken() -> None:
         (triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 0}]), "MESH_INVALID"),
         (triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 1 << 40}]), "MESH_INVALID"),
         (triangle(buffers=[{"byteLength": 36, "uri": "../../secret.bin"}]), "MESH_EXTERNAL_REFERENCE"),
-        (triangle(buffers=[{"byteLength": 36, "uri": "data:;base64,AAAA"}]), "MESH_EXTERNAL_REFERENCE"),
+        (triangle(buffers=[{"byteLength": 36, "uri": "data:;base64,AAAA"}]), "MESH_INVALID"),
         (triangle(extensionsRequired=["KHR_draco_mesh_compression"]), "FORMAT_NOT_SUPPORTED"),
         (
             triangle(bufferViews=[{"buffer": 0, "byteLength": 36, "extensions": {"EXT_meshopt_compression": {}}}]),

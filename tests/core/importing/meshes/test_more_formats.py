@@ -1,0 +1,277 @@
+"""OFF, COLLADA, glTF in parts, strips, PCD and plain points: sound files, and files that lie."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+from regnf_core.importing.containers.sniff import sniff_format
+from regnf_core.importing.families.mesh import convert_mesh
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.meshes import read_mesh
+from regnf_core.importing.meshes.lzf import unpack_lzf
+from regnf_core.importing.upload_description import UploadDescription
+from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.meshes.mesh_files import (
+    BALL,
+    FACES,
+    converted,
+    dae,
+    glb_parts,
+    literal_lzf,
+    off,
+    off_binary,
+    pcd,
+    strips_ply,
+)
+from tests.core.importing.meshes.test_point_clouds import directions
+
+POLYLIST = (
+    f'<polylist count="{len(FACES)}"><input semantic="VERTEX" source="#v" offset="1"/>'
+    f"<input semantic='TEXCOORD' source='#t' offset='0'/><vcount>{'3 ' * len(FACES)}</vcount>"
+    f"<p>{' '.join(f'0 {i}' for face in FACES for i in face)}</p></polylist>"
+)
+POLYGONS = (
+    '<polygons count="9"><input semantic="VERTEX" source="#v" offset="0"/>'
+    + "".join(f"<p>{a} {b} {c}</p>" for a, b, c in FACES)
+    + "</polygons>"
+)
+NESTED = (
+    "<node><scale>2 2 2</scale><node><rotate>0 0 1 90</rotate><translate>0 0 1</translate>"
+    '<instance_node url="#shared"/></node></node>'
+)
+AROUND = directions(400)
+
+
+def volume(data: bytes, **options: Any) -> tuple[float, np.ndarray[Any, Any]]:
+    """Of the mesh in a file: its volume and its center."""
+    format_ = sniff_format(data[:512])
+    found = read_mesh(str(format_), memoryview(data), **options)
+    mesh = trimesh.Trimesh(found.vertices, found.faces, process=True)
+    assert mesh.is_watertight
+    return float(mesh.volume), np.asarray(mesh.center_mass)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        off(),
+        off("COFF", " 255 0 0 255"),
+        off("NOFF", " 0 0 1"),
+        off("STCNOFF", " 0 0 1 1 0 0 1 0.5 0.5"),
+        off().replace(b"OFF\n# a ball\n", b"OFF"),
+        off_binary(),
+        off_binary(colors=3),
+        dae(),
+        dae(POLYLIST),
+        dae(POLYGONS),
+        dae(nodes="").replace(b'<instance_visual_scene url="#s"/>', b""),
+    ],
+    ids=[
+        "off",
+        "coff",
+        "noff",
+        "stcnoff",
+        "one line",
+        "binary",
+        "binary colors",
+        "dae",
+        "polylist",
+        "polygons",
+        "bare",
+    ],
+)
+def test_every_format_gives_the_ball(data: bytes) -> None:
+    found, center = volume(data)
+    assert found == pytest.approx(BALL.volume, rel=1e-6)
+    np.testing.assert_allclose(center, 0.0, atol=1e-6)
+
+
+def test_nodes_of_collada_stand_at_their_poses() -> None:
+    found, center = volume(dae(nodes=NESTED))
+    assert found == pytest.approx(8 * BALL.volume, rel=1e-6)
+    np.testing.assert_allclose(center, [0.0, 0.0, 2.0], atol=1e-6)
+    mirrored, _ = volume(dae(nodes='<node><scale>-1 1 1</scale><instance_geometry url="#g"/></node>'))
+    assert mirrored == pytest.approx(BALL.volume, rel=1e-6)
+    inches = converted(dae().replace(b'meter="1"', b'meter="0.0254"'))
+    assert any("its unit is 0.0254 m" in why for why in inches.why)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_strips_are_turned_one_by_one(binary: bool) -> None:
+    assert volume(strips_ply(binary))[0] == pytest.approx(1 / 6, rel=1e-6)
+
+
+def test_gltf_in_parts_needs_its_parts() -> None:
+    document, parts = glb_parts()
+    assert sniff_format(document[:512]) == "gltf"
+    assert volume(document, siblings=parts)[0] == pytest.approx(BALL.volume, rel=1e-5)
+    assert_refused(lambda: converted(document), "MESH_EXTERNAL_REFERENCE")
+    whole = json.loads(document)
+    for buffer in whole["buffers"]:
+        data = base64.b64encode(parts[buffer["uri"]]).decode()
+        buffer["uri"] = f"data:application/octet-stream;base64,{data}"
+    assert volume(json.dumps(whole).encode())[0] == pytest.approx(BALL.volume, rel=1e-5)
+
+
+@pytest.mark.parametrize("uri", ["../model.bin", "/etc/passwd", "http://example.org/a.bin", "%2e%2e/x", 7, None])
+def test_gltf_never_reaches_for_a_file(uri: Any) -> None:
+    document = json.loads(glb_parts()[0])
+    for buffer in document["buffers"]:
+        buffer["uri"] = uri
+    reason = "MESH_EXTERNAL_REFERENCE" if isinstance(uri, str) else "MESH_INVALID"
+    assert_refused(lambda: converted(json.dumps(document).encode()), reason)
+
+
+@pytest.mark.parametrize("tail", ["AAAA", "!!!!", "A" * (1 << 20)])
+def test_gltf_data_that_is_not_what_it_claims(tail: str) -> None:
+    document = json.loads(glb_parts()[0])
+    document["buffers"] = [{"uri": f"data:;base64,{tail}", "byteLength": 36} for _ in document["buffers"]]
+    assert_refused(lambda: converted(json.dumps(document).encode()), "MESH_INVALID")
+
+
+CIRCLE = '<node id="a"><instance_node url="#shared"/></node>'
+BOMB = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
+OUTSIDE = '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (dae(head=BOMB), "MESH_INVALID"),
+        (dae(head=OUTSIDE), "MESH_INVALID"),
+        (dae(head='<!DOCTYPE x SYSTEM "http://example.org/x.dtd">'), "MESH_INVALID"),
+        (dae()[:-20], "MESH_INVALID"),
+        (dae().replace(b"<COLLADA", b"<X><COLLADA").replace(b"</COLLADA>", b"</COLLADA></X>"), "MESH_INVALID"),
+        (dae().replace(b"utf-8", b"utf-99"), "MESH_INVALID"),
+        (dae("<triangles/>"), "MESH_INVALID"),
+        (dae(POLYLIST.replace("<p>0 ", "<p>")), "MESH_INVALID"),
+        (dae(POLYLIST.replace("<vcount>3 ", "<vcount>4 ")), "MESH_INVALID"),
+        (dae(POLYLIST.replace("<vcount>3 ", "<vcount>-3 ")), "MESH_INVALID"),
+        (dae(POLYLIST.replace('offset="1"', 'offset="99999999"')), "MESH_INVALID"),
+        (dae(POLYGONS.replace("<p>0", "<p>9999")), "MESH_INVALID"),
+        (dae(POLYGONS.replace("<p>0", "<p>&#233;")), "MESH_INVALID"),
+        (dae().replace(b'stride="3"', b'stride="4"'), "MESH_INVALID"),
+        (dae().replace(b'stride="3"', b'stride="3" offset="5"'), "MESH_INVALID"),
+        (dae().replace(b'"#a" count="', b'"#a" count="99999'), "MESH_INVALID"),
+        (dae().replace(b'url="#g"', b'url="#h"'), "MESH_INVALID"),
+        (dae().replace(b'url="#g"', b'url="other.dae#g"'), "MESH_EXTERNAL_REFERENCE"),
+        (
+            dae(nodes=CIRCLE).replace(b'<node id="shared">', b'<node id="shared"><instance_node url="#shared"/>'),
+            "MESH_INVALID",
+        ),
+        (dae(nodes="<node><translate>1 2</translate></node>"), "MESH_INVALID"),
+        (dae(nodes="<node>" * 300 + "</node>" * 300), "MESH_INVALID"),
+        (dae(nodes='<node><rotate>0 0 0 9</rotate><instance_geometry url="#g"/></node>'), "MESH_INVALID"),
+        (dae(nodes="<node/>"), "MESH_INVALID"),
+    ],
+)
+def test_faulty_collada_files(data: bytes, reason: str) -> None:
+    assert_refused(lambda: convert_mesh("dae", memoryview(data), UploadDescription()), reason)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (off("4OFF"), "FORMAT_NOT_SUPPORTED"),
+        (off("nOFF"), "FORMAT_NOT_SUPPORTED"),
+        (off().replace(b" 0\n", b" 1\n", 1)[:-500], "MESH_INVALID"),
+        (b"OFF\n", "MESH_INVALID"),
+        (b"OFF\n-1 2 0\n", "MESH_INVALID"),
+        (b"OFF\n99999999 2 0\n", "MESH_TOO_LARGE"),
+        (b"OFF\n3 99999999 0\n", "MESH_TOO_LARGE"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "MESH_INVALID"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1\n3 0 1 2\n", "MESH_INVALID"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 nan\n3 0 1 2\n", "MESH_INVALID"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 x\n3 0 1 2\n", "MESH_INVALID"),
+        (b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n9 0 1 2\n", "MESH_INVALID"),
+        (b"OFF BINARY", "MESH_INVALID"),
+        (b"OFF BINARY\n\0", "MESH_INVALID"),
+        (b"OFF BINARY\n" + struct.pack(">3i", 9, 9, 0), "MESH_INVALID"),
+        (off_binary()[:-3], "MESH_INVALID"),
+        (off_binary(colors=3)[:-3], "MESH_INVALID"),
+    ],
+)
+def test_faulty_off_files(data: bytes, reason: str) -> None:
+    assert_refused(lambda: convert_mesh("off", memoryview(data), UploadDescription()), reason)
+
+
+def points_text(normals: bool, count: bool = False, separator: str = " ") -> bytes:
+    rows = np.hstack([0.5 * AROUND, AROUND]) if normals else 0.5 * AROUND
+    lines = [separator.join(f"{value:.6f}" for value in row) for row in rows]
+    return "\n".join([str(len(rows))] * count + lines).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(pcd(0.5 * AROUND, AROUND, data) for data in ("ascii", "binary", "binary_compressed")),
+        points_text(normals=True),
+        points_text(normals=True, count=True),
+        points_text(normals=True, separator=", "),
+    ],
+    ids=["ascii", "binary", "compressed", "xyz", "pts", "commas"],
+)
+def test_clouds_give_the_points_and_normals_they_were_written_from(data: bytes) -> None:
+    format_ = sniff_format(data[:512])
+    assert format_ in ("pcd", "xyz")
+    found = read_mesh(format_, memoryview(data))
+    np.testing.assert_allclose(found.vertices, 0.5 * AROUND, atol=1e-6)
+    assert found.normals is not None
+    np.testing.assert_allclose(found.normals, AROUND, atol=1e-6)
+
+
+def test_a_cloud_goes_through_the_gate(tmp_path: Path) -> None:
+    around = directions(2000)
+    report = import_field(saved(tmp_path, pcd(0.5 * around, around, "binary")), tmp_path / "out")
+    assert report.family == "point_cloud"
+    assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (pcd(AROUND, None, "binary"), "POINT_CLOUD_WITHOUT_NORMALS"),
+        (points_text(normals=False), "POINT_CLOUD_WITHOUT_NORMALS"),
+        (pcd(AROUND, AROUND, "binary")[:-1], "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "ascii")[:-300], "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary_compressed")[:-1], "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "ascii").replace(b"0.7 -", b"0.7 -" + b"x" * 20000), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"POINTS 400", b"POINTS 99999999"), "MESH_TOO_LARGE"),
+        (pcd(AROUND, AROUND, "binary").replace(b"POINTS 400", b"POINTS -400"), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"COUNT 1", b"COUNT 9"), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"TYPE F", b"TYPE Q"), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"SIZE 4", b"SIZE 3"), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"FIELDS x y", b"FIELDS x x"), "MESH_INVALID"),
+        (pcd(AROUND, AROUND, "binary").replace(b"DATA binary", b"DATA zipped"), "MESH_INVALID"),
+        (points_text(normals=True) + b"1 2\n", "MESH_INVALID"),
+        (points_text(normals=True) + b"1 2 3 4 5 six\n", "MESH_INVALID"),
+    ],
+)
+def test_faulty_clouds(data: bytes, reason: str) -> None:
+    format_ = "pcd" if b"PCD" in data[:40] else "xyz"
+    assert_refused(lambda: convert_mesh(format_, memoryview(data), UploadDescription()), reason)
+
+
+def test_compressed_points_unpack_to_exactly_what_is_claimed() -> None:
+    raw = b"abc" * 7 + b"\0" * 500 + bytes(range(256))
+    packed = literal_lzf(raw)
+    assert bytes(unpack_lzf(memoryview(packed), len(raw))) == raw
+    assert bytes(unpack_lzf(memoryview(b"\x02abc\xe0\x09\x02"), 21)) == b"abc" * 7  # a copy that overlaps itself
+    for faulty, size in (
+        (packed, len(raw) - 1),
+        (packed, len(raw) + 1),
+        (packed[:-1], len(raw)),
+        (b"\x20\x05", 3),
+        (b"\xe0", 9),
+        (b"\x00", 1),
+        (b"\x00a", 1 << 40),
+    ):
+        assert_refused(lambda faulty=faulty, size=size: unpack_lzf(memoryview(faulty), size), "MESH_INVALID")
