@@ -52,7 +52,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
         "source": {"family": FAMILY},
     }
     nodes = " x ".join(map(str, values.shape))
-    why = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
+    why: tuple[str, ...] = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
     if weights is not None and not weights.all():
         tensors["values"] = filled_nodes(values, weights > 0, spacing, overrides.sign or 1)
         why = (*why, f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were seen, the rest is free space")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from typing import Any
 from xml.parsers import expat
 
 from regnf_core.importing.meshes.geometry import malformed
@@ -65,7 +66,8 @@ def read_xml(data: memoryview) -> Element:
     parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     parser.CharacterDataHandler = builder.text
-    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = _refuse
+    parser.StartDoctypeDeclHandler = _refuse
+    parser.EntityDeclHandler = _refuse
     parser.ExternalEntityRefHandler = _refuse
     try:
         parser.Parse(bytes(data), True)
@@ -76,5 +78,5 @@ def read_xml(data: memoryview) -> Element:
     return builder.root
 
 
-def _refuse(*_: object) -> None:
+def _refuse(*_: object) -> Any:
     raise malformed("the XML file declares a document type or entities, which no mesh needs")

@@ -124,19 +124,24 @@ def test_the_uploader_may_tell_the_truncation(tmp_path: Path) -> None:
 
 def fused(voxels: float, aslant: float = 0.0) -> dict[str, Any]:
     """A map of a box and the floor under it, fused by Open3D at ``voxels`` voxels, as cameras round it see it."""
-    shell = trimesh.util.concatenate(
-        [
-            trimesh.creation.box(bounds=[[-0.3, -0.25, 0.0], [0.3, 0.25, 0.5]]),
-            trimesh.creation.box(bounds=[[-1.0, -1.0, -0.1], [1.0, 1.0, 0.0]]),
-        ]
-    )
+    boxes = [
+        trimesh.creation.box(bounds=[[-0.3, -0.25, 0.0], [0.3, 0.25, 0.5]]),
+        trimesh.creation.box(bounds=[[-1.0, -1.0, -0.1], [1.0, 1.0, 0.0]]),
+    ]
     rays = open3d.t.geometry.RaycastingScene()
-    triangles = shell.vertices.astype(np.float32), shell.faces.astype(np.uint32)
-    rays.add_triangles(*(open3d.core.Tensor(part) for part in triangles))
+    for box in boxes:
+        triangles = box.vertices.astype(np.float32), box.faces.astype(np.uint32)
+        rays.add_triangles(*(open3d.core.Tensor.from_numpy(part) for part in triangles))
     grid = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (open3d.core.float32,) * 2, ((1), (1)), 0.02, 16, 2000, open3d.core.Device("CPU:0")
+        ("tsdf", "weight"),
+        (open3d.core.float32,) * 2,
+        (open3d.core.SizeVector([1]),) * 2,
+        0.02,
+        16,
+        2000,
+        open3d.core.Device("CPU:0"),
     )
-    K = open3d.core.Tensor(np.array([[160.0, 0.0, 79.5], [0.0, 160.0, 59.5], [0.0, 0.0, 1.0]]))
+    K = open3d.core.Tensor.from_numpy(np.array([[160.0, 0.0, 79.5], [0.0, 160.0, 59.5], [0.0, 0.0, 1.0]]))
     for turn in np.arange(8) * np.pi / 4 + aslant:
         forward = -np.array([1.3 * np.cos(turn), 1.3 * np.sin(turn), 0.25])
         z = forward / np.linalg.norm(forward)
@@ -144,9 +149,11 @@ def fused(voxels: float, aslant: float = 0.0) -> dict[str, Any]:
         pose = np.eye(4)
         pose[:3, :3] = np.stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z], axis=1)
         pose[:3, 3] = np.array([0.0, 0.0, 0.25]) - forward
-        T = open3d.core.Tensor(np.linalg.inv(pose))
+        T = open3d.core.Tensor.from_numpy(np.linalg.inv(pose))
         depth = rays.cast_rays(rays.create_rays_pinhole(K, T, 160, 120))["t_hit"].numpy()
-        image = open3d.t.geometry.Image(open3d.core.Tensor((np.where(depth < 5, depth, 0) * 1e4).astype(np.uint16)))
+        image = open3d.t.geometry.Image(
+            open3d.core.Tensor.from_numpy((np.where(depth < 5, depth, 0) * 1e4).astype(np.uint16))
+        )
         blocks = grid.compute_unique_block_coordinates(image, K, T, 1e4, 4.0, voxels)
         grid.integrate(blocks, image, K, T, 1e4, 4.0, voxels)
     tables = {name: grid.attribute(name).cpu().numpy() for name in ("tsdf", "weight")}

@@ -37,7 +37,7 @@ def exported(kind: str, **options: Any) -> bytes:
 def glb_parts() -> tuple[bytes, dict[str, memoryview]]:
     """BALL as glTF in several files: the document, and the files beside it."""
     files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(BALL))  # type: ignore[no-untyped-call]
-    return files.pop("model.gltf"), {name: memoryview(data) for name, data in files.items()}
+    return bytes(files.pop("model.gltf")), {name: memoryview(data) for name, data in files.items()}
 
 
 def strips_ply(binary: bool = False) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -274,4 +275,4 @@ def test_compressed_points_unpack_to_exactly_what_is_claimed() -> None:
         (b"\x00", 1),
         (b"\x00a", 1 << 40),
     ):
-        assert_refused(lambda faulty=faulty, size=size: unpack_lzf(memoryview(faulty), size), "MESH_INVALID")
+        assert_refused(partial(unpack_lzf, memoryview(faulty), size), "MESH_INVALID")
