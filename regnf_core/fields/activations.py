@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
+
+from regnf_core.schema.kinds.mlp import LEAKY_SLOPE
 
 _BETA = 100.0
 _FLAT = 20.0
@@ -46,9 +50,33 @@ class Activation:
     slope: Callable[[Tensor], Tensor]
 
 
+def _gelu_slope(x: Tensor) -> Tensor:
+    """Of x times the normal distribution's share below x."""
+    below = 0.5 * (1.0 + torch.erf(x * math.sqrt(0.5)))
+    return below + x * torch.exp(-0.5 * x.square()) / math.sqrt(2.0 * math.pi)
+
+
+def _silu_slope(x: Tensor) -> Tensor:
+    share = torch.sigmoid(x)
+    return share * (1.0 + x * (1.0 - share))
+
+
+def leaky_relu(negative_slope: float) -> Activation:
+    """x above zero, ``negative_slope`` x below."""
+    return Activation(
+        lambda x: functional.leaky_relu(x, negative_slope),
+        lambda x: torch.where(x > 0.0, 1.0, negative_slope).to(x.dtype),
+    )
+
+
 ACTIVATIONS = {
     "relu": Activation(torch.relu, lambda x: (x > 0.0).to(x.dtype)),
     "softplus": Activation(softplus, softplus_slope),
     "sine": Activation(torch.sin, torch.cos),
+    "tanh": Activation(torch.tanh, lambda x: 1.0 - torch.tanh(x).square()),
+    "elu": Activation(functional.elu, lambda x: x.clamp_max(0.0).exp()),
+    "gelu": Activation(functional.gelu, _gelu_slope),
+    "silu": Activation(functional.silu, _silu_slope),
+    "leaky_relu": leaky_relu(LEAKY_SLOPE),
 }
 """By the name that the safe format uses."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from regnf_core.fields.activations import ACTIVATIONS
+from regnf_core.fields.activations import ACTIVATIONS, Activation, leaky_relu
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.positional_encoding import PositionalEncoding
-from regnf_core.schema.kinds.mlp import ActivationName, MlpDescription
+from regnf_core.schema.kinds.mlp import MlpDescription
 from regnf_core.schema.layers import count_layers
 
 
@@ -63,7 +63,7 @@ class MlpFunction:
     """
 
     layers: tuple[Layer, ...]
-    activation: ActivationName
+    activation: Activation
     positional_encoding: PositionalEncoding | None = None
     output_tanh: int = 0
 
@@ -79,7 +79,7 @@ class MlpFunction:
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (N,) at points (N, 3)."""
         inputs = self._inputs(points)
-        activate = ACTIVATIONS[self.activation].value
+        activate = self.activation.value
         h = inputs
         for layer in self.layers[:-1]:
             a = _linear(layer, h, inputs)
@@ -89,15 +89,14 @@ class MlpFunction:
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
         inputs = self._inputs(points)
-        activation = ACTIVATIONS[self.activation]
         h, slopes, standards = inputs, [], []
         for layer in self.layers[:-1]:
             a = _linear(layer, h, inputs)
             if layer.norm is not None:
                 a, standard, scale = layer.norm.normalize(a)
                 standards.append((standard, scale))
-            slopes.append(activation.slope(a))
-            h = activation.value(a)
+            slopes.append(self.activation.slope(a))
+            h = self.activation.value(a)
         distance, slope = self._squashed(_linear(self.layers[-1], h, inputs).squeeze(-1))
         gradient = slope.unsqueeze(-1) * self.layers[-1].weight  # (N, in)
         by_input, gradient = _split(self.layers[-1], gradient, inputs)
@@ -148,7 +147,10 @@ def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> Fun
         if i in description.normalized:
             norm = LayerNorm(tensors[f"norms.{i}.weight"].float(), tensors[f"norms.{i}.bias"].float())
         layers.append(Layer(weight, bias, sees_input, norm))
-    function = MlpFunction(tuple(layers), description.activation, positional, description.output_tanh)
+    activation = ACTIVATIONS[description.activation]
+    if description.activation == "leaky_relu":
+        activation = leaky_relu(description.negative_slope)
+    function = MlpFunction(tuple(layers), activation, positional, description.output_tanh)
     return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
 
 

@@ -74,6 +74,12 @@ class EncodingDescription:
     """Number of frequencies."""
     two_pi: bool | None = None
     """Whether the sines' argument is multiplied by 2 pi."""
+    base_frequency: Annotated[float, Ge(1e-3), Le(1e3)] | None = None
+    """The sines' lowest frequency, in place of ``two_pi``."""
+    order: Literal["frequency", "kind", "kind_frequency", "axis"] | None = None
+    """How the columns are sorted. frequency: for each frequency three sines, then three cosines. kind: all sines, axis
+    by axis, then all cosines; kind_frequency: the same, frequency by frequency. axis: for each axis and frequency, the
+    sine and the cosine."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +119,12 @@ class UploadDescription:
     """The function between the network's layers."""
     activation_scale: Annotated[float, Gt(0), Le(1e6)] | None = None
     """Softplus's beta, the sine's omega, or leaky_relu's slope for negative numbers."""
+    first_activation_scale: Annotated[float, Gt(0), Le(1e6)] | None = None
+    """The sine's omega in the first layer, where it differs from that of the others."""
+    skip_factor: Annotated[float, Gt(0), Le(1e3)] | None = None
+    """The factor of what a layer is given that sees the network's input again: 1, or 1 / sqrt 2."""
+    skip_order: Literal["hidden_first", "input_first"] | None = None
+    """What comes first in such a layer's columns."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
     """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
     frame: Literal["dataset", "field"] | None = None

@@ -14,6 +14,7 @@ from regnf_core.importing.families import (
     neus,
     nglod,
     pin_slam,
+    plain_network,
     sdfstudio,
     siren,
     torch_ngp,
@@ -31,6 +32,7 @@ but cannot be taken."""
 FAMILIES: tuple[Family, ...] = (
     sdfstudio.convert,
     neus.convert,
+    neus.convert_implicit,
     instant_nsr_pl.convert,
     neuralangelo.convert,
     deepsdf.convert,
@@ -40,6 +42,7 @@ FAMILIES: tuple[Family, ...] = (
     nglod.convert,
     isdf.convert,
     unsupported.refuse,
+    plain_network.convert,
 )
 
 _SHOWN_KEYS = 8

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,18 @@ class Reading:
 
 
 @dataclass(frozen=True)
+class OpenReading:
+    """A reading that is made only when it is tried: there may be many, and each has tensors of its own."""
+
+    name: str
+    """What to say in a description to get it."""
+    family: str
+    make: Callable[[], Reading]
+    ends_at: float | None = None
+    """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
+
+
+@dataclass(frozen=True)
 class ConvertedField:
     """A field ready to be written: the safe file's description and tensors, and how the family was recognized."""
 
@@ -32,6 +44,9 @@ class ConvertedField:
     readings: tuple[Reading, ...] = ()
     """Where shapes leave the function open: every possible one, the most usual first. The gate tries them and keeps the
     one that behaves most like a distance; see :mod:`regnf_core.importing.gate.choice`. Empty: there is no doubt."""
+    open_readings: tuple[OpenReading, ...] = ()
+    """The same where what decides is how a network of plain layers behaves; see
+    :mod:`regnf_core.importing.gate.network_form`."""
     sign_is_open: bool = False
     """Whether trainers of this family save fields of either sign, and the upload does not say which this is."""
 

@@ -7,6 +7,8 @@ shape is constant, so it is folded into the biases, and what remains is a field.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +17,13 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, told
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.pickle.pickle_values import TensorRef
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
-FAMILY = "deepsdf"
+FAMILY, IGR = "deepsdf", "igr"
 _PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
 
@@ -36,34 +39,48 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     if prefix is None:
         _refuse_codes_alone(checkpoint)
         return None
-    require_family(overrides, FAMILY)
-    refuse_other_entries(overrides, FAMILY, ("latent", "latent_index"))
+    refuse_other_entries(overrides, FAMILY, ("latent", "latent_index", *FORM_ENTRIES))
     state = strip_prefix(network, prefix.removesuffix("lin"))
     names = layer_names(state, "lin")
-    layers = read_layers(state, names, source)
+    layers = read_layers(state, names, source, column=overrides.output_column or 0)
+    norms = _norms(state, layers, source)
+    own = _is_deepsdfs(state, norms)
+    require_family(overrides, IGR if overrides.family == IGR and not own else FAMILY)
     width = layers.input_width - 3
     if width < 0:
         raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 or more", "TENSOR_SHAPE")
-    latent, whence = _latent(checkpoint, source, overrides, width)
+    latent, whence = latent_code(checkpoint, source, overrides, width)
     whole = [i for i, extra in enumerate(layers.extra_columns) if extra == layers.input_width]
     seeing = [i for i, extra in enumerate(layers.extra_columns) if extra]
     require_extra_columns(layers, names, {i: layers.input_width if i in whole else 3 for i in seeing})
-    norms = _norms(state, layers, source)
-    description = {
-        "kind": "mlp",
-        **shared_entries(overrides, UNIT_CUBE),
-        "activation": "relu",
-        "input_at": seeing,
-        "normalized": sorted({int(name.split(".")[1]) for name in norms}),
-        "output_tanh": 1,
-        "source": {"family": FAMILY},
-    }
     why = (
         f"keys model_state_dict.{prefix}*, {len(names)} layers",
         whence,
-        "bounds [-1, 1]: the cube round the unit sphere, into which DeepSDF scales its shapes",
+        "bounds [-1, 1]: the cube round the unit sphere, into which shapes are scaled",
     )
-    return ConvertedField(FAMILY, why, description, _at_code(layers, latent, (0, *whole)).tensors() | norms)
+    folded = Network(at_code(layers, latent, (0, *whole)), tuple(seeing), norms)
+    return network_field(folded, _forms(overrides, own), shared_entries(overrides, UNIT_CUBE), why)
+
+
+def _is_deepsdfs(state: dict[str, Any], norms: dict[str, Float32Array]) -> bool:
+    """IGR's network (Gropp et al. 2020) has the same names; DeepSDF's has normalized weights or normalized layers."""
+    return bool(norms) or not all(f"lin{i}.weight" in state for i in range(len(state) // 2 - 1))
+
+
+def _forms(overrides: UploadDescription, own: bool) -> list[OpenForm]:
+    """DeepSDF's, with one tanh at the end, or with ``use_tanh`` two; IGR's where the names leave it open."""
+    tanhs = (1, 2) if overrides.output_tanh is None else (overrides.output_tanh,)
+    forms = [
+        OpenForm(told(output_tanh=n), Form("relu", output_tanh=n).said(replace(overrides, output_tanh=n)), FAMILY)
+        for n in tanhs
+    ]
+    igr = Form("softplus", skip_factor=math.sqrt(0.5)).said(overrides)
+    if overrides.family == IGR:
+        return [OpenForm(told(family=IGR), igr, IGR)]
+    if own or overrides.family == FAMILY:
+        return forms
+    named = (replace(one, name=told(family=FAMILY, output_tanh=one.form.output_tanh)) for one in forms)
+    return [OpenForm(told(family=IGR), igr, IGR), *named]
 
 
 def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:
@@ -73,7 +90,7 @@ def _refuse_codes_alone(checkpoint: dict[Any, Any]) -> None:
         raise FieldFormatError(message, reason="FIELD_NOT_RECOGNIZED")
 
 
-def _latent(
+def latent_code(
     checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription, width: int
 ) -> tuple[Float32Array, str]:
     """The shape's code (width,), and where it is from."""
@@ -121,7 +138,7 @@ def _norms(state: dict[str, Any], layers: Layers, source: TensorSource) -> dict[
     return found
 
 
-def _at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Layers:
+def at_code(layers: Layers, latent: Float32Array, whole: tuple[int, ...]) -> Layers:
     """The layers that see [..., code, position], with the code's part moved into the bias."""
     weights, biases = list(layers.weights), list(layers.biases)
     for i in whole:

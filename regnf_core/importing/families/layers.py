@@ -10,6 +10,7 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
+from regnf_core.importing.families.shared import contradiction
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.schema.layers import MAX_LAYERS
 
@@ -64,20 +65,30 @@ def layer_names(state: Mapping[str, Any], prefix: str, minimum: int = 2) -> list
 
 
 def read_layers(
-    state: Mapping[str, Any], names: Sequence[str], source: TensorSource, has_biases: bool = True
+    state: Mapping[str, Any],
+    names: Sequence[str],
+    source: TensorSource,
+    has_biases: bool | None = True,
+    column: int = 0,
 ) -> Layers:
-    """The layers of these names, in order. has_biases: False where the network has none; they are zero then.
+    """The layers of these names, in order. has_biases: False where the network has none, which are zero then; None
+    where each layer's names tell.
 
-    Raises FieldFormatError: TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
+    column: which of the last layer's results is the distance.
+    Raises FieldFormatError: TENSOR_MISSING, TENSOR_SHAPE, SETTINGS_CONTRADICT_TENSORS and what TensorSource raises.
     """
     weights, biases = [], []
     for name in names:
         weight = folded_weight(state, name, source)
         bias = np.zeros(weight.shape[0], dtype=np.float32)
-        if has_biases:
+        if has_biases or (has_biases is None and f"{name}.bias" in state):
             bias = source.array(f"{name}.bias", lookup(state, f"{name}.bias"))
             require_shape(f"{name}.bias", bias, (weight.shape[0],))
-        rows = slice(0, 1) if name == names[-1] else slice(None)
+        rows = slice(None)
+        if name == names[-1]:
+            if column >= len(weight):
+                raise contradiction("output_column", column, f"{len(weight)} columns, counted from 0")
+            rows = slice(column, column + 1)
         weights.append(weight[rows])
         biases.append(bias[rows])
     return Layers(tuple(weights), tuple(biases))

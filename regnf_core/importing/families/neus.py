@@ -1,75 +1,104 @@
-"""NeuS (Wang et al. 2021) as its authors' code saves it: one softplus network under ``sdf_network_fine``.
+"""NeuS (Wang et al. 2021), and the networks of IDR, VolSDF and MonoSDF, of which it has the form: softplus layers.
 
-The network's own ``scale`` is not in the checkpoint: S(x) = f(scale x) / scale. It is taken as 1; for the two published
-configurations that set 3, ``world_scale`` 1/3 and bounds of [-1, 1] say the same.
+NeuS's own ``scale`` is not in the checkpoint: S(x) = f(scale x) / scale. Where no settings say it, the published ones
+are tried: the trainer keeps the gradient at length one where it looks, and the network's surroundings show where that
+was. VolSDF's sphere round the scene is left out, as its own extraction of the surface leaves it out.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from regnf_core.importing.arrays import Float32Array, tensor_error
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.arrays import tensor_error
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.layers import layer_names, read_layers, strip_prefix
+from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, skips_of, told
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.states import state_under
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "neus"
-_MAX_DEGREE = 24
+_SCALES = (1.0, 3.0)
+"""Those of the published configurations."""
+_IMPLICIT = "implicit_network."
+_IMPLICIT_FAMILIES = ("volsdf", "monosdf", "idr")
+MAX_DEGREE = 24
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
-    """The signed distance field of such a checkpoint, or None where the keys are not theirs.
+    """The signed distance field of a NeuS, or None where the keys are not theirs.
 
-    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE and what TensorSource raises.
+    Raises FieldFormatError: FAMILY_NOT_SUPPORTED, TENSOR_MISSING, TENSOR_SHAPE, SETTINGS_CONTRADICT_TENSORS,
+    INVALID_DESCRIPTION and what TensorSource raises.
     """
     if "sdf_network_fine" not in checkpoint:
         return None
     require_family(overrides, FAMILY)
-    refuse_other_entries(overrides, FAMILY)
     state = strip_prefix(checkpoint["sdf_network_fine"], "")
-    names = layer_names(state, "lin")
-    layers = read_layers(state, names, source)
+    open_scale = overrides.input_scale is None and overrides.output_scale is None
+    return _converted(state, source, overrides, FAMILY, "sdf_network_fine", _SCALES if open_scale else ())
+
+
+def convert_implicit(
+    checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription
+) -> ConvertedField | None:
+    """The same of IDR, VolSDF or MonoSDF; raises the same."""
+    state = state_under(checkpoint, _IMPLICIT)
+    if not strip_prefix(state, "lin0."):
+        return None
+    if strip_prefix(state, "encoding."):
+        message = "MonoSDF's network with a hash grid of its own kernel; extract its mesh, and give that"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    density = bool(state_under(checkpoint, "density."))
+    family = overrides.family if overrides.family in _IMPLICIT_FAMILIES else "volsdf" if density else "idr"
+    require_family(overrides, family)
+    return _converted(state, source, overrides, family, _IMPLICIT.removesuffix("."), ())
+
+
+def _converted(
+    state: dict[str, Any],
+    source: TensorSource,
+    overrides: UploadDescription,
+    family: str,
+    where: str,
+    scales: tuple[float, ...],
+) -> ConvertedField:
+    refuse_other_entries(overrides, family, FORM_ENTRIES)
+    names = layer_names(strip_prefix(state, "lin"), "", minimum=2)
+    names = [f"lin{name}" for name in names]
+    layers = read_layers(state, names, source, column=overrides.output_column or 0)
     degree, rest = divmod(layers.input_width - 3, 6)
-    if rest or not 0 <= degree <= _MAX_DEGREE:
+    if rest or not 0 <= degree <= MAX_DEGREE:
         raise tensor_error(f"lin0 has {layers.input_width} columns, expected 3 + 6 x frequencies", "TENSOR_SHAPE")
-    skips = [i for i, extra in enumerate(layers.extra_columns) if extra]
-    require_extra_columns(layers, names, dict.fromkeys(skips, layers.input_width))
-    description = {
-        "kind": "mlp",
-        **shared_entries(overrides, UNIT_CUBE),
-        "activation": "softplus",
-        "positional_encoding": {"degree": degree},
-        "input_at": skips,
-        "source": {"family": FAMILY},
-    }
+    network = Network(layers, skips_of(layers, names))
+    form = Form("softplus", degree=degree, skip_factor=math.sqrt(0.5)).said(scaled(overrides))
+    forms = [OpenForm("as the description says", form, family)]
+    if scales:
+        forms = [
+            OpenForm(f"input_scale {s:g}", replace(form, input_scale=s, output_scale=1.0 / s), family) for s in scales
+        ]
     why = (
-        f"keys sdf_network_fine.lin*, {len(names)} layers, {degree} frequencies",
-        "bounds [-1, 1]: the unit sphere's cube, in which NeuS trains",
-        "the network's scale is taken as 1, as usual (where it was 3 say world_scale 0.333333 and the bounds)",
+        f"keys {where}.lin*, {len(names)} layers, {degree} frequencies",
+        "bounds [-1, 1]: the unit sphere's cube, in which it trains",
     )
-    return ConvertedField(FAMILY, why, description, _reordered(layers, degree, skips).tensors())
+    return network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why)
 
 
-def _reordered(layers: Layers, degree: int, skips: list[int]) -> Layers:
-    """The layers with the sines' columns in our order, and with the skip connections' 1 / sqrt 2 folded in.
-
-    NeuS has frequency after frequency, for each the three sines, then the three cosines; we have all sines, axis by
-    axis, then all cosines.
-    """
-    sines = [3 + 6 * k + axis for axis in range(3) for k in range(degree)]
-    order = np.array([0, 1, 2, *sines, *(column + 3 for column in sines)])
-    weights = list(layers.weights)
-    for i in (0, *skips):
-        before = weights[i].shape[1] - layers.input_width
-        columns = np.concatenate((np.arange(before), before + order))
-        weights[i] = _scaled(weights[i][:, columns], 1.0 if i == 0 else math.sqrt(0.5))
-    return Layers(tuple(weights), layers.biases)
+def _at_scale(form: Form, scale: float, world_scale: float) -> OpenForm:
+    """The trainer looks at the unit sphere."""
+    at_scale = replace(form, input_scale=scale, output_scale=1.0 / scale)
+    return OpenForm(told(input_scale=scale), at_scale, FAMILY, ends_at=world_scale)
 
 
-def _scaled(weight: Float32Array, factor: float) -> Float32Array:
-    return np.asarray(weight * np.float32(factor), dtype=np.float32)
+def scaled(overrides: UploadDescription) -> UploadDescription:
+    """With both factors where one is said: S(x) = f(s x) / s."""
+    given, made = overrides.input_scale, overrides.output_scale
+    if given is not None and made is None:
+        return replace(overrides, output_scale=1.0 / given)
+    if made is not None and given is None:
+        return replace(overrides, input_scale=1.0 / made)
+    return overrides

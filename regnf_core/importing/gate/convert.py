@@ -157,6 +157,10 @@ def _require_text(description: dict[str, Any]) -> None:
 
 def _settled(converted: ConvertedField) -> ConvertedField:
     """The one function that the field stands for, where its shapes leave several."""
+    if converted.open_readings:
+        from regnf_core.importing.gate.network_form import settle_form  # loads torch
+
+        converted = settle_form(converted)
     if not converted.readings:
         return converted
     from regnf_core.importing.gate.choice import choose_reading  # loads torch

@@ -13,7 +13,10 @@ from regnf_core.schema.layers import MAX_LAYERS, check_layers, count_layers, lay
 from regnf_core.schema.positional_encoding import PositionalEncodingDescription
 from regnf_core.schema.tensor_check import TensorSpec, count_rows, require, require_names, require_shape
 
-ActivationName = Literal["relu", "softplus", "sine"]
+LEAKY_SLOPE = 0.01
+"""Of leaky_relu for negative numbers, where nothing else is said."""
+
+ActivationName = Literal["relu", "softplus", "sine", "tanh", "elu", "gelu", "silu", "leaky_relu"]
 LayerNumbers = Annotated[tuple[Annotated[int, Ge(0), Le(MAX_LAYERS)], ...], MaxLen(MAX_LAYERS)]
 
 
@@ -23,7 +26,9 @@ class MlpDescription(FieldDescription):
 
     kind: Literal["mlp"]
     activation: ActivationName
-    """Between layers; softplus is log(1 + exp(100 a)) / 100."""
+    """Between layers; softplus is log(1 + exp(100 a)) / 100, gelu the exact one."""
+    negative_slope: Annotated[float, Ge(0), Le(1)] = LEAKY_SLOPE
+    """Of leaky_relu for negative numbers."""
     positional_encoding: PositionalEncodingDescription | None = None
     """None: the network sees the position alone."""
     input_at: LayerNumbers = ()

@@ -39,6 +39,12 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "normalized": {"activation": "relu", "normalized": [0, 1, 3], "input_at": [2], "output_tanh": 1},
     "tanh twice": {"activation": "sine", "output_tanh": 2},
+    "tanh between": {"activation": "tanh", "input_at": [2]},
+    "elu": {"activation": "elu"},
+    "gelu": {"activation": "gelu", "normalized": [1]},
+    "silu": {"activation": "silu", "input_at": [1]},
+    "leaky_relu": {"activation": "leaky_relu"},
+    "leaky_relu of another slope": {"activation": "leaky_relu", "negative_slope": 0.2, "input_at": [3]},
 }
 
 
@@ -80,6 +86,11 @@ def slowly(values: dict[str, Any], stored: dict[str, Array], point: Array) -> fl
         "relu": lambda a: np.maximum(a, 0.0),
         "softplus": lambda a: np.logaddexp(100.0 * a, 0.0) / 100.0,
         "sine": np.sin,
+        "tanh": np.tanh,
+        "elu": lambda a: np.where(a > 0.0, a, np.expm1(np.minimum(a, 0.0))),
+        "gelu": lambda a: a * np.array([0.5 * math.erfc(-each / math.sqrt(2.0)) for each in a]),
+        "silu": lambda a: a / (1.0 + np.exp(-a)),
+        "leaky_relu": lambda a: np.where(a > 0.0, a, values.get("negative_slope", 0.01) * a),
     }
     for i in range(5):
         if i in values.get("input_at", ()):
@@ -164,7 +175,14 @@ def test_tensors_that_do_not_fit(changes: dict[str, Any], stored: dict[str, Arra
 
 @pytest.mark.parametrize(
     "changes",
-    [{"activation": "gelu"}, {"output_tanh": 3}, {"input_at": [-1]}, {"input_at": list(range(40))}, {"hash": None}],
+    [
+        {"activation": "swish"},
+        {"activation": "leaky_relu", "negative_slope": 2.0},
+        {"output_tanh": 3},
+        {"input_at": [-1]},
+        {"input_at": list(range(40))},
+        {"hash": None},
+    ],
 )
 def test_descriptions_that_mean_nothing(changes: dict[str, Any]) -> None:
     with pytest.raises(FieldFormatError) as caught:

@@ -20,15 +20,17 @@ from tests.core.importing.archives import assert_refused
 
 INSTANT_GRID = {"hash": {"base_resolution": 16, "top_resolution": 2048, "features_per_level": 2}}
 ANGELO_GRID = {"hash": {"base_resolution": 32, "top_resolution": 2048, "features_per_level": 2}}
+NEUS_SAID, SIREN_SAID, DEEP_SAID = {"input_scale": 1.0}, {"activation_scale": 30.0}, {"output_tanh": 1}
+"""What random networks, which are no distances, cannot tell by their behavior."""
 CASES: dict[str, tuple[str, Callable[[], small.Sample], dict[str, Any]]] = {
-    "neus": ("neus", small.neus, {}),
-    "neus without frequencies": ("neus", lambda: small.neus(skip=1, multires=0), {}),
-    "siren": ("siren", small.siren, {}),
-    "deepsdf": ("deepsdf", small.deepsdf, {"latent_index": 1}),
-    "deepsdf's first shape": ("deepsdf", lambda: small.deepsdf(code=0), {}),
-    "deepsdf, xyz in all": ("deepsdf", lambda: small.deepsdf(xyz_in_all=True), {"latent_index": 1}),
-    "deepsdf, layer norm": ("deepsdf", lambda: small.deepsdf(weight_norm=False), {"latent_index": 1}),
-    "deepsdf of one shape": ("deepsdf", lambda: small.deepsdf(width=0), {}),
+    "neus": ("neus", small.neus, NEUS_SAID),
+    "neus without frequencies": ("neus", lambda: small.neus(skip=1, multires=0), NEUS_SAID),
+    "siren": ("siren", small.siren, SIREN_SAID),
+    "deepsdf": ("deepsdf", small.deepsdf, DEEP_SAID | {"latent_index": 1}),
+    "deepsdf's first shape": ("deepsdf", lambda: small.deepsdf(code=0), DEEP_SAID),
+    "deepsdf, xyz in all": ("deepsdf", lambda: small.deepsdf(xyz_in_all=True), DEEP_SAID | {"latent_index": 1}),
+    "deepsdf, layer norm": ("deepsdf", lambda: small.deepsdf(weight_norm=False), DEEP_SAID | {"latent_index": 1}),
+    "deepsdf of one shape": ("deepsdf", lambda: small.deepsdf(width=0), DEEP_SAID),
     "instant-nsr-pl": ("instant_nsr_pl", small.instant_nsr_pl, INSTANT_GRID),
     "instant-nsr-pl, four levels": ("instant_nsr_pl", lambda: small.instant_nsr_pl(999, True), INSTANT_GRID),
     "instant-nsr-pl, five levels": ("instant_nsr_pl", lambda: small.instant_nsr_pl(1000, True), INSTANT_GRID),
@@ -77,18 +79,18 @@ def test_the_old_container_holds_the_same(case: str, tmp_path: Path) -> None:
 def test_what_the_description_says_of_every_family(tmp_path: Path) -> None:
     """Distances and coordinates scale together; the sign turns; bounds are in the new unit."""
     sample = small.neus()
-    report = imported(tmp_path, sample.checkpoint, world_scale=2.0, sign=-1, up_axis="z", label="pot")
+    report = imported(tmp_path, sample.checkpoint, **NEUS_SAID, world_scale=2.0, sign=-1, up_axis="z", label="pot")
     assert report["bounds"] == [[-2.0] * 3, [2.0] * 3]
     assert_is(tmp_path, sample.function, scale=2.0, sign=-1.0)
     description = read_description(tmp_path / FIELD_NAME)
     assert (description["up_axis"], description["label"]) == ("z", "pot")
     box = [[-1.5, -1.0, -1.0], [1.5, 1.0, 1.0]]
-    assert imported(tmp_path, sample.checkpoint, world_scale=2.0, bounds=box)["bounds"] == box
+    assert imported(tmp_path, sample.checkpoint, **NEUS_SAID, world_scale=2.0, bounds=box)["bounds"] == box
 
 
 def test_a_field_file_takes_its_bounds_along_to_another_unit(tmp_path: Path) -> None:
     sample = small.neus()
-    imported(tmp_path, sample.checkpoint, world_scale=2.0, sign=-1)
+    imported(tmp_path, sample.checkpoint, **NEUS_SAID, world_scale=2.0, sign=-1)
     (tmp_path / FIELD_NAME).rename(tmp_path / "again")
     report = convert_file(tmp_path / "again", tmp_path, {"world_scale": 0.5, "sign": 1}, ImportLimits())
     assert report["bounds"] == [[-0.5] * 3, [0.5] * 3]
@@ -98,7 +100,7 @@ def test_a_field_file_takes_its_bounds_along_to_another_unit(tmp_path: Path) -> 
 def test_a_latent_code_may_come_from_the_description(tmp_path: Path) -> None:
     sample = small.deepsdf(code=2)
     code = sample.checkpoint.pop("latent_codes")["weight"][2]
-    imported(tmp_path, sample.checkpoint, latent=code.tolist())
+    imported(tmp_path, sample.checkpoint, latent=code.tolist(), **DEEP_SAID)
     assert_is(tmp_path, sample.function)
 
 
@@ -106,7 +108,7 @@ def test_a_latent_code_may_come_from_the_description(tmp_path: Path) -> None:
 def test_codes_saved_as_a_tensor(tmp_path: Path, shape: tuple[int, ...]) -> None:
     sample = small.deepsdf()
     sample.checkpoint["latent_codes"] = sample.checkpoint["latent_codes"]["weight"].reshape(shape)
-    report = imported(tmp_path, sample.checkpoint, latent_index=1)
+    report = imported(tmp_path, sample.checkpoint, latent_index=1, **DEEP_SAID)
     assert "latent code 1 of 3 (counted from 0)" in report["why"]
     assert_is(tmp_path, sample.function)
 
@@ -151,7 +153,7 @@ def round_siren(sign: float) -> dict[str, torch.Tensor]:
 def test_a_siren_that_is_negative_all_round_may_be_turned_round(
     sign: float, description: dict[str, Any], uncertain: bool, tmp_path: Path
 ) -> None:
-    report = imported(tmp_path, round_siren(sign), **description)
+    report = imported(tmp_path, round_siren(sign), **SIREN_SAID, **description)
     assert ("SIGN_UNCERTAIN" in [warning.split(":")[0] for warning in report["warnings"]]) == uncertain
 
 

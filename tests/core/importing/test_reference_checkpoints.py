@@ -113,7 +113,7 @@ def test_deepsdf_s_network_with_a_code_from_the_description(tmp_path: Path) -> N
     """The trainer's own file, in the container of before 1.6."""
     folder, files = deepsdf_run()
     latent = np.load(folder / "latent.npy").ravel().tolist()
-    report = convert_file(files["network"], tmp_path, {"latent": latent}, ImportLimits())
+    report = convert_file(files["network"], tmp_path, {"latent": latent, "output_tanh": 1}, ImportLimits())
     assert report["family"] == "deepsdf"
     assert report["warnings"] == []
     assert_reproduces(tmp_path / FIELD_NAME, folder)
@@ -128,7 +128,7 @@ def test_deepsdf_s_network_and_codes_in_one_file(tmp_path: Path, codes: str, ind
     stored = torch.load(files[codes], map_location="cpu", weights_only=True)
     whole["latent_codes"] = stored["latent_codes"] if isinstance(stored, dict) else stored
     torch.save(whole, tmp_path / "upload.pth", _use_new_zipfile_serialization=zipped)
-    convert_file(tmp_path / "upload.pth", tmp_path, {"latent_index": index}, ImportLimits())
+    convert_file(tmp_path / "upload.pth", tmp_path, {"latent_index": index, "output_tanh": 1}, ImportLimits())
     assert_reproduces(tmp_path / FIELD_NAME, folder)
 
 
