@@ -7,9 +7,11 @@ entry can be mapped where it lies.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from regnf_core.importing.containers.zip_members import Member, read_members
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.zip_members import DEFLATED, STORED, Member, read_members
 from regnf_core.importing.containers.zip_records import malformed
 
 MAX_PICKLE_BYTES = 32 * 1024 * 1024
@@ -50,9 +52,15 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
 
     Raises FieldFormatError: FILE_TRUNCATED, PICKLE_TOO_LARGE and the ARCHIVE_* reasons of docs/import-gate.md.
     """
-    members = _below_one_folder(read_members(data))
-    if any(name == "constants.pkl" or name.startswith("code/") for name in members):
-        raise malformed("a TorchScript archive holds a program, not weights", "ARCHIVE_TORCHSCRIPT")
+    try:
+        listed = read_members(data)
+    except FieldFormatError as error:
+        if error.reason == "ARCHIVE_COMPRESSED_ENTRY" and _is_program(_names_anyway(data)):
+            raise _program() from error
+        raise
+    if _is_program(member.name for member in listed):
+        raise _program()
+    members = _below_one_folder(listed)
     if sum(name.rsplit("/", 1)[-1] == "data.pkl" for name in members) > 1:
         raise malformed("more than one data.pkl", "ARCHIVE_DUPLICATE_ENTRY")
     if "data.pkl" not in members:
@@ -63,6 +71,24 @@ def read_archive(data: memoryview, max_pickle_bytes: int = MAX_PICKLE_BYTES) -> 
     if "byteorder" in members and bytes(archive.read("byteorder")[:16]) != b"little":
         raise malformed("the tensors are not little-endian", "ARCHIVE_BYTE_ORDER")
     return archive
+
+
+def _names_anyway(data: memoryview) -> list[str]:
+    """The entries' names, compressed ones among them; none where the container is faulty as well."""
+    try:
+        return [member.name for member in read_members(data, (STORED, DEFLATED))]
+    except FieldFormatError:
+        return []
+
+
+def _is_program(names: Iterable[str]) -> bool:
+    inner = [name.partition("/")[2] for name in names]
+    return any(name == "constants.pkl" or name.startswith("code/") for name in inner)
+
+
+def _program() -> FieldFormatError:
+    message = "a TorchScript archive holds a program, not weights: save state_dict() of it, or export it as ONNX"
+    return malformed(message, "ARCHIVE_TORCHSCRIPT")
 
 
 def _below_one_folder(members: list[Member]) -> dict[str, Entry]:

@@ -18,6 +18,7 @@ _ONNX_VERSIONS, _ONNX_NEXT = (
     tuple(bytes([n]) for n in range(3, 32)),
     (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
 )
+_KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 _OTHER_FILES = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
@@ -29,7 +30,11 @@ _OTHER_FILES = (
     (b"\x1f\x8b", "a gzip archive; unpack it, and give the file inside"),
     (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
     (b"%PDF", "a PDF document, not a field"),
-    (b"\x89HDF", "an HDF5 file; only the formats of docs/families.md are taken"),
+    (
+        b"\x89HDF",
+        "an HDF5 file, as Keras writes it; export the network as ONNX, or save its arrays by numpy.savez",
+    ),
+    (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
 )
 """Files that people give by mistake: their first bytes, and what they are."""
 
@@ -64,6 +69,10 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
     if head.startswith(_VDB_MAGICS):
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
+    if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
+        return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
+    if head[4:8] == b"TFL3":
+        return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
     if head.startswith(_ZIP_LOCAL_HEADER):
         return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     for magic, what in _OTHER_FILES:

@@ -1,19 +1,59 @@
-"""Families that are recognized but not supported: the refusal names them."""
+"""Families that are recognized but not supported: the refusal names them, and what to give instead."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import strip_prefix
+from regnf_core.importing.families.states import states
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
+
+_MESH = "extract its mesh, and give that"
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A family by what its checkpoint has: entries at the top, and beginnings of the tensors' names below them."""
+
+    what: str
+    instead: str
+    top: tuple[str, ...] = ()
+    tensors: tuple[str, ...] = ()
+
+
+_KNOWN = (
+    _Known(
+        "torch-ngp's radiance fields, which have no distances",
+        "train its SDF, or extract a mesh",
+        ("model",),
+        ("encoder.",),
+    ),
+    _Known("SHINE-Mapping's, a tree of features with tables of its own", _MESH, ("feature_octree", "geo_decoder")),
+    _Known("Co-SLAM's, whose bounds and truncation are in no file", _MESH, ("model",), ("decoder.sdf_net.",)),
+    _Known("NICE-SLAM's, grids of occupancies", _MESH, ("c", "decoder_state_dict")),
+    _Known("nerfstudio's splatfacto, Gaussians without a surface", _MESH, ("pipeline",), ("_model.gauss_params.",)),
+    _Known(
+        "nerfstudio's nerfacto, a radiance field without distances",
+        "train neus-facto, or export a mesh (ns-export tsdf or poisson), and give that",
+        ("pipeline",),
+        ("_model.field.mlp_base",),
+    ),
+    _Known("NeRF's, a radiance field without distances", _MESH, ("network_fn_state_dict",)),
+)
 
 
 def refuse(checkpoint: dict[Any, Any], _source: TensorSource, _description: UploadDescription) -> ConvertedField | None:
     """None for a checkpoint of no known family. Raises FieldFormatError (FAMILY_NOT_SUPPORTED) naming a known one."""
-    if not strip_prefix(checkpoint.get("model"), "encoder."):
-        return None
-    message = "this is a checkpoint of torch-ngp's radiance fields, which have no distances and are not supported"
-    raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    for known in _KNOWN:
+        if all(name in checkpoint for name in known.top) and all(_has(checkpoint, part) for part in known.tensors):
+            message = f"this is a checkpoint of {known.what}; it is not supported: {known.instead}"
+            raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    return None
+
+
+def _has(checkpoint: dict[Any, Any], part: str) -> bool:
+    return any(strip_prefix(state, part) or strip_prefix(state, f"module.{part}") for _, state in states(checkpoint))

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.meshes.geometry import malformed
 
 ByteOrder = Literal["<", ">"]
@@ -21,6 +22,9 @@ _CODES = {"i1": "char int8", "u1": "uchar uint8", "i2": "short int16", "u2": "us
 _TYPES = {name: code for code, names in _CODES.items() for name in names.split()}
 _FORMATS: dict[str, ByteOrder | None] = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _END = re.compile(rb"(?:^|\n)end_header[ \t]*\r?\n")
+
+_SPLAT = frozenset({"f_dc_0", "opacity", "scale_0", "rot_0"})
+"""Of the points that are Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class Header:
 
 
 def read_ply_header(data: memoryview) -> Header:
-    """The header. Raises FieldFormatError (MESH_INVALID)."""
+    """The header. Raises FieldFormatError: MESH_INVALID, or FAMILY_NOT_SUPPORTED for Gaussian splats."""
     head = bytes(data[:_MAX_HEADER])
     end = _END.search(head)
     if end is None:
@@ -83,6 +87,9 @@ def _elements(lines: list[list[str]]) -> tuple[Element, ...]:
         raise malformed("the PLY header names an element twice, or too many of them")
     for element in elements:
         properties = [p.name for p in element.properties]
+        if set(properties) >= _SPLAT:
+            message = "Gaussian splats, which have no surface; extract a mesh from them, and give that"
+            raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
         if not properties or len(properties) > _MAX_PARTS or len(set(properties)) != len(properties):
             raise malformed(f"the PLY element {element.name[:40]} has no properties, too many, or one twice")
         if any(p.count_type is not None and p.count_type.startswith("f") for p in element.properties):

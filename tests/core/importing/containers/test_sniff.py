@@ -71,11 +71,29 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (b"NanoVDB2" + bytes(40), "FORMAT_NOT_SUPPORTED"),
         (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNIZED"),
         (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNIZED"),
+        (b"\x89HDF\r\n\x1a\n", "FORMAT_NOT_RECOGNIZED"),
+        (b"\x08\x01\x12\xf0", "FORMAT_NOT_RECOGNIZED"),
+        (b"\x1c\0\0\0TFL3", "FORMAT_NOT_SUPPORTED"),
+        (zip_bytes([("metadata.json", b"{}")]), "FORMAT_NOT_SUPPORTED"),
     ],
 )
 def test_everything_else_is_named_none_and_explained(head: bytes, reason: str) -> None:
     assert sniff_format(head) is None
     assert explain_refusal(head)[0] == reason
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"\x89HDF\r\n\x1a\n", "ONNX"),
+        (b"\x08\x01\x12\xf0", "TensorFlow"),
+        (b"\x1c\0\0\0TFL3", "TensorFlow Lite"),
+        (zip_bytes([("config.json", b"{}")]), "Keras"),
+    ],
+)
+def test_files_of_others_are_told_what_they_are(head: bytes, words: str) -> None:
+    assert words in explain_refusal(head)[1]
 
 
 def test_sniffing_loads_nothing_heavy() -> None:

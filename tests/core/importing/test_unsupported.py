@@ -1,0 +1,65 @@
+"""Checkpoints that hold no distance, or one that cannot be computed, are named, and the message says what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.gate.convert import convert_file
+from regnf_core.importing.gate.report import ImportLimits
+
+ONE = torch.ones(4)
+CASES: dict[str, tuple[dict[str, Any], str]] = {
+    "nerfacto": ({"step": 1, "pipeline": {"_model.field.mlp_base.params": ONE}}, "nerfacto"),
+    "nerfacto on several devices": ({"pipeline": {"module._model.field.mlp_base_mlp.layers.0.weight": ONE}}, "nerfacto"),
+    "splatfacto": ({"pipeline": {"_model.gauss_params.means": ONE}}, "Gaussians"),
+    "SHINE-Mapping": ({"iters": 9, "feature_octree": {"a": ONE}, "geo_decoder": {"lout.weight": ONE}}, "SHINE"),
+    "Co-SLAM": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.0.weight": ONE}}, "Co-SLAM"),
+    "NICE-SLAM": ({"c": {"grid_fine": ONE}, "decoder_state_dict": {"a": ONE}}, "NICE-SLAM"),
+    "NeRF": ({"global_step": 1, "network_fn_state_dict": {"pts_linears.0.weight": ONE}}, "NeRF"),
+    "torch-ngp's radiance field": ({"model": {"encoder.embeddings": ONE, "sigma_net.0.weight": ONE}}, "torch-ngp"),
+    "MonoSDF with a grid": (
+        {
+            "model_state_dict": {
+                "module.implicit_network.encoding.embeddings": ONE,
+                "module.implicit_network.lin0.weight_v": ONE,
+            }
+        },
+        "MonoSDF",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_named_with_what_to_do_instead(case: str, tmp_path: Path) -> None:
+    values, name = CASES[case]
+    torch.save(values, tmp_path / "upload")
+    with pytest.raises(FieldFormatError) as caught:
+        convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
+    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
+    assert name in str(caught.value)
+    assert "mesh" in str(caught.value)
+
+
+def test_gaussian_splats_are_no_point_cloud(tmp_path: Path) -> None:
+    names = ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "rot_0")
+    header = ["ply", "format binary_little_endian 1.0", "element vertex 1"]
+    lines = [*header, *(f"property float {name}" for name in names), "end_header", ""]
+    (tmp_path / "upload").write_bytes("\n".join(lines).encode() + bytes(4 * len(names)))
+    with pytest.raises(FieldFormatError, match="Gaussian splats") as caught:
+        convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
+    assert caught.value.reason == "FAMILY_NOT_SUPPORTED"
+
+
+def test_a_program_of_torchscript_is_named(tmp_path: Path) -> None:
+    """As torch writes it: parts of it are compressed."""
+    network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU())
+    with pytest.warns(DeprecationWarning):
+        torch.jit.save(torch.jit.trace(network, torch.zeros(2, 3)), tmp_path / "upload")
+    with pytest.raises(FieldFormatError, match="ONNX") as caught:
+        convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
+    assert caught.value.reason == "ARCHIVE_TORCHSCRIPT"
