@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
-from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.converted import ConvertedField, OpenReading, Reading
+from regnf_core.importing.families.shared import (
+    UNIT_CUBE,
+    contradiction,
+    refuse_other_entries,
+    require_family,
+    shared_entries,
+)
 from regnf_core.importing.onnx.model import Attribute, Model, Node, Port, read_model, unsupported
+from regnf_core.importing.onnx.older import as_of_13
 from regnf_core.importing.onnx.tensor import Array
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.kinds.onnx import MAX_BATCH, MAX_NUMBERS
@@ -32,10 +41,13 @@ def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescripti
     TENSOR_TOO_LARGE, and what ``overrides`` is refused for.
     """
     require_family(overrides, "onnx")
-    refuse_other_entries(overrides, "onnx")
-    model = read_model(data)
+    refuse_other_entries(overrides, "onnx", ("output_column",))
+    read = read_model(data)
+    column = _column(read.output, overrides)
+    model = as_of_13(read)
+    batch, told = _batch(model.input, model.output, column is not None)
     parts = _Parts(model, tensor_bytes)
-    batch, told = _batch(model.input, model.output)
+    output = parts.names[model.output.name] if column is None else parts.add_choice(model.output.name, column)
     description = {
         "kind": "onnx",
         "source": {"family": "onnx"},
@@ -43,18 +55,38 @@ def convert_onnx(data: memoryview, tensor_bytes: int, overrides: UploadDescripti
         "nodes": parts.nodes,
         "constants": parts.constants,
         "input": parts.names[model.input.name],
-        "output": parts.names[model.output.name],
+        "output": output,
         "batch": batch,
         "opset": model.opset,
     }
-    why = (f"an ONNX model: {len(model.nodes)} nodes, operator set {model.opset}", told)
+    why = (f"an ONNX model: {len(read.nodes)} nodes, operator set {read.opset}", told)
     warnings = () if overrides.bounds else ("BOUNDS_ASSUMED: [-1, 1]^3; say bounds if the field's region is another",)
-    return ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
+    converted = ConvertedField("onnx", why, description, parts.tensors, warnings, sign_is_open=True)
+    if column is None or overrides.output_column is not None:
+        return converted
+    name = json.dumps({"output_column": column})
+    guess = OpenReading(name, "onnx", lambda: Reading(name, description, parts.tensors))
+    return replace(converted, open_readings=(guess,))
 
 
-def _batch(given: Port, made: Port) -> tuple[int, str]:
-    """How many points to evaluate at once, and why."""
-    for port, shapes in ((given, ((None, 3),)), (made, ((None,), (None, 1)))):
+def _column(made: Port, overrides: UploadDescription) -> int | None:
+    """Which column of the output is the distance; None where the output is nothing but distances.
+
+    Where nothing says it the first is, as in all known trainers' networks, if it behaves so.
+    """
+    wide = made.shape is not None and len(made.shape) == 2 and made.shape[1] not in (None, 1)
+    said = overrides.output_column
+    if wide and made.shape is not None and said is not None and said >= (made.shape[1] or 0):
+        raise contradiction("output_column", said, f"{made.shape[1]} columns, counted from 0")
+    if not wide and made.shape is not None and len(made.shape) == 1 and said is not None:
+        raise contradiction("output_column", said, "one distance for each point")
+    return said if said is not None else 0 if wide else None
+
+
+def _batch(given: Port, made: Port, wide: bool = False) -> tuple[int, str]:
+    """How many points to evaluate at once, and why. wide: whether the output may have several columns."""
+    results: tuple[tuple[int | None, ...], ...] = ((None, None),) if wide else ((None,), (None, 1))
+    for port, shapes in ((given, ((None, 3),)), (made, results)):
         if port.element_type not in _REAL_TYPES:
             raise unsupported(f"{port.name[:40]} does not hold real numbers")
         if port.shape is not None and not any(_fits(port.shape, shape) for shape in shapes):
@@ -94,6 +126,13 @@ class _Parts:
             self._add_node(number, node)
         if model.output.name not in self.names:
             raise unsupported("the model's output is made by no node")
+
+    def add_choice(self, name: str, column: int) -> str:
+        """One more node that keeps one column of a value; the name of what it gives."""
+        index, chosen = "the column", "of the column"
+        self._keep(index, np.array([column], dtype=np.int64))
+        self._add_node(-1, Node("Gather", (name, index), (chosen,), {"axis": 1}))
+        return self.names[chosen]
 
     def _add_name(self, name: str) -> str:
         if name in self.names:

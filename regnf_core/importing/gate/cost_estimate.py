@@ -31,7 +31,7 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
         seconds = sum(_seconds_of_reading(reading, TRIAL_SAMPLES) for reading in converted.readings)
         seconds += max(_seconds_of_reading(reading, SAMPLES) for reading in converted.readings)
     else:
-        seconds = _seconds(converted.description, converted.tensors, calls_of_check(SAMPLES))
+        seconds = seconds_of(converted.description, converted.tensors, calls_of_check(SAMPLES))
     require_within(seconds, limits.work_s)
     description = parse_description(converted.description)
     if isinstance(description, OnnxDescription):
@@ -42,12 +42,13 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
 def _seconds_of_reading(reading: Reading, samples: int) -> float:
     """A reading that is no field costs nothing: it is passed over when the readings are tried."""
     try:
-        return _seconds(reading.description, reading.tensors, calls_of_check(samples))
+        return seconds_of(reading.description, reading.tensors, calls_of_check(samples))
     except FieldFormatError:
         return 0.0
 
 
-def _seconds(description: dict[str, object], tensors: Mapping[str, StoredArray], calls: Calls) -> float:
+def seconds_of(description: dict[str, object], tensors: Mapping[str, StoredArray], calls: Calls) -> float:
+    """Estimated seconds of one core for these calls. Raises what a faulty description is refused for."""
     parsed = parse_description(description)
     parsed.check(tensor_specs(tensors))
     return _work(parsed, tensors, calls)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.importing.cost.calls import Calls
-from regnf_core.importing.cost.network_work import network_work
 from regnf_core.importing.families.converted import ConvertedField, OpenReading
+from regnf_core.importing.gate.cost_estimate import seconds_of
 from regnf_core.importing.gate.network_trial import (
     QUICK_SAMPLES,
     SAMPLES,
@@ -26,7 +26,6 @@ from regnf_core.importing.gate.network_trial import (
     quick_trial,
     values_differ,
 )
-from regnf_core.schema.parsing import parse_description
 
 _SAME = 1e-3
 """Readings whose values differ by less than this share of their range are one."""
@@ -89,11 +88,9 @@ def _affordable(converted: ConvertedField) -> Sequence[OpenReading]:
     """As many of the readings as may be tried in the time there is, the most usual first."""
     calls = Calls((QUICK_SAMPLES,), (QUICK_SAMPLES // 8,))
     full = Calls((SAMPLES, SAMPLES), (SAMPLES // 8,) * 10)
-    description = parse_description(converted.description)
-    each = network_work(description, converted.tensors, calls)
-    left = _TRIALS_S - min(_FINALISTS, len(converted.open_readings)) * network_work(
-        description, converted.tensors, full
-    )
+    each = seconds_of(converted.description, dict(converted.tensors), calls)
+    finals = min(_FINALISTS, len(converted.open_readings))
+    left = _TRIALS_S - finals * seconds_of(converted.description, dict(converted.tensors), full)
     return converted.open_readings[: max(1, int(left / each))]
 
 

@@ -12,7 +12,7 @@ from regnf_core.importing.onnx.tensor import Array, read_tensor
 MAX_NODES = 2_000
 _MAX_TENSORS = 1_000
 _MAX_NAMES = 64
-_OPSETS = range(13, 27)
+_OPSETS = range(9, 27)
 
 _OPSET_IMPORT, _GRAPH, _TRAINING, _FUNCTIONS = 8, 7, 20, 25
 _NODES, _INITIALIZERS, _INPUTS, _OUTPUTS, _QUANTIZATION, _SPARSE = 1, 5, 11, 12, 14, 15

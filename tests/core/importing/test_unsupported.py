@@ -15,7 +15,7 @@ from regnf_core.importing.gate.report import ImportLimits
 ONE = torch.ones(4)
 CASES: dict[str, tuple[dict[str, Any], str]] = {
     "nerfacto": ({"step": 1, "pipeline": {"_model.field.mlp_base.params": ONE}}, "nerfacto"),
-    "nerfacto on several devices": ({"pipeline": {"module._model.field.mlp_base_mlp.layers.0.weight": ONE}}, "nerfacto"),
+    "nerfacto, distributed": ({"pipeline": {"module._model.field.mlp_base.0.weight": ONE}}, "nerfacto"),
     "splatfacto": ({"pipeline": {"_model.gauss_params.means": ONE}}, "Gaussians"),
     "SHINE-Mapping": ({"iters": 9, "feature_octree": {"a": ONE}, "geo_decoder": {"lout.weight": ONE}}, "SHINE"),
     "Co-SLAM": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.0.weight": ONE}}, "Co-SLAM"),
@@ -58,7 +58,7 @@ def test_gaussian_splats_are_no_point_cloud(tmp_path: Path) -> None:
 def test_a_program_of_torchscript_is_named(tmp_path: Path) -> None:
     """As torch writes it: parts of it are compressed."""
     network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU())
-    with pytest.warns(DeprecationWarning):
+    with pytest.warns(DeprecationWarning, match="torch.jit"):
         torch.jit.save(torch.jit.trace(network, torch.zeros(2, 3)), tmp_path / "upload")
     with pytest.raises(FieldFormatError, match="ONNX") as caught:
         convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
