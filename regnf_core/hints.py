@@ -36,6 +36,13 @@ HINTS: dict[str, str] = {
     "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",
     "SAFE_FORMAT_INVALID": "The file is damaged, or no field of regnf. Copy it again, or give the checkpoint that it "
     "was made from.",
+    "RUN_WITHOUT_CHECKPOINT": "Pack the whole run, its checkpoint included; docs/families.md lists the files taken.",
+    "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",
+    "ARCHIVE_LINK": "Pack the run again with `tar --dereference`, or as a zip.",
+    "ARCHIVE_NESTED": "Unpack the outer archive, and give the inner one.",
+    "SETTINGS_NOT_RECOGNIZED": "docs/import-gate.md lists the settings of each trainer.",
+    "SETTINGS_UNSAFE": "Write the values themselves into the file, or say them in a description.",
+    "SETTINGS_CONTRADICT_TENSORS": "Most often the settings are another run's. Give this checkpoint's own, or none.",
     "RAW_PICKLE": "Save it again with torch.save.",
     "INVALID_DETECTION": "docs/api.md shows every form of a detection.",
     "INVALID_OPTIONS": "docs/api.md lists every option with its range.",

@@ -72,6 +72,8 @@ class EncodingDescription:
 
     degree: Annotated[int, Ge(0), Le(24)] | None = None
     """Number of frequencies."""
+    used: bool | None = None
+    """False: the network has the columns, but was trained with zeros in them."""
     two_pi: bool | None = None
     """Whether the sines' argument is multiplied by 2 pi."""
     base_frequency: Annotated[float, Ge(1e-3), Le(1e3)] | None = None

@@ -7,6 +7,7 @@ import pytest
 from tests.core.importing.fuzzing.seeds import Seeds
 from tests.gate.bad_containers import CONTAINERS
 from tests.gate.bad_pickles import CANARY, PICKLES
+from tests.gate.bad_runs import RUNS
 from tests.gate.bad_tensors import TENSORS
 from tests.gate.house import House
 
@@ -32,6 +33,12 @@ def test_tensors(house: House, seeds: Seeds, row: str) -> None:
     build, outcome = TENSORS[row]
     assert house.outcome(build(seeds)) == outcome
     forget(house)
+
+
+@pytest.mark.parametrize("row", RUNS)
+def test_run(house: House, seeds: Seeds, row: str) -> None:
+    build, outcome = RUNS[row]
+    assert house.outcome(build(seeds)) == outcome
 
 
 def forget(house: House) -> None:

@@ -14,10 +14,11 @@ import pytest
 from regnf_state.reasons import REASONS
 from tests.gate.bad_containers import CONTAINERS
 from tests.gate.bad_pickles import PICKLES
+from tests.gate.bad_runs import RUNS
 from tests.gate.bad_tensors import TENSORS
 
 ROOT = Path(__file__).resolve().parents[2]
-SECTIONS = ("Transport", "Names", "Container", "Pickle", "Tensors", "Boxes", "Requests")
+SECTIONS = ("Transport", "Names", "Container", "Runs", "Pickle", "Tensors", "Boxes", "Requests")
 _WORD = re.compile(r"`([^`]+)`")
 _REASON = re.compile(r"`([A-Z][A-Z0-9_]+)`")
 
@@ -74,7 +75,8 @@ def test_every_row_names_tests_that_exist(collected: set[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("test", "files"), [("test_container", CONTAINERS), ("test_pickle", PICKLES), ("test_tensors", TENSORS)]
+    ("test", "files"),
+    [("test_container", CONTAINERS), ("test_pickle", PICKLES), ("test_tensors", TENSORS), ("test_run", RUNS)],
 )
 def test_every_bad_file_has_its_row_and_its_outcome(test: str, files: dict[str, tuple[object, str]]) -> None:
     said = {name: row for row in rows() for name in row.tests if name.startswith(f"tests/gate/test_files.py::{test}[")}

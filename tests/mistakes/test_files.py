@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.cli.conftest import DATA, Run
+from tests.core.importing.archives import zip_bytes
 from tests.mistakes.case import Case, parametrized
 
 FIELD = "expected a f|field is expected|not a field|not the file|cut short|empty|no bytes|unpack"
@@ -42,10 +43,10 @@ CASES = [
     Case("photo", "FORMAT_NOT_RECOGNIZED", 2, "a.jpg: a JPEG", FIELD, "checkpoint", "a.jpg", write("a.jpg", b"\xff\xd8\xff\xe0000")),
     Case("web page", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt: an HTML page", FIELD, "download", "a.ckpt", write("a.ckpt", b"<!DOCTYPE html><html>")),
     Case("Git LFS pointer", "FORMAT_NOT_RECOGNIZED", 2, "a.ckpt", FIELD, "git lfs pull", "a.ckpt", write("a.ckpt", b"version https://git-lfs.github.com/spec/v1\n")),
-    Case("gzip archive", "FORMAT_NOT_RECOGNIZED", 2, "a.tar.gz", FIELD, "unpack", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
+    Case("gzip archive", "FILE_TRUNCATED", 2, "a.tar.gz", "cut short", "again", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
     Case("notes", "FORMAT_NOT_RECOGNIZED", 2, "notes.txt", FIELD, "checkpoint|mean", "notes.txt", write("notes.txt", b"to do")),
     Case("bare pickle", "RAW_PICKLE", 2, "a.pkl", "torch.save", "Save it again", "a.pkl", write("a.pkl", b"\x80\x04\x95\0\0\0\0}.")),
-    Case("zip of other things", "FORMAT_NOT_SUPPORTED", 2, "a.zip", "torch.save", "docs/families", "a.zip", write("a.zip", b"PK\x03\x04" + bytes(22) + b"\x05\0\0\0a.txt")),
+    Case("zip of other things", "RUN_WITHOUT_CHECKPOINT", 2, "a.zip", "checkpoint", "docs/families", "a.zip", write("a.zip", zip_bytes([("a.txt", b"to do")]))),
     Case("truncated checkpoint", "FILE_TRUNCATED", 2, "cut.ckpt", "cut short", "again", "cut.ckpt", cut_checkpoint),
     Case("truncated safe field", "SAFE_FORMAT_INVALID", 2, "a.safetensors", "safetensors", "again|docs", "a.safetensors", lambda folder: (folder / "a.safetensors").write_bytes((DATA / "armchair.safetensors").read_bytes()[:3000])),
     Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "no known", "docs/families.md", "other.ckpt", foreign_checkpoint),

@@ -20,6 +20,10 @@ _ONNX_VERSIONS, _ONNX_NEXT = (
 )
 _KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
+RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
+"""Formats in which a whole training run may be given."""
+_PACKED = ((b"\x1f\x8b\x08", "gzip"), (b"BZh", "bzip2"), (b"\xfd7zXZ\x00", "xz"))
+_TAR_MAGIC, _TAR_MAGIC_AT, _OLD_TORCH_TAR = b"ustar", 257, b"sys_info\0"
 _OTHER_FILES = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
     (b"<!doctype html", "an HTML page, not a field; the download failed, or it needs a login"),
@@ -27,7 +31,6 @@ _OTHER_FILES = (
     (b"<?xml", "an XML document, not a field; the download failed, or it is another file"),
     (b"\x89PNG", "a PNG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
     (b"\xff\xd8\xff", "a JPEG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
-    (b"\x1f\x8b", "a gzip archive; unpack it, and give the file inside"),
     (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
     (b"%PDF", "a PDF document, not a field"),
     (
@@ -40,8 +43,8 @@ _OTHER_FILES = (
 
 
 def sniff_format(head: bytes) -> str | None:
-    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, or
-    None for what is not taken.
+    """``"torch-zip"``, ``"torch-legacy"``, ``"safetensors"``, ``"npz"``, ``"sqlite"``, ``"onnx"``, a mesh's format, one
+    of ``RUN_ARCHIVES``, or None for what is not taken.
 
     ``head`` is the file's beginning, HEAD_BYTES of it or the whole file if it is shorter. A name promises nothing
     about the rest of the file.
@@ -50,8 +53,14 @@ def sniff_format(head: bytes) -> str | None:
         return "torch-zip"
     if head.startswith(_LEGACY_MAGIC):
         return "torch-legacy"
-    if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head).endswith(b".npy"):
-        return "npz"
+    if head.startswith(_ZIP_LOCAL_HEADER):
+        first = _first_name(head)
+        return "npz" if first.endswith(b".npy") else None if first in _KERAS_MEMBERS else "zip"
+    if head[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC):
+        return None if head.startswith(_OLD_TORCH_TAR) else "tar"
+    for magic, packing in _PACKED:
+        if head.startswith(magic):
+            return packing
     if head.startswith(_SQLITE_MAGIC):
         return "sqlite"
     if head[8:9] == b"{":
@@ -63,7 +72,7 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     """The reason and a sentence for a file that ``sniff_format`` does not name."""
     if not head:
         return "FILE_EMPTY", "the file holds no bytes"
-    if head[257:262] == b"ustar":
+    if head.startswith(_OLD_TORCH_TAR):
         return "LEGACY_TORCH_FILE", "a tar archive, as PyTorch wrote before version 0.1.10; save it again"
     if head[:1] == b"\x80" and head[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05"):
         return "RAW_PICKLE", "a bare pickle; only files written by torch.save (1.6 or later) are taken"
@@ -73,14 +82,12 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
     if head[4:8] == b"TFL3":
         return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
-    if head.startswith(_ZIP_LOCAL_HEADER):
-        return "FORMAT_NOT_SUPPORTED", "a zip archive, but not one that torch.save or numpy.savez wrote"
     for magic, what in _OTHER_FILES:
         if head.lstrip()[: len(magic)].lower() == magic.lower():
             return "FORMAT_NOT_RECOGNIZED", what
     return (
         "FORMAT_NOT_RECOGNIZED",
-        "none of the formats that are taken: torch.save archives, safetensors, npz, SQLite, ONNX, meshes",
+        "none of the formats taken: torch.save files, safetensors, npz, SQLite, ONNX, meshes, archives of a run",
     )
 
 

@@ -35,16 +35,17 @@ class Member:
     crc32: int
 
 
-def read_members(data: memoryview, methods: Collection[int] = (STORED,)) -> list[Member]:
+def read_members(data: memoryview, methods: Collection[int] = (STORED,), folders: bool = False) -> list[Member]:
     """Check the structure of the zip file ``data`` and list its entries in the order in which they lie.
 
-    ``methods`` are the ways of compression that are allowed. Nothing is unpacked. Names have no part that is empty,
+    ``methods`` are the ways of compression that are allowed. folders: take empty entries for folders too, whose names
+    end in a slash. Nothing is unpacked. Names have no part that is empty,
     ``.`` or ``..``, and no control character. Raises FieldFormatError: FILE_TRUNCATED and the ARCHIVE_* reasons of
     docs/import-gate.md.
     """
     _check_ends(data)
     directory = records.read_directory_end(data)
-    return _tile(data, _central_headers(data, directory, methods), directory.offset)
+    return _tile(data, _central_headers(data, directory, methods), directory.offset, folders)
 
 
 def _check_ends(data: memoryview) -> None:
@@ -96,7 +97,7 @@ def _deflate_flags(header: Header) -> int:
     return 0x0006 if header.method == DEFLATED else 0
 
 
-def _tile(data: memoryview, headers: list[Header], data_end: int) -> list[Member]:
+def _tile(data: memoryview, headers: list[Header], data_end: int, folders: bool) -> list[Member]:
     """Entries in file order: each must begin where the one before ends, from 0 to ``data_end`` without a gap."""
     members = []
     expected = 0
@@ -109,15 +110,16 @@ def _tile(data: memoryview, headers: list[Header], data_end: int) -> list[Member
         if end > data_end:
             raise malformed("an entry overlaps the central directory", "ARCHIVE_OVERLAP")
         expected = end + _descriptor_size(data, central, end, data_end)
-        members.append(_member(central, local.end))
+        members.append(_member(central, local.end, folders))
     if expected != data_end:
         raise _gap(expected, data_end)
     return members
 
 
-def _member(header: Header, offset: int) -> Member:
+def _member(header: Header, offset: int, folders: bool) -> Member:
     name = _decoded(header)
-    if not all(_PART.fullmatch(part) and part not in (".", "..") for part in name.split("/")):
+    path = name.removesuffix("/") if folders and header.size == 0 else name
+    if not all(_PART.fullmatch(part) and part not in (".", "..") for part in path.split("/")):
         raise malformed("an entry's name leaves the archive's folder or is not a valid name", "ARCHIVE_ENTRY_NAME")
     return Member(name, header.method, offset, header.compressed_size, header.size, header.crc32)
 

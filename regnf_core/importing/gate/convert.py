@@ -1,7 +1,9 @@
-"""The conversion itself, run in a throw-away process: ``python -m regnf_core.importing.gate.convert UPLOAD OUT_DIR``.
+"""The conversion itself, run in a throw-away process:
+``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS]``.
 
-Standard input holds one JSON object {"description", "limits", "parent_pid", "picture"}; standard output gets one JSON
-line: the report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors, a picture beside it.
+Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings"}; standard output
+gets one JSON line: the report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors, a picture
+beside it.
 """
 
 from __future__ import annotations
@@ -9,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import mmap
 import os
 import re
 import sys
@@ -18,8 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
-from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
-from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
+from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
@@ -29,6 +29,7 @@ from regnf_core.schema.observation_grid import OBSERVATION
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
     from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.gate.reading import Named
 
 FIELD_NAME = "field.safetensors"
 _SEEN = (OBSERVATION, WEIGHTS)
@@ -40,22 +41,28 @@ _SIGN_UNCERTAIN = (
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
-_THREADED_FORMATS = ("ply", "pcd", "xyz", "off")
-"""May be clouds of points; the library that reconstructs their surface cannot do without threads."""
+_THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "off"}
+"""May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
 
 
 def convert_file(
-    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, picture: bool = False
+    upload: Path,
+    out_dir: Path,
+    description: dict[str, Any] | None,
+    limits: ImportLimits,
+    picture: bool = False,
+    settings: Named | None = None,
 ) -> dict[str, Any]:
     """Convert ``upload``, write the safe field, evaluate it once, draw it if asked to. Returns the report's values.
 
-    Confines nothing: the caller has done so. Raises FieldFormatError with the reason of the stage that refused.
+    settings: the trainer's own, as the name and the path of one file or of an archive of files. Confines nothing: the
+    caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
     from regnf_core.importing.gate.cost_estimate import require_affordable
     from regnf_core.schema.safe_format import write_safe_field
 
-    converted = _convert(upload, description, limits)
+    converted, used = _read(upload, out_dir, description, limits, settings)
     _require_text(converted.description)
     require_affordable(converted, limits)
     converted = _settled(converted)
@@ -86,7 +93,21 @@ def convert_file(
         "plausibility": measured,
         "warnings": [*warnings, *more],
         "label": label,
+        "settings": used,
     }
+
+
+def _read(
+    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
+) -> tuple[ConvertedField, dict[str, Any] | None]:
+    """What ``read_upload`` returns; nothing that it has unpacked is left, but what is mapped stays readable."""
+    from regnf_core.importing.gate.reading import read_upload
+    from regnf_core.importing.run.unpacking import remove_unpacked
+
+    try:
+        return read_upload(upload, out_dir, description, limits, settings)
+    finally:
+        remove_unpacked(out_dir)
 
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
@@ -96,48 +117,6 @@ def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
 
     with contextlib.suppress(RegnfError, MemoryError), without_new_code():
         field_picture(field, up_axis).save(path)
-
-
-def _convert(upload: Path, description: dict[str, Any] | None, limits: ImportLimits) -> ConvertedField:
-    from regnf_core.importing.containers.container import read_archive
-    from regnf_core.importing.containers.legacy_container import read_legacy
-    from regnf_core.importing.containers.npz import ArraySource
-    from regnf_core.importing.families import convert_checkpoint
-    from regnf_core.importing.families.arrays import convert_arrays
-    from regnf_core.importing.families.safe_field import convert_safe_field
-    from regnf_core.importing.pickle.pickle_reader import read_pickle
-    from regnf_core.importing.tensor_source import TensorSource
-    from regnf_core.importing.upload_description import UploadDescription
-
-    overrides, tensor_bytes = UploadDescription.from_dict(description), limits.tensor_bytes
-    data = _mapped(upload)
-    head = bytes(data[:HEAD_BYTES])
-    kind = sniff_format(head)
-    if kind == "torch-zip":
-        archive = read_archive(data)
-        return convert_checkpoint(read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes), overrides)
-    if kind == "torch-legacy":
-        values, legacy = read_legacy(data)
-        return convert_checkpoint(values, TensorSource(legacy, tensor_bytes), overrides)
-    if kind == "npz":
-        return convert_arrays(ArraySource(data, tensor_bytes), overrides)
-    if kind == "safetensors":
-        return convert_safe_field(upload, data, tensor_bytes, overrides)
-    if kind == "onnx":
-        from regnf_core.importing.families.onnx import convert_onnx
-
-        return convert_onnx(data, tensor_bytes, overrides)
-    if kind == "sqlite":
-        from regnf_core.importing.containers.sqlite_source import TableSource
-        from regnf_core.importing.families.nvblox import convert_database
-
-        return convert_database(TableSource(data), tensor_bytes, overrides)
-    if kind in MESH_FORMATS:
-        from regnf_core.importing.families.mesh import convert_mesh
-
-        return convert_mesh(kind, data, overrides, limits.work_s)
-    reason, detail = explain_refusal(head)
-    raise FieldFormatError(detail, reason=reason)
 
 
 def _require_text(description: dict[str, Any]) -> None:
@@ -168,19 +147,17 @@ def _settled(converted: ConvertedField) -> ConvertedField:
     return choose_reading(converted)
 
 
-def _mapped(upload: Path) -> memoryview:
-    with open(upload, "rb") as file:
-        if os.fstat(file.fileno()).st_size == 0:
-            return memoryview(b"")
-        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-
-
 def run(
-    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, picture: bool = False
+    upload: Path,
+    out_dir: Path,
+    description: dict[str, Any] | None,
+    limits: ImportLimits,
+    picture: bool = False,
+    settings: Named | None = None,
 ) -> dict[str, Any]:
     """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
     try:
-        return convert_file(upload, out_dir, description, limits, picture)
+        return convert_file(upload, out_dir, description, limits, picture, settings)
     except FieldFormatError as error:
         return {"reason": error.reason, "detail": str(error)}
     except MemoryError:
@@ -197,12 +174,14 @@ def main(arguments: list[str]) -> int:
     """The process: confine, convert, report."""
     request = json.load(sys.stdin)
     limits = ImportLimits(**request["limits"])
-    out_dir = Path(arguments[1])
+    out_dir = Path(arguments[0])
     # Opened while all is still allowed: a folder on the way may be open to this process's privileges only.
-    upload = os.open(arguments[0], os.O_RDONLY)
-    threads = sniff_format(os.pread(upload, HEAD_BYTES, 0)) in _THREADED_FORMATS
-    isolation = confine(limits, request["parent_pid"], upload, out_dir, threads)
-    report = run(Path(f"/proc/self/fd/{upload}"), out_dir, request["description"], limits, request["picture"])
+    opened = [os.open(path, os.O_RDONLY) for path in arguments[1:]]
+    threads = sniff_format(os.pread(opened[0], HEAD_BYTES, 0)) in _THREADED_FORMATS
+    isolation = confine(limits, request["parent_pid"], opened, out_dir, threads)
+    upload, *others = (Path(f"/proc/self/fd/{number}") for number in opened)
+    settings = (request["settings"], others[0]) if others else None
+    report = run(upload, out_dir, request["description"], limits, request["picture"], settings)
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
     sys.stdout.flush()

@@ -42,6 +42,7 @@ _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
 _MAX_DETAIL = 500
 _OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
 _MAX_DESCRIPTION = 16_384
+_MAX_NAME = 120
 _PICTURE_BYTES = 16 << 20
 _log = logging.getLogger(__name__)
 
@@ -52,27 +53,29 @@ def import_field(
     description: dict[str, Any] | None = None,
     limits: ImportLimits | None = None,
     picture: bool = False,
+    settings: Path | None = None,
 ) -> ImportReport:
     """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
     ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
-    of the field in ``out_dir``/preview.png too, if it can be made in good time.
+    of the field in ``out_dir``/preview.png too, if it can be made in good time. settings: the trainer's own, one file
+    or an archive of several. The upload may be an archive of a whole run; then it brings its settings along.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
     limits = limits or ImportLimits()
-    request = _request(description, limits, picture)
-    upload = upload.resolve(strict=True)
+    request = _request(description, limits, picture, settings)
+    files = [upload.resolve(strict=True), *([] if settings is None else [settings.resolve(strict=True)])]
     out_dir.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     try:
-        return _import_once(upload, out_dir, request, limits, started, picture)
+        return _import_once(files, out_dir, request, limits, started, picture)
     except _KilledError:
         _log.warning("the import's process was killed from outside; it is started once more")
     try:
-        return _import_once(upload, out_dir, request, limits, started, picture)
+        return _import_once(files, out_dir, request, limits, started, picture)
     except _KilledError as error:
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
 
@@ -82,13 +85,13 @@ class _KilledError(Exception):
 
 
 def _import_once(
-    upload: Path, out_dir: Path, request: bytes, limits: ImportLimits, started: float, picture: bool
+    files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float, picture: bool
 ) -> ImportReport:
     """One child, within what is left of the time since ``started``. Raises _KilledError, and as ``import_field``."""
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
     left_s = max(0.0, limits.wall_s - (time.monotonic() - started))
     try:
-        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(upload), str(work.resolve())]
+        command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(work.resolve()), *map(str, files)]
         outcome = run_child(command, request, work, _environment(), left_s, limits.file_bytes + _PICTURE_BYTES)
         values = _values_of(outcome)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
@@ -100,9 +103,15 @@ def _import_once(
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: bool) -> bytes:
+def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: bool, settings: Path | None) -> bytes:
     try:
-        request = {"description": description, "limits": asdict(limits), "parent_pid": os.getpid(), "picture": picture}
+        request = {
+            "description": description,
+            "limits": asdict(limits),
+            "parent_pid": os.getpid(),
+            "picture": picture,
+            "settings": None if settings is None else settings.name[-_MAX_NAME:],
+        }
         text = json.dumps(request, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise FieldFormatError("the description is not JSON", reason="INVALID_DESCRIPTION") from error
@@ -168,6 +177,7 @@ def _report(
             plausibility={str(key): _finite(value) for key, value in values["plausibility"].items()},
             warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),
             label=None if values["label"] is None else str(values["label"]),
+            settings=_settings(values.get("settings")),
             field_bytes=size,
             seconds=round(seconds, 3),
             cpu_seconds=round(outcome.cpu_seconds, 3),
@@ -177,6 +187,18 @@ def _report(
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError, OSError, FieldFormatError) as error:
         _log.error("import process left no usable result: %r", error)
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED") from error
+
+
+def _settings(values: Any) -> dict[str, Any] | None:
+    """Which settings were used: plain, flat values, as the report promises them."""
+    if values is None:
+        return None
+    used = {str(name): value for name, value in values["used"].items()}
+    if not all(
+        value is None or isinstance(value, (bool, int, str)) or _finite(value) is not None for value in used.values()
+    ):
+        raise ValueError("a setting that is no plain value")
+    return {"trainer": str(values["trainer"]), "files": [str(name) for name in values["files"]], "used": used}
 
 
 def _finite(value: Any) -> float:

@@ -45,6 +45,9 @@ class ImportReport:
     warnings: tuple[str, ...]
     """Each begins with a stable UPPER_SNAKE word and a colon."""
     label: str | None
+    settings: dict[str, Any] | None
+    """The trainer's settings that counted: ``trainer``, ``files`` (their names) and ``used`` (entries of a description,
+    such as hash.levels, and their values). None where there were none."""
     field_bytes: int
     seconds: float
     cpu_seconds: float

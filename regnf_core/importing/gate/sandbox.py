@@ -8,6 +8,7 @@ import resource
 import signal
 import struct
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,10 +28,12 @@ _SYSTEM = """
 """Where libraries are, and which facts about the machine they read as they load. No service keeps a secret there."""
 
 
-def confine(limits: ImportLimits, parent_pid: int, upload: int, folder: Path, threads: bool = False) -> dict[str, bool]:
+def confine(
+    limits: ImportLimits, parent_pid: int, opened: Sequence[int], folder: Path, threads: bool = False
+) -> dict[str, bool]:
     """Confine this process for the rest of its life; returns which confinements the kernel granted.
 
-    ``upload`` is the opened upload, ``folder`` where the process may write. Resource limits always hold. A network
+    ``opened`` are the files it was given, ``folder`` is where it may write. Resource limits always hold. A network
     namespace without interfaces and the system call filter each keep the process off the network; containers often
     forbid the first and allow the second. threads: allow new ones; whoever started this process counts them.
     """
@@ -49,7 +52,7 @@ def confine(limits: ImportLimits, parent_pid: int, upload: int, folder: Path, th
         "network_namespace": no_network,
         "no_capabilities": no_capabilities,
         "no_new_privileges": no_new_privileges,
-        "files_restricted": no_new_privileges and restrict_files([upload, *_readable()], folder),
+        "files_restricted": no_new_privileges and restrict_files([*opened, *_readable()], folder),
         "system_call_filter": no_new_privileges and refuse_system_calls(threads),
     }
 

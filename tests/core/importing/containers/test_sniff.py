@@ -43,6 +43,14 @@ def test_arrays_and_databases_are_named() -> None:
     assert sniff_format(b"SQLite format 3\x00".ljust(100, b"\x01")) == "sqlite"
 
 
+def test_archives_of_runs_are_named() -> None:
+    assert sniff_format(zip_bytes([("points.txt", b"1 2 3")])) == "zip"
+    assert sniff_format(b"run/config.yml".ljust(257, b"\0") + b"ustar\x0000") == "tar"
+    assert sniff_format(b"\x1f\x8b\x08\x00") == "gzip"
+    assert sniff_format(b"BZh91AY&SY") == "bzip2"
+    assert sniff_format(b"\xfd7zXZ\x00\x00\x04") == "xz"
+
+
 def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
     assert sniff_format(b"PK\x03\x04\x00") == "torch-zip"
 
@@ -66,11 +74,9 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNIZED"),
         (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNIZED"),  # an STL file's facets have corners
         (b"x" * 512, "FORMAT_NOT_RECOGNIZED"),
-        (zip_bytes([("points.txt", b"1 2 3")]), "FORMAT_NOT_SUPPORTED"),
         (b" BDV\0\0\0\0\xe0\0\0\0", "FORMAT_NOT_SUPPORTED"),
         (b"NanoVDB2" + bytes(40), "FORMAT_NOT_SUPPORTED"),
         (b"7z\xbc\xaf\x27\x1c", "FORMAT_NOT_RECOGNIZED"),
-        (b"\x1f\x8b\x08\x00", "FORMAT_NOT_RECOGNIZED"),
         (b"\x89HDF\r\n\x1a\n", "FORMAT_NOT_RECOGNIZED"),
         (b"\x08\x01\x12\xf0", "FORMAT_NOT_RECOGNIZED"),
         (b"\x1c\0\0\0TFL3", "FORMAT_NOT_SUPPORTED"),

@@ -38,7 +38,7 @@ where = json.load(sys.stdin)
 upload, home = os.open(where["upload"], os.O_RDONLY), Path(where["home"])
 granted = {{}}
 if where["layer"] == "everything":
-    granted = sandbox.confine(ImportLimits(), where["parent"], upload, home)
+    granted = sandbox.confine(ImportLimits(), where["parent"], [upload], home)
 elif where["layer"] != "nothing":
     assert ctypes.CDLL(None).prctl(38, 1, 0, 0, 0) == 0
     if where["layer"] == "filter":

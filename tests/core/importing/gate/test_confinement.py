@@ -38,7 +38,7 @@ def attempt(action):
 CONFINE = """
 from pathlib import Path
 upload = os.open("upload", os.O_RDONLY | os.O_CREAT)
-granted = sandbox.confine(ImportLimits(**request['limits']), request['parent'], upload, Path.cwd())
+granted = sandbox.confine(ImportLimits(**request['limits']), request['parent'], [upload], Path.cwd())
 """
 NO_NEW_PRIVILEGES = "assert ctypes.CDLL(None).prctl(38, 1, 0, 0, 0) == 0\n"
 

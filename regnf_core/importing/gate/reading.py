@@ -1,0 +1,144 @@
+"""From the upload's bytes to a field: the archive opened, the settings translated, the format's own reader called."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
+from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
+from regnf_core.importing.gate.report import ImportLimits
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.run.opened import OpenedUpload, SettingsFile
+    from regnf_core.importing.settings.facts import Facts
+    from regnf_core.importing.settings.translate import Settings
+    from regnf_core.importing.tensor_source import TensorSource
+    from regnf_core.importing.upload_description import UploadDescription
+
+    Describe = Callable[[Facts], UploadDescription]
+    """The description, the settings' part of it included, for a checkpoint of which some facts are known."""
+
+Named = tuple[str, Path]
+"""What a file is called, and where it can be read."""
+
+
+def read_upload(
+    upload: Path, folder: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
+) -> tuple[ConvertedField, dict[str, Any] | None]:
+    """The field in ``upload``, and what its report says about settings. Large parts of archives are unpacked to
+    ``folder``. Raises FieldFormatError with the reason of the stage that refused.
+    """
+    from regnf_core.importing.run.opened import open_settings, open_upload
+    from regnf_core.importing.upload_description import UploadDescription
+
+    said = UploadDescription.from_dict(description)
+    opened = open_upload(_mapped(upload), folder, limits.file_bytes)
+    files = opened.settings
+    if settings is not None:
+        files = open_settings(_mapped(settings[1]), settings[0], folder, limits.file_bytes)
+    required = settings is not None and len(files) == 1 and files[0].name == settings[0]
+    translated = _Translation(files, said, description or {}, required)
+    path = upload if opened.name is None else folder / "unpacked-field"
+    converted = _convert(opened, path, translated, limits)
+    return translated.noted(converted, opened.name), translated.settings.report()
+
+
+class _Translation:
+    """The settings' translation, made once the checkpoint's facts are known, and what became of it."""
+
+    def __init__(
+        self, files: tuple[SettingsFile, ...], said: UploadDescription, values: dict[str, Any], required: bool
+    ) -> None:
+        from regnf_core.importing.settings.translate import Settings
+
+        self._files, self._said, self._values, self._required = files, said, values, required
+        self.settings: Settings = Settings()
+
+    def __call__(self, facts: Facts) -> UploadDescription:
+        """The description of both. Raises what ``translate_settings`` and UploadDescription raise."""
+        from regnf_core.importing.settings.translate import merged, translate_settings
+        from regnf_core.importing.upload_description import UploadDescription
+
+        if not self._files:
+            return self._said
+        self.settings = translate_settings(self._files, facts, self._said, self._required)
+        return UploadDescription.from_dict(merged(self._values, self.settings.values))
+
+    def noted(self, converted: ConvertedField, name: str | None) -> ConvertedField:
+        """The field, with what the settings decided among the evidence."""
+        from dataclasses import replace
+
+        where = () if name is None else (f"the run's checkpoint is {name[-200:]}",)
+        return replace(
+            converted,
+            why=(*where, *converted.why, *self.settings.why),
+            warnings=(*converted.warnings, *self.settings.warnings),
+        )
+
+
+def _convert(opened: OpenedUpload, path: Path, describe: Describe, limits: ImportLimits) -> ConvertedField:
+    """By the format's own reader. path: the upload itself, or where a field file out of an archive may be written."""
+    from regnf_core.importing.families.arrays import convert_arrays
+    from regnf_core.importing.families.safe_field import convert_safe_field
+    from regnf_core.importing.settings.facts import Facts
+
+    data, tensor_bytes = opened.data, limits.tensor_bytes
+    head = bytes(data[:HEAD_BYTES])
+    kind = sniff_format(head)
+    if kind in ("torch-zip", "torch-legacy"):
+        return _convert_torch(kind, data, tensor_bytes, describe)
+    if kind == "npz":
+        from regnf_core.importing.containers.npz import ArraySource
+
+        return convert_arrays(ArraySource(data, tensor_bytes), describe(Facts()))
+    if kind == "safetensors":
+        if opened.name is not None:
+            path.write_bytes(data)
+        return convert_safe_field(path, data, tensor_bytes, describe(Facts()))
+    if kind == "onnx":
+        from regnf_core.importing.families.onnx import convert_onnx
+
+        return convert_onnx(data, tensor_bytes, describe(Facts()))
+    if kind == "sqlite":
+        from regnf_core.importing.containers.sqlite_source import TableSource
+        from regnf_core.importing.families.nvblox import convert_database
+
+        return convert_database(TableSource(data), tensor_bytes, describe(Facts()))
+    if kind in MESH_FORMATS:
+        from regnf_core.importing.families.mesh import convert_mesh
+
+        return convert_mesh(kind, data, describe(Facts()), limits.work_s)
+    reason, detail = explain_refusal(head)
+    raise FieldFormatError(detail, reason=reason)
+
+
+def _convert_torch(kind: str, data: memoryview, tensor_bytes: int, describe: Describe) -> ConvertedField:
+    from regnf_core.importing.containers.container import read_archive
+    from regnf_core.importing.containers.legacy_container import read_legacy
+    from regnf_core.importing.families import convert_checkpoint
+    from regnf_core.importing.pickle.pickle_reader import read_pickle
+    from regnf_core.importing.settings.facts import facts_of
+    from regnf_core.importing.tensor_source import TensorSource
+
+    source: TensorSource
+    if kind == "torch-zip":
+        archive = read_archive(data)
+        values, source = read_pickle(archive.read("data.pkl")), TensorSource(archive, tensor_bytes)
+    else:
+        values, legacy = read_legacy(data)
+        source = TensorSource(legacy, tensor_bytes)
+    return convert_checkpoint(values, source, describe(facts_of(values, source)))
+
+
+def _mapped(path: Path) -> memoryview:
+    with open(path, "rb") as file:
+        if os.fstat(file.fileno()).st_size == 0:
+            return memoryview(b"")
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))

@@ -1,0 +1,107 @@
+"""A training run on the user's own disk: its checkpoint, and the settings beside it, packed for the import gate.
+
+Nothing is parsed here. Names decide, as in an archive; links that lead out of the run's folder are not followed.
+"""
+
+from __future__ import annotations
+
+import os
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.run.checkpoint_names import choose_checkpoint
+from regnf_core.importing.run.opened import MAX_SETTINGS_BYTES
+from regnf_core.importing.run.settings_names import MAX_FILES, choose_settings
+
+_MAX_FILES, _MAX_DEPTH = 50_000, 12
+_LEVELS = 4
+"""How many folders above a lone checkpoint may be its run's."""
+_SKIPPED = frozenset({".git", "__pycache__", "wandb", "node_modules", ".venv"})
+
+
+@dataclass(frozen=True)
+class Run:
+    """A checkpoint and the settings that belong to it. settings: paths, none of them a folder."""
+
+    checkpoint: Path
+    settings: tuple[Path, ...]
+
+
+def find_run(folder: Path) -> Run:
+    """The run in ``folder``. Raises FieldFormatError: RUN_WITHOUT_CHECKPOINT, AMBIGUOUS_RUN, RUN_TOO_LARGE."""
+    root = folder.resolve(strict=True)
+    names = sorted(_names_below(root))
+    checkpoint = choose_checkpoint(names)
+    chosen = choose_settings(names, checkpoint)
+    return Run(root / checkpoint, tuple(root / name for name in chosen))
+
+
+def settings_beside(checkpoint: Path) -> tuple[Path, ...]:
+    """The settings that a checkpoint's trainer leaves round it; only their own few folders are looked into."""
+    path = checkpoint.resolve(strict=True)
+    top = list(path.parents)[:_LEVELS][-1]
+    names = [str(path.relative_to(top))]
+    for folder in list(path.parents)[:_LEVELS]:
+        for found in _known_near(folder):
+            if _stays_in(found, top):
+                names.append(str(found.relative_to(top)))
+    chosen = choose_settings(sorted(set(names)), names[0])
+    return tuple(top / name for name in chosen)
+
+
+def pack_settings(run: Run, into: Path) -> Path:
+    """A tar file of the run's settings in the folder ``into``. Raises FieldFormatError (SETTINGS_TOO_LARGE)."""
+    target = into / "settings.tar"
+    top = Path(os.path.commonpath([path.parent for path in run.settings] or [run.checkpoint.parent]))
+    if sum(path.stat().st_size for path in run.settings) > MAX_SETTINGS_BYTES:
+        message = f"the settings beside {run.checkpoint.name} have more than {MAX_SETTINGS_BYTES} bytes"
+        raise FieldFormatError(message, reason="SETTINGS_TOO_LARGE")
+    with tarfile.open(target, "w", format=tarfile.GNU_FORMAT, dereference=True) as archive:
+        for path in run.settings[:MAX_FILES]:
+            archive.add(path, arcname=str(path.relative_to(top)), recursive=False, filter=_nameless)
+    return target
+
+
+def _nameless(member: tarfile.TarInfo) -> tarfile.TarInfo:
+    """Without the user's name and the file's times: the same settings are the same bytes."""
+    member.uid = member.gid = member.mtime = 0
+    member.uname = member.gname = ""
+    return member
+
+
+def _names_below(root: Path) -> Iterator[str]:
+    """Plain files below ``root``, links to files within it included. Raises FieldFormatError (RUN_TOO_LARGE)."""
+    waiting, count = [(root, 0)], 0
+    while waiting:
+        folder, depth = waiting.pop()
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                count += 1
+                if count > _MAX_FILES:
+                    message = f"{root.name} holds more than {_MAX_FILES} files; give the checkpoint by itself"
+                    raise FieldFormatError(message, reason="RUN_TOO_LARGE")
+                if entry.is_dir(follow_symlinks=False):
+                    if depth < _MAX_DEPTH and entry.name not in _SKIPPED:
+                        waiting.append((Path(entry.path), depth + 1))
+                elif _stays_in(Path(entry.path), root):
+                    yield Path(entry.path).relative_to(root).as_posix()
+
+
+def _known_near(folder: Path) -> Iterator[Path]:
+    """Files in ``folder`` and in those of its subfolders in which trainers keep settings."""
+    for name in (".", "config", "recording", ".hydra", "LatentCodes"):
+        near = folder / name
+        if near.is_dir():
+            with os.scandir(near) as entries:
+                yield from (folder / name / entry.name for entry, _ in zip(entries, range(_MAX_FILES), strict=False))
+
+
+def _stays_in(path: Path, root: Path) -> bool:
+    """Whether ``path`` is a plain file that lies, its links followed, below ``root``."""
+    try:
+        return path.is_file() and path.resolve(strict=True).is_relative_to(root)
+    except (OSError, RuntimeError):
+        return False

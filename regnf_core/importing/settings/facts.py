@@ -1,0 +1,76 @@
+"""What a checkpoint itself says beside its large weights: whole numbers such as its step, and the tensors' shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.pickle.pickle_values import Placeholder, TensorRef
+from regnf_core.importing.tensor_source import TensorSource
+
+_MAX_DEPTH, _MAX_VALUES = 4, 50_000
+_MAX_NUMBER = 1 << 53
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Of one checkpoint. Tensors are called by the keys on the way to them, with dots between them."""
+
+    numbers: Mapping[str, int] = field(default_factory=dict)
+    tensors: Mapping[str, TensorRef] = field(default_factory=dict)
+    objects: Mapping[str, Mapping[Any, Any]] = field(default_factory=dict)
+    """Of objects at the top that are never made, the attributes that they would have had."""
+    source: TensorSource | None = None
+
+    def shape(self, end: str) -> tuple[int, ...] | None:
+        """The shape of the one tensor whose keys end so; None where there is none, or several."""
+        name = self._name(end)
+        return None if name is None else tuple(self.tensors[name].shape)
+
+    def few(self, end: str, most: int = 64) -> list[float] | None:
+        """The numbers of the one tensor whose keys end so, if it is small and sound."""
+        name = self._name(end)
+        if name is None or self.source is None or self.tensors[name].storage.count > most:
+            return None
+        try:
+            return [float(value) for value in self.source.array(name, self.tensors[name]).ravel()]
+        except FieldFormatError:  # the family says it better, if it needs the tensor
+            return None
+
+    def count(self, part: str, end: str) -> int:
+        """How many tensors there are with ``part`` in their keys that end so."""
+        return sum(part in name and name.endswith(end) for name in self.tensors)
+
+    def _name(self, end: str) -> str | None:
+        found = [name for name in self.tensors if name == end or name.endswith("." + end)]
+        return found[0] if len(found) == 1 else None
+
+
+def facts_of(checkpoint: object, source: TensorSource | None = None) -> Facts:
+    """What a checkpoint that was read says, as far as it is a dictionary; bounded in depth and number."""
+    if not isinstance(checkpoint, dict):
+        return Facts()
+    numbers, objects = {}, {}
+    for key, value in checkpoint.items():
+        if isinstance(key, str) and isinstance(value, int) and not isinstance(value, bool) and 0 <= value < _MAX_NUMBER:
+            numbers[key] = value
+        if isinstance(key, str) and isinstance(value, Placeholder) and isinstance(value.state, dict):
+            objects[key] = value.state
+    return Facts(numbers, dict(_tensors(checkpoint)), objects, source)
+
+
+def _tensors(checkpoint: Mapping[Any, Any]) -> Iterator[tuple[str, TensorRef]]:
+    waiting: list[tuple[str, Mapping[Any, Any], int]] = [("", checkpoint, 0)]
+    left = _MAX_VALUES
+    while waiting:
+        path, here, depth = waiting.pop()
+        for key, value in here.items():
+            left -= 1
+            if left < 0:
+                return
+            if isinstance(key, str) and isinstance(value, TensorRef):
+                yield path + key, value
+            elif isinstance(key, str) and isinstance(value, dict) and depth < _MAX_DEPTH:
+                waiting.append((f"{path}{key}.", value, depth + 1))

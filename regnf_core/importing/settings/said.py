@@ -1,0 +1,60 @@
+"""What a trainer's settings say, as it is collected: entries of a description, and the keys they are from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.shared import contradiction
+from regnf_core.importing.settings.documents import Documents
+from regnf_core.importing.settings.facts import Facts
+from regnf_core.importing.settings.keys import Keys
+
+
+@dataclass
+class Said:
+    """Filled by one trainer's module."""
+
+    trainer: str
+    facts: Facts
+    documents: Documents
+    values: dict[str, Any] = field(default_factory=dict)
+    """Entries of an UploadDescription; those of ``hash`` and ``positional_encoding`` with a dot: ``hash.levels``."""
+    used: dict[str, list[str]] = field(default_factory=dict)
+    """Of each file the keys that counted, as "key value"."""
+    warnings: list[str] = field(default_factory=list)
+
+    def put(self, entry: str, value: Any, keys: Keys, key: str) -> None:
+        """``entry`` of the description is ``value``, by ``key`` of the file. None says nothing."""
+        if value is not None:
+            self.values[entry] = value
+            self.note(keys, key)
+
+    def note(self, keys: Keys, key: str) -> None:
+        """``key`` of the file counted. A long value is not repeated."""
+        value = keys.find(key)
+        text = "..." if isinstance(value, (dict, list)) and len(str(value)) > 40 else str(value)[:40]
+        used = self.used.setdefault(keys.file, [])
+        if (line := f"{key.rpartition('.')[2]} {text}") not in used:
+            used.append(line)
+
+    def agree(self, keys: Keys, key: str, found: int | Sequence[int] | None) -> None:
+        """Raise FieldFormatError (SETTINGS_CONTRADICT_TENSORS) if ``key`` says other whole numbers than the tensors.
+
+        None on either side says nothing.
+        """
+        said: int | list[int] | None = None
+        if found is not None:
+            said = keys.whole(key) if isinstance(found, int) else keys.wholes(key)
+        if said is None or found is None:
+            return
+        if said != (found if isinstance(found, int) else list(found)):
+            raise contradiction(f"{keys.file}: {keys.at}{key}", said, found)
+        self.note(keys, key)
+
+    def refuse(self, keys: Keys, key: str) -> None:
+        """Raise FieldFormatError (FAMILY_NOT_SUPPORTED): the value of ``key`` makes another function of the field."""
+        message = f"{keys.file}: {keys.at}{key} is {str(keys.find(key))[:60]}, which is not supported"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")

@@ -1,0 +1,1 @@
+"""One module a trainer: which of its settings' keys the gate knows, and what they mean."""

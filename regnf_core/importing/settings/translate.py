@@ -1,0 +1,154 @@
+"""From a trainer's settings to a description: the first trainer that knows a file says what its keys mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import PurePosixPath
+from types import ModuleType
+from typing import Any
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.run.opened import SettingsFile
+from regnf_core.importing.settings.documents import read_documents
+from regnf_core.importing.settings.facts import Facts
+from regnf_core.importing.settings.keys import Keys
+from regnf_core.importing.settings.latent_codes import latent_code
+from regnf_core.importing.settings.plain import malformed
+from regnf_core.importing.settings.said import Said
+from regnf_core.importing.settings.trainers import (
+    deepsdf,
+    fusion,
+    implicit_network,
+    instant_nsr_pl,
+    neuralangelo,
+    neus,
+    pin_slam,
+    sdf_field,
+    sines,
+)
+from regnf_core.importing.upload_description import UploadDescription
+
+_MAX_WHY = 400
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """What one module knows."""
+
+    name: Callable[[Keys], str]
+    module: ModuleType
+
+
+TRAINERS = (
+    Trainer(sdf_field.trainer_of, sdf_field),
+    Trainer(lambda _: "instant-nsr-pl", instant_nsr_pl),
+    Trainer(lambda _: "Neuralangelo", neuralangelo),
+    Trainer(lambda _: "NeuS", neus),
+    Trainer(lambda _: "IDR, VolSDF or MonoSDF", implicit_network),
+    Trainer(lambda _: "DeepSDF", deepsdf),
+    Trainer(lambda _: "PIN-SLAM", pin_slam),
+    Trainer(lambda _: "a network of sines", sines),
+    Trainer(lambda _: "a map of truncated distances", fusion),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run's settings say. Empty where there are none, or none that is known."""
+
+    trainer: str | None = None
+    files: tuple[str, ...] = ()
+    """Names of those that counted."""
+    values: dict[str, Any] = field(default_factory=dict)
+    """Entries of an UploadDescription, as plain values."""
+    why: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def report(self) -> dict[str, Any] | None:
+        """For the import's report: flat, and without long values."""
+        if self.trainer is None:
+            return None
+        used = {name: value for name, value in _flat(self.values).items() if not isinstance(value, list)}
+        return {"trainer": self.trainer, "files": list(self.files), "used": used}
+
+
+def translate_settings(
+    files: tuple[SettingsFile, ...], facts: Facts, description: UploadDescription, required: bool
+) -> Settings:
+    """What ``files`` say about a checkpoint of which ``facts`` are known. required: refuse files that nobody knows.
+
+    Raises FieldFormatError: the SETTINGS_* reasons, FAMILY_NOT_SUPPORTED for a setting that makes another function.
+    """
+    if not files:
+        return Settings()
+    documents = read_documents(files)
+    for trainer in TRAINERS:
+        keys = trainer.module.main_file(documents)
+        if keys is not None:
+            said = Said(trainer.name(keys), facts, documents)
+            trainer.module.translate(keys, said)
+            _choose_code(description, said)
+            return _settings(said)
+    names = ", ".join(PurePosixPath(file.name).name[:60] for file in files[:6])
+    message = f"no known trainer's settings in {names}"
+    if required:
+        raise FieldFormatError(message, reason="SETTINGS_NOT_RECOGNIZED")
+    return Settings(warnings=(f"SETTINGS_NOT_USED: {message}",))
+
+
+def _choose_code(description: UploadDescription, said: Said) -> None:
+    """The shape's code from the file of codes, where the checkpoint has none and the caller gives none."""
+    if said.trainer != "DeepSDF" or not said.documents.tensors or description.latent is not None:
+        return
+    if said.facts.count("latent_codes", "") or said.facts.shape("latent_codes"):
+        return
+    file, index = said.documents.tensors[0], description.latent_index or 0
+    said.values["latent"], count = latent_code(file, index)
+    said.used.setdefault(PurePosixPath(file.name).name, []).append(f"latent code {index} of {count}, counted from 0")
+
+
+def _settings(said: Said) -> Settings:
+    """The values, checked as a description is: what no field can have is no sound setting."""
+    values: dict[str, Any] = {}
+    for entry, value in said.values.items():
+        part, _, name = entry.rpartition(".")
+        (values.setdefault(part, {}) if part else values)[name] = value
+    try:
+        UploadDescription.from_dict(values)
+    except FieldFormatError as error:
+        raise malformed(
+            f"{next(iter(said.used), 'the settings')}: {str(error).removeprefix('description.')}"
+        ) from error
+    why = tuple(f"{file}: {', '.join(keys)}"[:_MAX_WHY] for file, keys in said.used.items())
+    return Settings(said.trainer, tuple(said.used), values, why, tuple(said.warnings))
+
+
+def merged(said: dict[str, Any], by_settings: dict[str, Any]) -> dict[str, Any]:
+    """A description of both; what the caller ``said`` goes before, and takes with it what would contradict it."""
+    below = {name: value for name, value in by_settings.items() if name not in ("hash", "positional_encoding")}
+    result = {**below, **{name: value for name, value in said.items() if value is not None}}
+    if said.get("latent_index") is not None and said.get("latent") is None and "latent" in result:
+        del result["latent_index"]  # the settings' code is the one of this index
+    if "bounds" in by_settings and said.get("bounds") is None and said.get("world_scale") is not None:
+        result["bounds"] = [[said["world_scale"] * value for value in corner] for corner in by_settings["bounds"]]
+    for part in ("hash", "positional_encoding"):
+        own = said.get(part) or {}
+        theirs = dict(by_settings.get(part, {}))
+        for one, other in (("top_resolution", "per_level_scale"), ("per_level_scale", "top_resolution")):
+            if own.get(one) is not None:
+                theirs.pop(other, None)
+        result[part] = {**theirs, **own}
+        if not result[part]:
+            del result[part]
+    return result
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}.{part}": inner for part, inner in value.items()}
+        else:
+            flat[name] = value
+    return flat
