@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,23 +13,32 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
-from regnf_cli.paths import FIELD, JSON_FILE, folder
-from regnf_cli.request_files import read_object
+from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
+from regnf_cli.paths import FIELD, folder
 from regnf_core.errors import InvalidOptionsError
+from regnf_core.field_source import FieldSource, naming
 
 _SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
 _GRID_MOST = 1024
 
 
 def convert(
-    field: Annotated[Path, typer.Argument(help="A checkpoint, mesh, grid, ONNX model or safe field.", **FIELD)],
+    field: Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)],
     output: Annotated[
         Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
     ],
     resolution: Annotated[
         int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
     ] = 128,
-    description: Annotated[Path | None, typer.Option(help="JSON: what the file does not carry.", **JSON_FILE)] = None,
+    description: Annotated[
+        dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **CONFIG)
+    ] = None,
+    no_config: Annotated[
+        bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")
+    ] = False,
     images: Annotated[
         Path | None,
         typer.Option(
@@ -49,29 +59,28 @@ def convert(
         raise InvalidOptionsError(message, hint="The ending chooses the format.")
     if not output.parent.is_dir():
         raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
-    given = read_object(description, "description") if description else None
     if images is not None and output.suffix.lower() != ".safetensors":
         raise InvalidOptionsError("--images goes with a safe field (.safetensors)")
+    source = source_of(field, description, choice_of(config, no_config))
     if output.suffix.lower() == ".safetensors":
-        _to_safe_field(field, output, given, images)
+        _to_safe_field(source, output, images)
     else:
-        _evaluated(field, output, resolution, given)
+        _evaluated(source, output, resolution)
 
 
-def _to_safe_field(field: Path, output: Path, given: dict[str, Any] | None, images: Path | None) -> None:
+def _to_safe_field(source: FieldSource, output: Path, images: Path | None) -> None:
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
-    from regnf_core.loading import naming
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
-        with err.status("importing"), naming(field):
-            report = import_field(field, Path(scratch), given, ImportLimits())
+        with err.status("importing"), naming(source.file), source.packed_settings() as settings:
+            said = source.description or None
+            report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings)
         if images is not None:
             with err.status("recording which parts the cameras observed"):
                 _keep_what_was_seen(Path(scratch) / FIELD_NAME, images)
         os.replace(Path(scratch) / FIELD_NAME, output)
     _say(output, f"{report.family}, {report.parameters:,} parameters")
-    for warning in report.warnings:
-        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    _warn(report.warnings)
 
 
 def _keep_what_was_seen(field: Path, images: Path) -> None:
@@ -81,12 +90,12 @@ def _keep_what_was_seen(field: Path, images: Path) -> None:
     attach_observation(field, load_dataset(images))
 
 
-def _evaluated(field: Path, output: Path, resolution: int, given: dict[str, Any] | None) -> None:
+def _evaluated(source: FieldSource, output: Path, resolution: int) -> None:
     with err.status("opening"):
         from regnf_core.loading import load_field
         from regnf_core.surface.exporting import write_grid, write_mesh
 
-        source = load_field(field, given)
+        loaded = load_field(source)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -100,11 +109,17 @@ def _evaluated(field: Path, output: Path, resolution: int, given: dict[str, Any]
             bar.update(task, completed=points)
 
         if output.suffix.lower() == ".npz":
-            shape = write_grid(source, output, resolution, report)
+            shape = write_grid(loaded.field, output, resolution, report)
             told = f"{' x '.join(map(str, shape))} nodes"
         else:
-            told = f"{write_mesh(source, output, resolution, report):,} triangles"
+            told = f"{write_mesh(loaded.field, output, resolution, report):,} triangles"
     _say(output, told)
+    _warn(loaded.notes.warnings)
+
+
+def _warn(warnings: Sequence[str]) -> None:
+    for warning in warnings:
+        err.print(f"warning: {warning}", markup=False, soft_wrap=True)
 
 
 def _say(output: Path, what: str) -> None:

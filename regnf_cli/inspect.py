@@ -11,16 +11,23 @@ import typer
 
 from regnf_cli.console import out
 from regnf_cli.extras import require
-from regnf_cli.paths import FIELD, JSON_FILE
-from regnf_cli.request_files import read_object
+from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
+from regnf_cli.paths import FIELD
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.field_source import naming
 
 
 def inspect(
-    field: Annotated[Path, typer.Argument(help="A safe field or a checkpoint.", **FIELD)],
+    field: Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)],
     description: Annotated[
-        Path | None, typer.Option(help="JSON: what the checkpoint does not carry.", **JSON_FILE)
+        dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
     ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **CONFIG)
+    ] = None,
+    no_config: Annotated[
+        bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")
+    ] = False,
     picture: Annotated[
         Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
     ] = None,
@@ -35,15 +42,15 @@ def inspect(
 
     from regnf_core.importing.gate.gate import ImportLimits, import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
-    from regnf_core.loading import naming
 
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
         message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
         raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
-    given = read_object(description, "description") if description else None
+    source = source_of(field, description, choice_of(config, no_config))
     with tempfile.TemporaryDirectory() as folder:
-        with naming(field):
-            report = import_field(field, Path(folder), given, ImportLimits(), picture is not None).to_dict()
+        with naming(source.file), source.packed_settings() as settings:
+            made = import_field(source.file, Path(folder), description, ImportLimits(), picture is not None, settings)
+            report = made.to_dict()
         if picture is not None:
             _keep(Path(folder) / PICTURE_NAME, picture)
     if as_json:

@@ -7,18 +7,19 @@ from pathlib import Path
 
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import FieldFormatError
+from regnf_core.field_source import FieldSource
 from regnf_core.fields.build import open_field
 from regnf_core.library import ObjectModel, model_object, read_object_model, write_object_model
-from regnf_core.loading import default_cache_dir, safe_field_path
+from regnf_core.loading import default_cache_dir, safe_field
 from regnf_core.options import RobustOptions
 
 
-def object_model(path: Path, options: RobustOptions) -> ObjectModel:
-    """The model of the object in a file; one by default options is kept, and made again where it does not read.
+def object_model(source: FieldSource, options: RobustOptions) -> ObjectModel:
+    """The model of an object; one by default options is kept, and made again where it does not read.
 
     Raises NoSurfaceError, and FieldFormatError naming the file.
     """
-    field = safe_field_path(path)
+    field = safe_field(source).path
     kept = _place(field) if options.object_samples == RobustOptions().object_samples else None
     if kept is not None:
         try:

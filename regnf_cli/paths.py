@@ -7,12 +7,13 @@ from typing import Any
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_files import require_field_file, require_file
+from regnf_core.field_source import find_source
 
 
-def field_file(text: str) -> Path:
-    """The path of a field. Raises what ``require_field_file`` does."""
+def field_path(text: str) -> Path:
+    """The path of a field: of a file, a training run's folder or an archive. Raises what ``find_source`` does."""
     path = Path(text)
-    require_field_file(path)
+    find_source(path, settings=False)
     return path
 
 
@@ -55,7 +56,7 @@ def output_folder(text: str) -> Path:
     return path
 
 
-FIELD: dict[str, Any] = {"parser": field_file, "metavar": "FILE"}
+FIELD: dict[str, Any] = {"parser": field_path, "metavar": "FIELD"}
 JSON_FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
 OUTPUT: dict[str, Any] = {"parser": output_folder, "metavar": "FOLDER"}
 """How options and arguments of these kinds are declared."""

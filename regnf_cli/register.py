@@ -10,6 +10,7 @@ import typer
 
 from regnf_cli.console import err, out, phase_progress
 from regnf_cli.extras import require
+from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
 from regnf_cli.output import prepare, write_into
 from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT
 from regnf_cli.report import exit_code, show_result
@@ -17,14 +18,18 @@ from regnf_cli.request_files import read_detection, read_options, read_transform
 from regnf_cli.scene_file import check_box_by_header, open_scene
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError
+from regnf_core.field_source import FieldSource
 from regnf_core.options import Preset, RegistrationOptions
 
 
 def register(
     scene: Annotated[
-        Path, typer.Argument(help="The scene's field: safe field, checkpoint or mesh.", **FIELD | {"metavar": "SCENE"})
+        Path,
+        typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
     ],
-    object_: Annotated[Path, typer.Argument(help="The library object's field.", **FIELD | {"metavar": "OBJECT"})],
+    object_: Annotated[
+        Path, typer.Argument(help="The library object's field, in the same forms.", **FIELD | {"metavar": "OBJECT"})
+    ],
     detection: Annotated[
         Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **JSON_FILE)
     ],
@@ -36,6 +41,19 @@ def register(
     ] = None,
     options: Annotated[
         Path | None, typer.Option(help="JSON: options by stage; the defaults otherwise.", **JSON_FILE)
+    ] = None,
+    scene_config: Annotated[
+        Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **CONFIG)
+    ] = None,
+    object_config: Annotated[Path | None, typer.Option(help="The same of the object.", **CONFIG)] = None,
+    no_config: Annotated[
+        bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")
+    ] = False,
+    scene_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
+    ] = None,
+    object_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="The same of the object.", **DESCRIPTION)
     ] = None,
     initial_transform: Annotated[
         Path | None,
@@ -82,17 +100,21 @@ def register(
         )
     if server is None:
         require("engine")
-    if scene.samefile(object_):
+    sources = (
+        source_of(scene, scene_description, choice_of(scene_config, no_config), "scene"),
+        source_of(object_, object_description, choice_of(object_config, no_config), "object"),
+    )
+    if sources[0].file.samefile(sources[1].file):
         err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
-    check_box_by_header(scene, box, object_)
+    check_box_by_header(sources[0].file, box, sources[1].file)
     if server is not None:
         from regnf_cli.remote import RemoteService
         from regnf_cli.remote_exchange import Delivery, register_remotely
 
         service = RemoteService(server, token, worker_timeout)
-        document = register_remotely(service, scene, object_, request, Delivery(output, cancel_on_interrupt))
+        document = register_remotely(service, *sources, request, Delivery(output, cancel_on_interrupt))
     else:
-        document = _register_here(scene, object_, box, request, output)
+        document = _register_here(*sources, box, request, output)
     if as_json:
         out.print_json(json.dumps(document))
     else:
@@ -101,7 +123,7 @@ def register(
 
 
 def _register_here(
-    scene: Path, object_: Path, detection: Detection, request: dict[str, Any], output: Path | None
+    scene: FieldSource, object_: FieldSource, detection: Detection, request: dict[str, Any], output: Path | None
 ) -> dict[str, Any]:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
@@ -117,9 +139,10 @@ def _register_here(
     prepare(output)
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
-        fields = open_scene(scene, detection), load_field(object_)
+        opened, obj = open_scene(scene, detection), load_field(object_)
         result = run(
-            *fields,
+            opened.field,
+            obj.field,
             box,
             options,
             request["seed"],
@@ -128,6 +151,11 @@ def _register_here(
             clouds=output is not None,
         )
         bar.update(task, description="exporting", completed=1.0)
-    write_into(output, result, truth=truth, object_name=str(object_))
-    document: dict[str, Any] = result_document(result, truth=truth, object_name=str(object_))
+    said: dict[str, Any] = {
+        "truth": truth,
+        "object_name": str(object_.named),
+        "fields": {"scene": opened.notes, "object": obj.notes},
+    }
+    write_into(output, result, **said)
+    document: dict[str, Any] = result_document(result, **said)
     return document

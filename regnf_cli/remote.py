@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 
-from regnf_cli.remote_errors import checked, checked_address, service_error
+from regnf_cli.remote_errors import ServiceError, checked, checked_address, service_error
 from regnf_cli.worker_watch import WorkerWatch
+from regnf_core.field_source import FieldSource
+from regnf_core.importing.upload_description import UploadDescription
 
 _BLOCK = 1 << 20
 _FINISHED = ("successful", "failed", "dismissed")
@@ -47,30 +51,40 @@ class RemoteService:
         except (KeyError, TypeError, ValueError):
             return True
 
-    def upload_field(self, path: Path, report: Report = lambda phase, share: None) -> str:
+    def upload_field(self, field: FieldSource | Path, report: Report = lambda phase, share: None) -> str:
         """Send a field unless the service holds it; returns its SHA-256 once the service has found it good."""
-        sha256 = self.send(path, report)
+        sha256 = self.send(field, report)
         self.wait_until_ready(sha256)
         return sha256
 
-    def send(self, path: Path, report: Report = lambda phase, share: None) -> str:
-        """Send a field unless the service holds it; returns its SHA-256 while its import may still run."""
-        sha256 = _sha256(path)
+    def send(self, field: FieldSource | Path, report: Report = lambda phase, share: None) -> str:
+        """Send a field unless the service holds it; returns its SHA-256 while its import may still run.
+
+        Raises ServiceError FIELD_DESCRIPTION_DIFFERS for bytes that are held as another function.
+        """
+        source = field if isinstance(field, FieldSource) else FieldSource(field, field)
+        sha256 = _sha256(source.file)
         known = self._http.get(f"/fields/{sha256}")
-        if known.status_code != 200 or checked(known).get("state") == "rejected":
-            size = max(path.stat().st_size, 1)
-
-            def body() -> Iterator[bytes]:
-                sent = 0
-                with path.open("rb") as file:
-                    while block := file.read(_BLOCK):
-                        yield block
-                        sent += len(block)
-                        report("uploading", sent / size)
-
-            length = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
-            checked(self._http.put(f"/fields/{sha256}", content=body(), headers=length))
+        with source.packed_settings() as settings:
+            if known.status_code != 200 or checked(known).get("state") == "rejected":
+                self._send(sha256, source, settings, report)
+            elif source.said or settings is not None:
+                _require_same(checked(known), source, settings)
         return sha256
+
+    def _send(self, sha256: str, source: FieldSource, settings: Path | None, report: Report) -> None:
+        """The bytes alone, or multipart where something goes with them."""
+        with _Told(source.file, report) as file:
+            if not source.description and settings is None:
+                length = {"Content-Length": str(file.size), "Content-Type": "application/octet-stream"}
+                checked(self._http.put(f"/fields/{sha256}", content=file.blocks(), headers=length))
+                return
+            parts: dict[str, Any] = {"file": (source.file.name, file, "application/octet-stream")}
+            if source.description:
+                parts["description"] = (None, json.dumps(source.description), "application/json")
+            if settings is not None:
+                parts["settings"] = (settings.name, settings.read_bytes(), "application/octet-stream")
+            checked(self._http.post("/fields", files=parts))
 
     def wait_until_ready(self, sha256: str) -> None:
         """Wait for a field's import to end; raises ServiceError with the gate's reason when it was rejected."""
@@ -117,6 +131,41 @@ class RemoteService:
             with target.open("wb") as file:
                 for block in response.iter_bytes(_BLOCK):
                     file.write(block)
+
+
+class _Told(io.FileIO):
+    """A file that tells how much of it was read."""
+
+    def __init__(self, path: Path, report: Report) -> None:
+        super().__init__(path, "rb")
+        self.size = path.stat().st_size
+        self._report = report
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """The next bytes."""
+        block = super().read(-1 if size is None else size) or b""
+        self._report("uploading", self.tell() / max(self.size, 1))
+        return block
+
+    def blocks(self) -> Iterator[bytes]:
+        """All of it."""
+        while block := self.read(_BLOCK):
+            yield block
+
+
+def _require_same(held: dict[str, Any], source: FieldSource, settings: Path | None) -> None:
+    """Raises ServiceError FIELD_DESCRIPTION_DIFFERS unless the service has the field as the user wants it.
+
+    What it will be used as is no condition, as long as the user has not said it.
+    """
+    said = UploadDescription.from_dict(dict(source.said)).non_default()
+    wanted = {name: value for name, value in said.items() if name != "label"}
+    found = {name: value for name, value in (held.get("description") or {}).items() if name in wanted or name != "as"}
+    digest = None if settings is None else _sha256(settings)
+    if (wanted, digest) != (found, (held.get("settings") or {}).get("sha256")):
+        message = "the service holds the same bytes with another description or other settings"
+        hint = f"Delete the field there first (DELETE /fields/{held.get('sha256')}), or leave them out."
+        raise ServiceError(message, reason="FIELD_DESCRIPTION_DIFFERS", hint=hint)
 
 
 def _sha256(path: Path) -> str:

@@ -14,6 +14,7 @@ from rich.progress import Progress
 from regnf_cli.console import err, phase_progress
 from regnf_cli.remote import RemoteService, Report
 from regnf_cli.remote_errors import ServiceError, unreachable
+from regnf_core.field_source import FieldSource
 
 _NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", ServiceError.reason})
 
@@ -27,7 +28,7 @@ class Delivery:
 
 
 def register_remotely(
-    service: RemoteService, scene: Path, object_: Path, request: dict[str, Any], delivery: Delivery
+    service: RemoteService, scene: FieldSource, object_: FieldSource, request: dict[str, Any], delivery: Delivery
 ) -> dict[str, Any]:
     """The whole exchange for one registration, with progress on stderr; returns the result document.
 
@@ -41,16 +42,20 @@ def register_remotely(
 
 
 def search_remotely(
-    service: RemoteService, scene: Path, objects: Sequence[Path], request: dict[str, Any], delivery: Delivery
+    service: RemoteService,
+    scene: FieldSource,
+    objects: Sequence[FieldSource],
+    request: dict[str, Any],
+    delivery: Delivery,
 ) -> dict[str, Any]:
     """The same for a search among ``objects``, which the document then names by their files."""
     files: dict[str, Path] = {}
 
     def upload(report: Report) -> dict[str, Any]:
         sent = {"scene": _sent(service, scene, report)}
-        for path in objects:
-            with _named(path):
-                files.setdefault(service.send(path, report), path)
+        for one in objects:
+            with _named(one.named):
+                files.setdefault(service.send(one, report), one.named)
         for sha256, path in files.items():
             with _named(path):
                 service.wait_until_ready(sha256)
@@ -62,9 +67,9 @@ def search_remotely(
     return document
 
 
-def _sent(service: RemoteService, path: Path, report: Report) -> str:
-    with _named(path):
-        return service.upload_field(path, report)
+def _sent(service: RemoteService, source: FieldSource, report: Report) -> str:
+    with _named(source.named):
+        return service.upload_field(source, report)
 
 
 @contextmanager

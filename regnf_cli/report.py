@@ -29,6 +29,7 @@ def show_result(document: dict[str, Any]) -> None:
         _line("", detail)
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
+    _show_warnings(document.get("fields") or {})
     transform = document["T_object_scene"]
     out.print("T_object_scene (scene coordinates to object coordinates)")
     for row in transform["matrix"]:
@@ -65,6 +66,13 @@ def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     if symmetry["continuous"]:
         return f"any rotation{about}" + (", and upside down" if order > 1 else "")
     return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"
+
+
+def _show_warnings(fields: dict[str, Any]) -> None:
+    """What the imports of scene and object have warned of."""
+    for name in ("scene", "object"):
+        for warning in (fields.get(name) or {}).get("warnings") or ():
+            _line("warning", f"{name}: {warning}")
 
 
 def _show_uncertainty(sigmas: dict[str, Any] | None) -> None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.field_files import stored_bounds
+from regnf_core.field_source import FieldSource
 
 if TYPE_CHECKING:
-    from regnf_core.fields.base import SdfField
+    from regnf_core.loading import LoadedField
 
 
 def check_box_by_header(scene: Path, box: Detection, obj: Path | None = None) -> None:
@@ -23,14 +24,14 @@ def check_box_by_header(scene: Path, box: Detection, obj: Path | None = None) ->
         _require_in(scene, box, bounds, None if obj is None else stored_bounds(obj))
 
 
-def open_scene(path: Path, box: Detection) -> SdfField:
+def open_scene(source: FieldSource, box: Detection) -> LoadedField:
     """The scene's field, refused as above by the bounds that only its import told."""
     from regnf_core.loading import load_field
 
-    field = load_field(path)
-    lower, upper = field.bounds.tolist()
-    _require_in(path, box, (lower, upper), None)
-    return field
+    loaded = load_field(source)
+    lower, upper = loaded.field.bounds.tolist()
+    _require_in(source.named, box, (lower, upper), None)
+    return loaded
 
 
 def _require_in(path: Path, box: Detection, scene: Bounds, obj: Bounds | None) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from regnf_cli.console import out, phase_progress
 from regnf_cli.extras import require
+from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
 from regnf_cli.output import prepare, write_into
 from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT, library_path
 from regnf_cli.report import exit_code, show_ranking, show_result
@@ -18,15 +19,21 @@ from regnf_cli.request_files import read_detection, read_options
 from regnf_cli.scene_file import check_box_by_header, open_scene
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, NoSurfaceError
+from regnf_core.field_files import checkpoint_below
+from regnf_core.field_source import FieldSource
 from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.options import RegistrationOptions
+
+if TYPE_CHECKING:
+    from regnf_core.fields.base import SdfField
 
 _MOST = 512
 
 
 def search(
     scene: Annotated[
-        Path, typer.Argument(help="The scene's field: safe field, checkpoint or mesh.", **FIELD | {"metavar": "SCENE"})
+        Path,
+        typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
     ],
     library: Annotated[
         list[Path],
@@ -40,6 +47,19 @@ def search(
     ] = None,
     top: Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")] = 5,
     options: Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)] = None,
+    scene_config: Annotated[
+        Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **CONFIG)
+    ] = None,
+    object_config: Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)] = None,
+    no_config: Annotated[
+        bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")
+    ] = False,
+    scene_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
+    ] = None,
+    object_description: Annotated[
+        dict[str, Any] | None, typer.Option(help="The same of every object.", **DESCRIPTION)
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1)] = 0,
     output: Annotated[
         Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", **OUTPUT)
@@ -72,17 +92,19 @@ def search(
         message = f"{options}: only the preset robust searches a library"
         hint = "Leave the preset out of the options."
         raise InvalidInputError(message, reason="LIBRARY_SEARCH_UNSUPPORTED", hint=hint)
-    check_box_by_header(scene, box)
-    objects = library_files(library)
+    place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
+    check_box_by_header(place.file, box)
+    settings = choice_of(object_config, no_config)
+    objects = [source_of(path, object_description, settings, "object") for path in library_files(library)]
     if server is not None:
         from regnf_cli.remote import RemoteService
         from regnf_cli.remote_exchange import Delivery, search_remotely
 
         service = RemoteService(server, token, worker_timeout)
-        document = search_remotely(service, scene, objects, request, Delivery(output, cancel_on_interrupt))
+        document = search_remotely(service, place, objects, request, Delivery(output, cancel_on_interrupt))
     else:
         require("engine")
-        document = _search_here(scene, objects, box, request, output)
+        document = _search_here(place, objects, box, request, output)
     if as_json:
         out.print_json(json.dumps(document))
     else:
@@ -98,7 +120,7 @@ def library_files(named: list[Path]) -> list[Path]:
     """
     files: dict[Path, Path] = {}
     for path in named:
-        for file in sorted(filter(_looks_like_a_field, path.iterdir())) if path.is_dir() else [path]:
+        for file in _fields_in(path) if path.is_dir() else [path]:
             files.setdefault(file.resolve(), file)
     if not files:
         message = f"{', '.join(map(str, named))}: no fields in it, expected safe fields, checkpoints or meshes"
@@ -109,6 +131,12 @@ def library_files(named: list[Path]) -> list[Path]:
     return list(files.values())
 
 
+def _fields_in(folder: Path) -> list[Path]:
+    """The fields that lie in a folder; the folder itself where it has none and is a training run's."""
+    found = sorted(filter(_looks_like_a_field, folder.iterdir()))
+    return found if found or checkpoint_below(folder) is None else [folder]
+
+
 def _looks_like_a_field(path: Path) -> bool:
     if not path.is_file():
         return False
@@ -116,13 +144,19 @@ def _looks_like_a_field(path: Path) -> bool:
         return sniff_format(file.read(HEAD_BYTES)) is not None
 
 
+def _field_of(source: FieldSource) -> SdfField:
+    from regnf_core.loading import load_field
+
+    return load_field(source).field
+
+
 def _search_here(
-    scene: Path, objects: list[Path], detection: Detection, request: dict[str, Any], output: Path | None
+    scene: FieldSource, objects: list[FieldSource], detection: Detection, request: dict[str, Any], output: Path | None
 ) -> dict[str, Any]:
     from regnf_cli.object_models import object_model
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import LibraryObject, search_library
-    from regnf_core.loading import load_field
+    from regnf_core.loading import safe_field
     from regnf_core.viewing import ranking_document, result_document
 
     options = RegistrationOptions.from_dict(request["options"])
@@ -131,17 +165,19 @@ def _search_here(
     library, unusable = [], {}
     with phase_progress() as bar:
         task = bar.add_task("library", total=1.0)
-        scene_field = open_scene(scene, detection)
-        for taken, path in enumerate(objects):
+        opened = open_scene(scene, detection)
+        for taken, one in enumerate(objects):
             bar.update(task, completed=taken / len(objects))
             try:
-                library.append(LibraryObject(str(path), partial(load_field, path), object_model(path, options.robust)))
+                model = object_model(one, options.robust)
             except NoSurfaceError as error:
-                unusable[str(path)] = error.reason
+                unusable[str(one.named)] = error.reason
+            else:
+                library.append(LibraryObject(str(one.named), partial(_field_of, one), model))
         if not library:
             raise NoSurfaceError("none of the files is usable as an object", reason="NO_SURFACE_IN_OBJECT")
         found = search_library(
-            scene_field,
+            opened.field,
             box,
             library,
             options,
@@ -149,8 +185,10 @@ def _search_here(
             lambda phase, share: bar.update(task, description=phase, completed=share),
         )
         bar.update(task, description="exporting", completed=1.0)
+    winner = next(one for one in objects if str(one.named) == found.ranking[0].name)
     said: dict[str, Any] = {
         "object_name": found.ranking[0].name,
+        "fields": {"scene": opened.notes, "object": safe_field(winner).notes},
         "candidates": ranking_document(found.ranking, unusable),
     }
     write_into(output, found.result, **said)

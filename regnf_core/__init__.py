@@ -2,7 +2,7 @@
 
     from regnf_core import OrientedBox, RegistrationOptions, open_field, register
 
-    result = register(open_field("room.safetensors"), open_field("chair.safetensors"),
+    result = register(open_field("outputs/room/neus/run/"), open_field("chair.ply"),
                       OrientedBox.from_corners([-0.4, -0.3, 0.0], [0.1, 0.2, 0.4]))
     result.T_object_scene.matrix()   # (4, 4): scene coordinates to object coordinates
 
@@ -19,14 +19,15 @@ from regnf_core.version import __version__
 if TYPE_CHECKING:
     from regnf_core.errors import RegnfError
     from regnf_core.fields.base import SdfField
-    from regnf_core.fields.build import open_field
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
+    from regnf_core.loading import FieldWarning, open_field
     from regnf_core.options import RegistrationOptions
     from regnf_core.registration import WarmStart, register
     from regnf_core.result import RegistrationResult
 
 _HOMES = {
+    "FieldWarning": "regnf_core.loading",
     "OrientedBox": "regnf_core.geometry.box",
     "RegistrationOptions": "regnf_core.options",
     "RegistrationResult": "regnf_core.result",
@@ -34,11 +35,12 @@ _HOMES = {
     "SdfField": "regnf_core.fields.base",
     "Sim3": "regnf_core.geometry.sim3",
     "WarmStart": "regnf_core.robust.pipeline",
-    "open_field": "regnf_core.fields.build",
+    "open_field": "regnf_core.loading",
     "register": "regnf_core.registration",
 }
 
 __all__ = [
+    "FieldWarning",
     "OrientedBox",
     "RegistrationOptions",
     "RegistrationResult",

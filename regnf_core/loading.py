@@ -1,77 +1,88 @@
-"""Open whatever file a user has as a field: a safe field, or anything that the import gate takes."""
+"""Open whatever a user has as a field: a safe field, or anything that the import gate takes, with its settings."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core import __version__
-from regnf_core.errors import FieldFormatError
-from regnf_core.field_files import require_field_file
+from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.field_notes import NO_NOTES, FieldNotes
+from regnf_core.field_source import FieldSource, SettingsChoice, find_source, naming
+from regnf_core.files import atomic_path
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
 
-_READ_BYTES = 1 << 20
+
+class FieldWarning(UserWarning):
+    """A field was opened, and its import has warned of something."""
 
 
-def load_field(
-    path: str | Path, description: dict[str, Any] | None = None, device: str = "cpu", cache_dir: Path | None = None
+@dataclass(frozen=True)
+class SafeField:
+    """A safe field's file, and what its import said."""
+
+    path: Path
+    notes: FieldNotes
+
+
+@dataclass(frozen=True)
+class LoadedField:
+    """A field ready to be evaluated, and what its import said."""
+
+    field: SdfField
+    notes: FieldNotes
+
+
+def open_field(
+    path: str | Path,
+    description: Mapping[str, Any] | None = None,
+    settings: SettingsChoice = None,
+    device: str = "cpu",
+    cache_dir: Path | None = None,
 ) -> SdfField:
-    """The field in a file, on ``device``.
+    """The field in a file, a training run's folder or an archive of one, on ``device``.
 
-    A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``
-    under the file's SHA-256. ``description`` says what the file does not carry, see UploadDescription.
+    A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``.
+    ``description`` says what the file does not carry, see UploadDescription. ``settings`` names the trainer's settings:
+    a file, or an archive of several; None takes those beside the checkpoint, False none. A warning of the import is
+    issued as a FieldWarning.
 
     Raises FieldFormatError (with the gate's reason) and InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER), which name
-    the file and, for the folder of a training run, the checkpoint that was meant.
+    the file.
     """
-    from regnf_core.fields.build import open_field
+    loaded = load_field(find_source(Path(path), description, settings), device, cache_dir)
+    for warning in loaded.notes.warnings:
+        warnings.warn(f"{path}: {warning}", FieldWarning, stacklevel=2)
+    return loaded.field
 
-    safe = safe_field_path(Path(path), description, cache_dir)
-    with naming(Path(path)):
-        return open_field(safe, device)
+
+def load_field(source: FieldSource, device: str = "cpu", cache_dir: Path | None = None) -> LoadedField:
+    """The field, and what its import said. Raises as ``open_field`` does."""
+    from regnf_core.fields.build import open_field as open_safe_field
+
+    safe = safe_field(source, cache_dir)
+    with naming(source.file):
+        return LoadedField(open_safe_field(safe.path, device), safe.notes)
 
 
-def safe_field_path(path: Path, description: dict[str, Any] | None = None, cache_dir: Path | None = None) -> Path:
-    """The safe field for a file: the file itself when it is one already, else what the import gate made of it.
+def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
+    """The safe field for a source: the file itself when it is one already, else what the import gate made of it.
 
     Raises FieldFormatError and InvalidInputError naming the file.
     """
-    require_field_file(path)
-    with naming(path):
-        return _safe_field_path(path, description, cache_dir)
-
-
-@contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Errors about the file's content begin with its name."""
-    try:
-        yield
-    except FieldFormatError as error:
-        if str(error).startswith(str(path)):
-            raise
-        raise FieldFormatError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
-
-
-def _safe_field_path(path: Path, description: dict[str, Any] | None, cache_dir: Path | None) -> Path:
-    from regnf_core.schema.safe_format import read_description
-
-    if path.suffix.lower() == ".safetensors":
-        try:
-            read_description(path)
-        except FieldFormatError:
-            if description is None:
-                raise
-        else:
-            if not description:
-                return path
-    return _imported(path, description, cache_dir or default_cache_dir())
+    with naming(source.file):
+        if _is_safe_field(source):
+            return SafeField(source.file, NO_NOTES)
+        return _imported(source, cache_dir or default_cache_dir())
 
 
 def default_cache_dir() -> Path:
@@ -80,18 +91,53 @@ def default_cache_dir() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "regnf" / "fields"
 
 
-def _imported(path: Path, description: dict[str, Any] | None, cache_dir: Path) -> Path:
-    from regnf_core.importing.gate.gate import ImportLimits, import_field
+def _is_safe_field(source: FieldSource) -> bool:
+    """Whether the file can be opened as it is. Raises FieldFormatError: it only looks like a safe field."""
+    from regnf_core.schema.safe_format import read_description
 
-    key = hashlib.sha256(repr((__version__, sorted((description or {}).items()))).encode())
-    with path.open("rb") as file:
-        while block := file.read(_READ_BYTES):
-            key.update(block)
-    kept = cache_dir / f"{key.hexdigest()}.safetensors"
-    if kept.exists():
-        return kept
+    if source.file.suffix.lower() != ".safetensors" or source.description or source.settings:
+        return False
+    read_description(source.file)
+    return True
+
+
+def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
+    from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+
+    name = _digest(source)
+    kept, report = cache_dir / f"{name}.safetensors", cache_dir / f"{name}.json"
+    if kept.exists() and (notes := _read_notes(report)) is not None:
+        return SafeField(kept, notes)
     cache_dir.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=cache_dir) as folder:
-        import_field(path, Path(folder), description, ImportLimits())
-        os.replace(Path(folder) / "field.safetensors", kept)
-    return kept
+    with tempfile.TemporaryDirectory(dir=cache_dir) as folder, source.packed_settings() as settings:
+        said = source.description or None
+        made = import_field(source.file, Path(folder), said, ImportLimits(), settings=settings)
+        notes = notes_of(source, made.to_dict())
+        with atomic_path(report) as path:
+            path.write_text(json.dumps(notes.to_dict()), encoding="utf-8")
+        os.replace(Path(folder) / FIELD_NAME, kept)
+    return SafeField(kept, notes)
+
+
+def notes_of(source: FieldSource, report: Mapping[str, Any]) -> FieldNotes:
+    """What the import of a source said. Where it does not name the settings that it used, those that it was given."""
+    notes = FieldNotes.of_report(report)
+    return notes if notes.settings else replace(notes, settings=tuple(source.settings_names))
+
+
+def _read_notes(path: Path) -> FieldNotes | None:
+    try:
+        return FieldNotes.of_report(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, AttributeError):
+        return None
+
+
+def _digest(source: FieldSource) -> str:
+    """Of all that the import depends on: the release, what was said, the settings' files and the file itself."""
+    said = json.dumps(source.description, sort_keys=True, default=repr)
+    digest = hashlib.sha256(f"{__version__} {ENGINE_REVISION} {said}".encode())
+    for path in (*source.settings, source.file):
+        with path.open("rb") as file:
+            digest.update(f" {path.name} ".encode(errors="surrogateescape"))
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()

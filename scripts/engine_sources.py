@@ -16,8 +16,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from regnf_core import open_field, register
+from regnf_core import register
 from regnf_core.batch import register_batch
+from regnf_core.fields.build import open_field
 from regnf_core.library import search_library
 
 ENTRIES = tuple(function.__module__ for function in (open_field, register, register_batch, search_library))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import Tensor
 
+from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.geometry.symmetry import Symmetries
@@ -37,10 +39,11 @@ def write_artifacts(
     symmetries: Symmetries | None = None,
     object_name: str | None = None,
     candidates: list[dict[str, Any]] | None = None,
+    fields: Mapping[str, FieldNotes] | None = None,
 ) -> list[str]:
     """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
 
-    ``truth``, ``symmetries``, ``object_name`` and ``candidates`` are for the result document.
+    ``truth``, ``symmetries``, ``object_name``, ``candidates`` and ``fields`` are for the result document.
 
     scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
     source), context_points.ply (the scene around the detection, if the result has it), residuals.npz,
@@ -61,7 +64,8 @@ def write_artifacts(
     np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
     registration_picture(result).save(directory / "preview.png")
     device = scene.points.device
-    document = result_document(result, truth, symmetries, device, object_name=object_name, candidates=candidates)
+    said: dict[str, Any] = {"object_name": object_name, "candidates": candidates, "fields": fields}
+    document = result_document(result, truth, symmetries, device, **said)
     _write_json(directory / "result.json", document)
     return names
 

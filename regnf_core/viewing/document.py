@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
@@ -31,11 +32,13 @@ def result_document(
     *,
     object_name: str | None = None,
     candidates: list[dict[str, Any]] | None = None,
+    fields: Mapping[str, FieldNotes] | None = None,
 ) -> dict[str, Any]:
     """Plain JSON values of the result; with ``truth``, a T_object_scene, the metrics hold the errors against it.
 
     ``symmetries`` are the object's: rotation error and MSSD are the smallest over them. ``device``: of the computation.
     ``object_name``: the object that was registered. ``candidates``: of :func:`ranking_document`, after a search.
+    ``fields``: what is known of the imports of scene and object, by these names.
     """
     metrics = dict(result.metrics)
     if truth is not None:
@@ -54,6 +57,7 @@ def result_document(
         "metrics": {name: _json_number(value) for name, value in metrics.items()},
         "object": object_name,
         "candidates": candidates,
+        "fields": None if fields is None else {name: notes.to_dict() for name, notes in fields.items()},
         "seed": result.seed,
         "options": result.options,
         "engine": {

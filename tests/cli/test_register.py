@@ -13,7 +13,9 @@ import torch
 from regnf_cli.report import symmetry_in_words
 from regnf_cli.request_files import read_options
 from regnf_core.errors import InvalidOptionsError
+from regnf_core.field_notes import NO_NOTES
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.loading import LoadedField
 from regnf_core.verdicts import VERDICT_REASONS
 from tests.cli.conftest import DATA, Run
 from tests.core.analytic import chair, chair_box, chair_pose, room
@@ -27,7 +29,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     fields = {"room.safetensors": room(truth), "chair.safetensors": chair()}
     for name in fields:
         (tmp_path / name).write_bytes(bytes(8) + b"{")
-    monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
+    monkeypatch.setattr("regnf_core.loading.load_field", lambda one: LoadedField(fields[one.file.name], NO_NOTES))
     box = chair_box(truth)
     (tmp_path / "box.json").write_text(json.dumps({"center": box.center.tolist(), "size": box.size.tolist()}))
     (tmp_path / "truth.json").write_text(json.dumps({"T_object_scene": truth.matrix().tolist()}))
@@ -42,7 +44,7 @@ def symmetric(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     fields = {"room.safetensors": table_room(truth), "table.safetensors": slab_table()}
     for name in fields:
         (tmp_path / name).write_bytes(bytes(8) + b"{")
-    monkeypatch.setattr("regnf_core.loading.load_field", lambda path: fields[path.name])
+    monkeypatch.setattr("regnf_core.loading.load_field", lambda one: LoadedField(fields[one.file.name], NO_NOTES))
     (tmp_path / "box.json").write_text('{"min": [-0.48, -0.33, -0.03], "max": [0.48, 0.33, 0.49]}')
     return ["register", *(tmp_path / name for name in fields), "--detection", tmp_path / "box.json"]
 

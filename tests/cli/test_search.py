@@ -15,6 +15,7 @@ from regnf_cli.object_models import object_model
 from regnf_cli.report import show_ranking
 from regnf_cli.search import library_files
 from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_core.field_source import find_source
 from regnf_core.options import RobustOptions
 from tests.cli.conftest import DATA, Answer, Run, Serve
 
@@ -42,26 +43,26 @@ def test_the_right_chair_comes_first(run: Run, tmp_path: Path) -> None:
 
 def test_a_model_of_an_older_engine_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "cache" / "regnf" / "object-models"
-    object_model(CHAIRS[0], RobustOptions())
+    object_model(find_source(CHAIRS[0]), RobustOptions())
     (kept,) = folder.iterdir()
     kept.write_bytes(b"of an older engine")
     monkeypatch.setattr(object_models, "ENGINE_REVISION", object_models.ENGINE_REVISION + 1)
-    object_model(CHAIRS[0], RobustOptions())
+    object_model(find_source(CHAIRS[0]), RobustOptions())
     assert kept.read_bytes() == b"of an older engine"
     assert len(list(folder.iterdir())) == 2
 
 
 def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) -> None:
-    first = object_model(CHAIRS[0], RobustOptions())
+    first = object_model(find_source(CHAIRS[0]), RobustOptions())
     (kept,) = (tmp_path / "cache" / "regnf" / "object-models").iterdir()
-    again = object_model(CHAIRS[0], RobustOptions())
+    again = object_model(find_source(CHAIRS[0]), RobustOptions())
     assert first.samples.points.equal(again.samples.points)
     half = kept.read_bytes()[:100]
     kept.unlink()  # rather than shortened in place: what was read from it is mapped
     kept.write_bytes(half)
-    assert object_model(CHAIRS[0], RobustOptions()).samples.points.equal(first.samples.points)
+    assert object_model(find_source(CHAIRS[0]), RobustOptions()).samples.points.equal(first.samples.points)
     assert kept.stat().st_size > 100
-    few = object_model(CHAIRS[0], RobustOptions(object_samples=300))
+    few = object_model(find_source(CHAIRS[0]), RobustOptions(object_samples=300))
     assert len(few.samples) < len(first.samples)
     assert list(kept.parent.iterdir()) == [kept]
 
@@ -69,7 +70,7 @@ def test_a_model_is_kept_and_made_again_when_it_does_not_read(tmp_path: Path) ->
 def test_a_file_that_is_no_field_is_named(tmp_path: Path) -> None:
     (tmp_path / "chair.safetensors").write_bytes(b"\x10\0\0\0\0\0\0\0{")
     with pytest.raises(FieldFormatError, match=r"chair\.safetensors: "):
-        object_model(tmp_path / "chair.safetensors", RobustOptions())
+        object_model(find_source(tmp_path / "chair.safetensors"), RobustOptions())
 
 
 def test_a_library_is_the_fields_of_its_folders_each_once(tmp_path: Path) -> None:

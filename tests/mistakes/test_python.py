@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core import OrientedBox, RegistrationOptions, RegnfError, register
-from regnf_core.loading import load_field
+from regnf_core import OrientedBox, RegistrationOptions, RegnfError, open_field, register
 from tests.core.analytic import chair, chair_pose, room
 from tests.mistakes.case import Case, parametrized
 
@@ -19,9 +18,9 @@ def registered(box: object) -> Callable[[], object]:
 
 
 CASES = [
-    Case("field missing", "FILE_NOT_FOUND", 0, "rom.safetensors", "no such file", "Did you mean room.safetensors", lambda: load_field("rom.safetensors")),
-    Case("folder of a run", "FILE_IS_FOLDER", 0, "run", "expected a file", "step-000030000.ckpt", lambda: load_field(Path("run"))),
-    Case("config of a run", "FORMAT_NOT_RECOGNIZED", 0, "config.yml", "expected a field", "step-000030000.ckpt", lambda: load_field("run/config.yml")),
+    Case("field missing", "FILE_NOT_FOUND", 0, "rom.safetensors", "no such file", "Did you mean room.safetensors", lambda: open_field("rom.safetensors")),
+    Case("folder of no run", "RUN_WITHOUT_CHECKPOINT", 0, "nothing", "checkpoint", "Give the folder of one training run", lambda: open_field(Path("nothing"))),
+    Case("config of a run", "FORMAT_NOT_RECOGNIZED", 0, "config.yml", "expected a field", "step-000030000.ckpt", lambda: open_field("run/config.yml")),
     Case("box without a size", "INVALID_DETECTION", 0, "detection.size", "is missing", '"min"', registered({"center": [0, 0, 0]})),
     Case("misspelled member", "INVALID_DETECTION", 0, "detection.cnter", "not a member", "Did you mean `center`", registered({"cnter": [0, 0, 0], "size": [1, 1, 1]})),
     Case("quaternion of unknown order", "INVALID_DETECTION", 0, "detection.rotation", "unknown order", "xyzw.*wxyz", registered({"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [0, 0, 0, 1]})),

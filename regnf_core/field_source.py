@@ -1,0 +1,113 @@
+"""What a user means by a field: a file, a training run's folder or an archive, with what is said about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.field_files import require_field_file, require_file
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
+from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
+from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
+
+Role = Literal["scene", "object"]
+SettingsChoice = str | Path | bool | None
+"""A file of settings or an archive of them; None or True: those that lie beside the checkpoint; False: none."""
+_WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, "safetensors", "zip", "tar", "gzip", "bzip2", "xz"})
+"""Formats that no trainer's settings say anything about, and archives, which have their own."""
+_WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "sqlite", "onnx"})
+"""Formats whose files say which side of the surface is free; of the others the use decides."""
+
+
+@dataclass(frozen=True)
+class FieldSource:
+    """named: the path as the user gave it · file: what the gate reads · run: the settings found beside it · config: the
+    file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it will be
+    used as, where that decides something and the user has not said it."""
+
+    named: Path
+    file: Path
+    run: Run | None = None
+    config: Path | None = None
+    said: Mapping[str, Any] = field(default_factory=dict)
+    role: Role | None = None
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What the gate is told."""
+        return dict(self.said) if self.role is None else {**self.said, "as": self.role}
+
+    @property
+    def settings(self) -> tuple[Path, ...]:
+        """The files of settings that go with the field."""
+        if self.config is not None:
+            return (self.config,)
+        return () if self.run is None else self.run.settings
+
+    @property
+    def settings_names(self) -> list[str]:
+        """The same as a person finds them again: by their places in the run's folder."""
+        if self.config is not None:
+            return [str(self.config)]
+        return [] if self.run is None else [str(path.relative_to(self.run.folder)) for path in self.run.settings]
+
+    @contextmanager
+    def packed_settings(self) -> Iterator[Path | None]:
+        """All settings in one file, which stays for as long as the context; None where there are none."""
+        if self.config is not None or self.run is None or not self.run.settings:
+            yield self.config
+            return
+        with TemporaryDirectory(prefix="settings-") as folder:
+            yield pack_settings(self.run, Path(folder))
+
+
+def find_source(
+    path: Path,
+    description: Mapping[str, Any] | None = None,
+    settings: SettingsChoice = None,
+    role: Role | None = None,
+) -> FieldSource:
+    """What a path stands for. role: what the field will be used as.
+
+    Raises InvalidInputError (FILE_NOT_FOUND) and FieldFormatError naming the path: what ``find_run`` does of a folder.
+    """
+    run, file, config = None, path, None
+    if path.is_dir():
+        with naming(path):
+            run = find_run(path)
+        file = run.checkpoint
+    require_field_file(file)
+    format_ = format_of(file)
+    if isinstance(settings, str | Path):
+        run, config = None, Path(settings)
+        require_file(config)
+    elif settings is False:
+        run = None
+    elif run is None and format_ not in _WITHOUT_SETTINGS:
+        with naming(path):
+            run = settings_beside(file)
+    said = dict(description or {})
+    decides = "as" not in said and format_ not in _WITHOUT_ROLE
+    return FieldSource(path, file, run, config, said, role if decides else None)
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Errors about the file's content begin with its name."""
+    try:
+        yield
+    except FieldFormatError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise FieldFormatError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
+
+
+def format_of(file: Path) -> str | None:
+    """What a file seems to be, from its first bytes."""
+    with file.open("rb") as opened:
+        return sniff_format(opened.read(HEAD_BYTES))

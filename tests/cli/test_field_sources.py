@@ -1,0 +1,204 @@
+"""What the commands take for a field: a file, a run's folder, settings, descriptions; and the warnings of imports."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tarfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import trimesh
+
+from regnf_core import FieldWarning, open_field
+from regnf_core.importing.gate.report import ImportReport
+from tests.cli.conftest import DATA, Run
+from tests.devdata import dev_data
+
+WARNING = "TRUNCATION_ASSUMED: taken for 8 voxels"
+
+
+def contents(settings: Path | None) -> bytes | None:
+    """Of a file of settings, or of all in an archive of them."""
+    if settings is None or not tarfile.is_tarfile(settings):
+        return None if settings is None else settings.read_bytes()
+    with tarfile.open(settings) as archive:
+        return b"".join(archive.extractfile(member).read() for member in archive)  # type: ignore[union-attr]
+
+
+@dataclass
+class Gate:
+    """Stands in for the import gate: what it was given, and the demo's armchair as every field."""
+
+    asked: list[dict[str, Any]] = field(default_factory=list)
+
+    def import_field(
+        self,
+        upload: Path,
+        out_dir: Path,
+        description: dict[str, Any] | None = None,
+        limits: object = None,
+        picture: bool = False,
+        settings: Path | None = None,
+    ) -> ImportReport:
+        self.asked.append({"file": upload.name, "description": description, "settings": contents(settings)})
+        name = "mix-room" if "room" in upload.name else "armchair"
+        shutil.copy(DATA / f"{name}.safetensors", out_dir / "field.safetensors")
+        return ImportReport("deepsdf", "sdf", (), ((0, 0, 0), (1, 1, 1)), 1, {}, (WARNING,), None, 1, 0.1, 0.1, 1, {})
+
+
+@pytest.fixture
+def gate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Gate:
+    made = Gate()
+    monkeypatch.setattr("regnf_core.importing.gate.gate.import_field", made.import_field)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return made
+
+
+@pytest.fixture
+def run_folder(tmp_path: Path) -> Path:
+    """A training run: its settings, and checkpoints of two steps."""
+    models = tmp_path / "outputs" / "room" / "sdfstudio_models"
+    models.mkdir(parents=True)
+    (models.parent / "config.yml").write_text("method: neus\n")
+    for step in (10, 30):
+        torch.save({"step": step}, models / f"step-{step:09d}.ckpt")
+    return models.parent
+
+
+def opened(path: Path, **how: Any) -> None:
+    with pytest.warns(FieldWarning, match="TRUNCATION_ASSUMED"):
+        assert open_field(path, **how).bounds.shape == (2, 3)
+
+
+def test_a_runs_folder_is_its_latest_checkpoint_with_its_settings(gate: Gate, run_folder: Path) -> None:
+    opened(run_folder)
+    opened(run_folder / "sdfstudio_models" / "step-000000010.ckpt")
+    wanted = {"description": None, "settings": b"method: neus\n"}
+    assert gate.asked == [{"file": f"step-{step:09d}.ckpt"} | wanted for step in (30, 10)]
+
+
+def test_what_was_imported_is_kept_for_the_same_file_settings_and_description(gate: Gate, run_folder: Path) -> None:
+    for _ in range(2):
+        opened(run_folder)
+    assert len(gate.asked) == 1
+    opened(run_folder, settings=False)
+    opened(run_folder, description={"sign": -1})
+    (run_folder / "config.yml").write_text("method: neus-facto\n")
+    opened(run_folder)
+    other = run_folder.parent / "other.yml"
+    other.write_text("method: neus-facto\n")
+    opened(run_folder, settings=other)
+    assert [(one["description"], one["settings"]) for one in gate.asked[1:]] == [
+        (None, None),
+        ({"sign": -1}, b"method: neus\n"),
+        (None, b"method: neus-facto\n"),
+        (None, b"method: neus-facto\n"),
+    ]
+
+
+def test_the_warnings_of_a_field_that_was_kept_whose_notes_are_damaged_are_found_again(
+    gate: Gate, run_folder: Path, tmp_path: Path
+) -> None:
+    opened(run_folder)
+    (notes,) = (tmp_path / "cache" / "regnf" / "fields").glob("*.json")
+    notes.write_text("[")
+    opened(run_folder)
+    assert len(gate.asked) == 2
+
+
+def registration(room: Path, chair: Path, *more: object) -> list[object]:
+    return ["register", room, chair, "--detection", DATA / "detection.json", *more]
+
+
+def test_what_is_asked_decides_where_the_file_does_not(gate: Gate, run: Run, tmp_path: Path) -> None:
+    for name in ("room", "chair"):
+        trimesh.creation.box().export(tmp_path / f"{name}.ply")
+    outcome = run(*registration(tmp_path / "room.ply", tmp_path / "chair.ply"))
+    assert outcome.code == 0, outcome.stderr
+    assert [one["description"] for one in gate.asked] == [{"as": "scene"}, {"as": "object"}]
+    run(*registration(tmp_path / "room.ply", tmp_path / "chair.ply", "--object-description", '{"as": "scene"}'))
+    assert gate.asked[2:] == [{"file": "chair.ply", "description": {"as": "scene"}, "settings": None}]
+
+
+def test_a_result_repeats_what_the_imports_warned_of(gate: Gate, run: Run, run_folder: Path, tmp_path: Path) -> None:
+    (run_folder / "sdfstudio_models" / "room.ckpt").write_bytes(
+        (run_folder / "sdfstudio_models" / "step-000000030.ckpt").read_bytes()
+    )
+    room = run_folder / "sdfstudio_models" / "room.ckpt"
+    outcome = run(*registration(room, DATA / "armchair.safetensors", "--output", tmp_path / "out"))
+    assert outcome.code == 0, outcome.stderr
+    assert "settings: " in outcome.stderr
+    assert "config.yml" in outcome.stderr
+    assert f"warning      scene: {WARNING}\n" in outcome.stdout
+    fields = json.loads((tmp_path / "out" / "result.json").read_text())["fields"]
+    assert (fields["scene"]["warnings"], fields["scene"]["family"]) == ([WARNING], "deepsdf")
+    assert fields["scene"]["settings"][0].endswith("config.yml")
+    assert fields["object"] == {"family": None, "settings": [], "warnings": []}
+    assert gate.asked == [{"file": "room.ckpt", "description": None, "settings": b"method: neus\n"}]
+    outcome = run(*registration(room, DATA / "armchair.safetensors", "--no-config"))
+    assert "settings: " not in outcome.stderr
+    assert gate.asked[1]["settings"] is None
+
+
+def test_a_search_repeats_them_too(gate: Gate, run: Run, run_folder: Path) -> None:
+    run_folder.joinpath("specs.yml").write_text("x: 1\n")
+    arguments = ["search", DATA / "mix-room.safetensors", run_folder, "--detection", DATA / "detection.json"]
+    outcome = run(*arguments, "--object-config", run_folder / "specs.yml", "--json")
+    assert outcome.code == 0, outcome.stderr
+    document = json.loads(outcome.stdout)
+    assert document["object"] == str(run_folder)
+    assert document["fields"]["object"]["warnings"] == [WARNING]
+    assert gate.asked == [{"file": "step-000000030.ckpt", "description": None, "settings": b"x: 1\n"}]
+
+
+def test_inspect_and_convert_take_settings_and_descriptions(
+    gate: Gate, run: Run, run_folder: Path, tmp_path: Path
+) -> None:
+    outcome = run("inspect", run_folder, "--json", "--description", '{"latent_index": 3}')
+    assert (outcome.code, json.loads(outcome.stdout)["warnings"]) == (0, [WARNING])
+    assert "settings: config.yml\n" in outcome.stderr
+    outcome = run("convert", run_folder, tmp_path / "a.ply", "--resolution", 8, "--no-config")
+    assert (outcome.code, f"warning: {WARNING}\n" in outcome.stderr) == (0, True)
+    outcome = run("convert", run_folder, tmp_path / "a.safetensors", "--config", run_folder / "config.yml")
+    assert (outcome.code, f"warning: {WARNING}\n" in outcome.stderr) == (0, True)
+    assert [(one["description"], one["settings"]) for one in gate.asked] == [
+        ({"latent_index": 3}, b"method: neus\n"),
+        (None, None),
+        (None, b"method: neus\n"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "MALFORMED_JSON"),
+        ('{"sign": 3}', "INVALID_DESCRIPTION"),
+        ('{"sing": -1}', "INVALID_DESCRIPTION"),
+        ("absent.json", "FILE_NOT_FOUND"),
+        ('{"a": ' + "[" * 100_000, "MALFORMED_JSON"),
+    ],
+)
+@pytest.mark.usefixtures("gate")
+def test_descriptions_that_are_refused(text: str, reason: str, run: Run) -> None:
+    outcome = run("inspect", DATA / "armchair.safetensors", "--description", text)
+    assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, reason)
+    assert "hint: " in outcome.stderr
+
+
+@pytest.mark.usefixtures("gate")
+def test_settings_that_are_not_there_are_refused(run: Run, run_folder: Path) -> None:
+    outcome = run("inspect", run_folder, "--config", run_folder / "absent.yml")
+    assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "FILE_NOT_FOUND")
+
+
+def test_a_real_run_is_converted(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    outcome = run("convert", dev_data("formats", "sdfstudio_neus_facto", "outputs"), tmp_path / "field.safetensors")
+    assert outcome.code == 0, outcome.stderr
+    assert "settings: " in outcome.stderr
+    assert "config.yml" in outcome.stderr
+    assert outcome.stdout.startswith(f"{tmp_path / 'field.safetensors'}: sdfstudio_neus_facto, ")
