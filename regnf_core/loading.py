@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from regnf_core import __version__
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.field_notes import NO_NOTES, FieldNotes
 from regnf_core.field_source import FieldSource, SettingsChoice, find_source, naming
 from regnf_core.files import atomic_path
+from regnf_core.version import __version__
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
