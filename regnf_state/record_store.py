@@ -104,7 +104,7 @@ class RecordStore(Protocol):
         ...
 
     def stored(self, owner: str) -> tuple[int, int]:
-        """How many fields that were not rejected an owner has, and the bytes that are kept of them.
+        """How many fields an owner has of which bytes are kept, and these bytes: few of the rejected ones.
 
         Of a ready field these are the bytes of its upload or of what the import made, whichever are more.
         """
@@ -139,6 +139,21 @@ class RecordStore(Protocol):
 
         ready and rejected are final within an attempt.
         """
+        ...
+
+    def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
+        """A field whose import has ended, to be imported anew as the next attempt, with another description.
+
+        Raises StaleAttemptError when it has changed since it was ``known``.
+        """
+        ...
+
+    def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
+        """The field as it was ``before`` that attempt, which has not begun. Raises StaleAttemptError."""
+        ...
+
+    def fields_with_original(self, owner: str) -> list[FieldRecord]:
+        """An owner's fields whose uploads are kept after their import, those whose time is over first, first."""
         ...
 
     def delete_field(self, sha256: str) -> bool: ...

@@ -117,6 +117,20 @@ class JobRecord:
         return owner_of(self.request["scene"]) if "scene" in self.request else ANONYMOUS
 
 
+ORIGINAL_UNTIL = "original_until"
+"""In a rejected field's error or a ready field's report: until when the upload itself is kept."""
+SETTINGS = "settings"
+"""In a field's description: the file of settings that came with the upload. No description has such an entry."""
+
+
+class SettingsFile(NamedTuple):
+    """A trainer's settings that came with an upload."""
+
+    name: str
+    sha256: str
+    bytes: int
+
+
 @dataclass(frozen=True)
 class FieldRecord:
     """One field. ``sha256`` is its reference: the SHA-256 of the bytes that were uploaded, and its owner's name."""
@@ -129,7 +143,7 @@ class FieldRecord:
     version: int = 1
     label: str | None = None
     description: dict[str, Any] = field(default_factory=dict)
-    """What the uploader said that the file does not: family, contraction, level mask ..."""
+    """What the uploader said that the file does not: family, level mask ...; and under SETTINGS which settings came."""
     report: dict[str, Any] = field(default_factory=dict)
     """What the import found: family, bounds, parameters, plausibility, warnings."""
     error: dict[str, Any] | None = None
@@ -148,13 +162,41 @@ class FieldRecord:
         return owner_of(self.sha256)
 
     @property
+    def said(self) -> dict[str, Any]:
+        """The description without the settings that came."""
+        return {name: value for name, value in self.description.items() if name != SETTINGS}
+
+    @property
+    def settings(self) -> SettingsFile | None:
+        """The settings that came with the upload."""
+        match self.description.get(SETTINGS):
+            case {"name": str() as name, "sha256": str() as sha256, "bytes": int() as size}:
+                return SettingsFile(name, sha256, size)
+        return None
+
+    @property
+    def original_until(self) -> float | None:
+        """Until when the upload is kept although its import has ended; None: it is not."""
+        if self.state == "validating":
+            return None
+        until = ((self.error if self.state == "rejected" else self.report) or {}).get(ORIGINAL_UNTIL)
+        return float(until) if isinstance(until, int | float) else None
+
+    @property
+    def upload_bytes(self) -> int:
+        """The upload and the settings that came with it."""
+        return self.bytes + (self.settings.bytes if self.settings is not None else 0)
+
+    @property
     def kept_bytes(self) -> int:
         """What counts towards the quota: of a ready field, its upload or what the import made of it, if that is larger.
 
-        A compressed upload may become a field a thousand times as large.
+        A compressed upload may become a field a thousand times as large. Both count where both are kept.
         """
         made = self.report.get("field_bytes") if self.state == "ready" else None
-        return max(self.bytes, made) if isinstance(made, int) else self.bytes
+        if not isinstance(made, int):
+            return self.upload_bytes
+        return self.upload_bytes + made if self.original_until is not None else max(self.bytes, made)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from redis import Redis
 
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.originals import Originals, delete_upload
 from regnf_state.records import RecordsFullError, StaleAttemptError, UnreadableRecordError
 from regnf_state.redis import counters
 from regnf_state.redis.owners import Owners
@@ -53,6 +54,7 @@ class Room:
         self._of_caller = settings.quota_finished_jobs
         self._of_all = settings.max_finished_jobs
         self._reserve = settings.redis_reserve
+        self._originals = Originals(records, blobs, settings)
 
     def make(self, owner: str) -> None:
         """Make room for one more record of this caller. Raises RecordsFullError, RedisError, OSError."""
@@ -74,10 +76,14 @@ class Room:
         return self.memory().is_below(self._reserve / 2)
 
     def tidy(self, confirm: Callable[[], None]) -> int:
-        """One round: all callers and all together within their bounds. How many jobs went."""
+        """One round: all callers and all together within their bounds, and uploads whose time is over let go.
+
+        How many jobs went.
+        """
         self._owners.find()
         evicted = 0
         for owner in self._owners.all():
+            self._originals.trim(owner)
             evicted += self._evict(owner, min(_A_ROUND, self._owners.finished(owner) - self._of_caller), confirm)
         evicted += self._evict_greediest(min(_A_ROUND, self._owners.finished() - self._of_all), confirm)
         while evicted < _A_ROUND and self.memory().is_below(self._reserve):
@@ -120,3 +126,5 @@ class Room:
             field = self._records.get_field(reference)
             if field is None or field.state == "rejected":
                 self._records.delete_field(reference)
+                if field is not None and field.original_until is not None:
+                    delete_upload(self._blobs, field)

@@ -137,6 +137,13 @@ class Settings(BaseSettings):
     """How long finished jobs and their artifacts are kept."""
     unused_field_retention_s: int | None = Field(default=None, ge=60)
     """How long a field is kept after its last use by a job. Unset: until it is deleted."""
+    keep_originals: Literal["none", "questions", "all"] = "questions"
+    """Which uploads stay for a while after their import, so that they can be imported anew with another description:
+    those that were rejected with a question, or those of ready fields too."""
+    keep_originals_s: int = Field(default=6 * 3600, ge=60)
+    """How long."""
+    keep_originals_bytes: int = Field(default=8192 * MIB, ge=0)
+    """Of each caller; beyond this the oldest go."""
     storage_cap_bytes: int | None = Field(default=None, ge=1)
     """Beyond this the oldest finished jobs and unused fields go, before their time."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")

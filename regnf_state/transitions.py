@@ -161,6 +161,35 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
     return replace(again, unknown_members=record.unknown_members)
 
 
+def reimported_field(
+    record: FieldRecord, known: FieldRecord, description: dict[str, Any], label: str | None, now: float
+) -> FieldRecord:
+    """The field to be imported anew. Raises StaleAttemptError when it is no longer as it was ``known``."""
+    _require_attempt(record, known.attempt)
+    if record.state == "validating" or record.description != known.description:
+        raise StaleAttemptError("the field has changed")
+    again = FieldRecord(
+        sha256=record.sha256,
+        state="validating",
+        bytes=record.bytes,
+        created=record.created,
+        updated=now,
+        version=record.version + 1,
+        label=label,
+        description=description,
+        attempt=record.attempt + 1,
+    )
+    return replace(again, unknown_members=record.unknown_members)
+
+
+def restored_field(record: FieldRecord, before: FieldRecord, attempt: int, now: float) -> FieldRecord:
+    """The field as it was ``before`` the attempt, whose number it keeps. Raises StaleAttemptError."""
+    _require_attempt(record, attempt)
+    if record.state != "validating":
+        raise StaleAttemptError("its import has ended")
+    return replace(before, version=record.version + 1, attempt=attempt, updated=now)
+
+
 def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> FieldRecord:
     """The field with its import started anew. Raises StaleAttemptError."""
     _require_attempt(record, attempt)

@@ -1,7 +1,8 @@
 """Where bytes live: uploads, safe fields, results. Keys are relative, '/'-separated and never leave the store.
 
 Keys in use:
-    fields/{sha256}/original               the upload, until its import has ended
+    fields/{sha256}/original               the upload, until its import has ended or as long as it is kept
+    fields/{sha256}/settings-{sha256}      the trainer's settings that came with it, for as long
     fields/{sha256}/field.safetensors      the safe field that workers open
     fields/{sha256}/object-model-{n}.safetensors   its model as an object by revision n of the engine; the first job
                                            that needs the model makes it

@@ -173,6 +173,16 @@ class JournaledRecordStore(RedisRecordStore):
         _if_possible(f"what became of field {sha256}", lambda: self.journal.keep_field(field))
         return field
 
+    def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
+        field = super().reimport_field(known, description, label)
+        self.journal.keep_field(field)
+        return field
+
+    def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
+        field = super().undo_reimport(before, attempt)
+        self.journal.keep_field(field)
+        return field
+
     def delete_field(self, sha256: str) -> bool:
         deleted = super().delete_field(sha256)
         self._redis.zrem(_USED, sha256)

@@ -23,6 +23,8 @@ _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
 _ATTEMPTS_KEPT_S = str(48 * 3600)
 """How long a deleted field's count of attempts is kept: longer than anything else that names them."""
+_LOOKED_AT = 256
+"""Of an owner's kept uploads at once; there are hardly more."""
 
 
 FIELD = Kind("field", FieldRecord)
@@ -43,6 +45,11 @@ def _rejected_key(owner: str) -> str:
     return f"{PREFIX}owner:{owner}:rejected"
 
 
+def _originals_key(owner: str) -> str:
+    """An owner's fields whose uploads are kept after their import, by the time until then."""
+    return f"{PREFIX}owner:{owner}:originals"
+
+
 def _importing_key(owner: str) -> str:
     """An owner's fields whose import has not ended."""
     return f"{_VALIDATING}:{owner}"
@@ -55,7 +62,7 @@ def _caps(record: FieldRecord, quota: Quota) -> list[Cap]:
     if quota.fields is not None:
         caps.append(("HLEN", key, 1, quota.fields, "QUOTA_FIELDS"))
     if quota.stored_bytes is not None:
-        caps.append(("HVALS", key, record.bytes, quota.stored_bytes, "QUOTA_STORED_BYTES"))
+        caps.append(("HVALS", key, record.kept_bytes, quota.stored_bytes, "QUOTA_STORED_BYTES"))
     return caps
 
 
@@ -80,13 +87,20 @@ class RedisFieldRecords(RedisRejections):
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
         ]
         indexes += more
-        rejected = _rejected_key(record.owner)
+        rejected, until = _rejected_key(record.owner), record.original_until
         if record.state == "rejected":
             indexes.append(("ZADD", rejected, repr(record.updated), record.sha256))
-            indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
         else:
             indexes.append(("ZREM", rejected, record.sha256))
+        if record.state == "rejected" and until is None:
+            indexes.append(("HDEL", _stored_key(record.owner), record.sha256))
+        else:
             indexes.append(("HSET", _stored_key(record.owner), record.sha256, str(record.kept_bytes)))
+        originals = _originals_key(record.owner)
+        if until is None:
+            indexes.append(("ZREM", originals, record.sha256))
+        else:
+            indexes.append(("ZADD", originals, repr(until), record.sha256))
         return self._compare_and_set(FIELD.key(record.sha256), expected_version, indexes, record, caps)
 
     def _change_field(self, sha256: str, change: Callable[[FieldRecord, float], FieldRecord]) -> FieldRecord:
@@ -111,6 +125,7 @@ class RedisFieldRecords(RedisRejections):
         if kind is FIELD and not error.newer:
             self._redis.srem(_VALIDATING, name)
             self._redis.hdel(_stored_key(owner_of(name)), name)
+            self._redis.zrem(_originals_key(owner_of(name)), name)
 
     def create_field(self, record: FieldRecord, quota: Quota = NO_QUOTA) -> tuple[FieldRecord, bool]:
         while True:
@@ -166,6 +181,20 @@ class RedisFieldRecords(RedisRejections):
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
+    def reimport_field(self, known: FieldRecord, description: dict[str, Any], label: str | None) -> FieldRecord:
+        return self._change_field(
+            known.sha256, lambda now_held, now: transitions.reimported_field(now_held, known, description, label, now)
+        )
+
+    def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
+        return self._change_field(
+            before.sha256, lambda known, now: transitions.restored_field(known, before, attempt, now)
+        )
+
+    def fields_with_original(self, owner: str) -> list[FieldRecord]:
+        names: Any = self._redis.zrange(_originals_key(owner), 0, _LOOKED_AT - 1)
+        return self._read_many(FIELD, [text(name) for name in names])
+
     def delete_field(self, sha256: str) -> bool:
         while True:
             known, _ = self._read(FIELD, sha256)
@@ -177,6 +206,7 @@ class RedisFieldRecords(RedisRejections):
                 *(("SREM", each, sha256) for each in (_VALIDATING, _importing_key(owner_of(sha256)))),
                 ("ZREM", _rejected_key(owner_of(sha256)), sha256),
                 ("HDEL", _stored_key(owner_of(sha256)), sha256),
+                ("ZREM", _originals_key(owner_of(sha256)), sha256),
                 ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
             ]
             if self._compare_and_set(FIELD.key(sha256), known.version, commands) == "OK":

@@ -19,7 +19,7 @@ from tests.contract.world import World, assert_refused, make_world, sha256
 LIMITS = ImportLimits(tensor_bytes=64 * MIB)
 
 
-def convert(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+def convert(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
     """What the gate's process does, without a process of its own: the gate's own tests cover that."""
     return convert_file(upload, folder, description or None, LIMITS)
 
@@ -66,5 +66,5 @@ def make_house(folder: Path, redis: Redis, good: bytes) -> House:
     scratch = folder / "scratch"
     scratch.mkdir()
     tempfile.tempdir = str(scratch)
-    world = make_world(folder / "state", redis, max_upload_bytes=256 * MIB)
+    world = make_world(folder / "state", redis, max_upload_bytes=256 * MIB, keep_originals="none")
     return House(world, Context(world.settings, world.records, world.blobs, world.queue), scratch, good)

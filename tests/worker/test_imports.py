@@ -33,9 +33,11 @@ def test_an_import_that_died_after_its_work_is_not_done_again(context: Context) 
 def test_a_field_deleted_while_it_is_imported_leaves_nothing(context: Context) -> None:
     begin_import(context)
 
-    def importer(upload: Path, folder: Path, description: dict[str, object]) -> dict[str, object]:
+    def importer(
+        upload: Path, folder: Path, description: dict[str, object], settings: Path | None
+    ) -> dict[str, object]:
         context.records.delete_field(SHA)
-        return tiny_importer(upload, folder, description)
+        return tiny_importer(upload, folder, description, settings)
 
     run_import_attempt(context, SHA, 1, "w", importer)
     assert list(context.blobs.list("")) == []
@@ -44,10 +46,12 @@ def test_a_field_deleted_while_it_is_imported_leaves_nothing(context: Context) -
 def test_an_upload_after_a_deletion_owes_nothing_to_the_import_before_it(context: Context) -> None:
     begin_import(context)
 
-    def importer(upload: Path, folder: Path, description: dict[str, object]) -> dict[str, object]:
+    def importer(
+        upload: Path, folder: Path, description: dict[str, object], settings: Path | None
+    ) -> dict[str, object]:
         context.records.delete_field(SHA)
         begin_import(context)
-        return tiny_importer(upload, folder, description)
+        return tiny_importer(upload, folder, description, settings)
 
     run_import_attempt(context, SHA, 1, "w", importer)
     settle_import(context, SHA, 1, "w", ChildExit())

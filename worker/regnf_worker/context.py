@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 from regnf_state.blobs.base import BlobStore
+from regnf_state.originals import Originals
 from regnf_state.queue import JobQueue
 from regnf_state.record_store import RecordStore
 from regnf_state.settings import Settings
@@ -23,6 +25,11 @@ class Context:
     records: RecordStore
     blobs: BlobStore
     queue: JobQueue
+
+    @cached_property
+    def originals(self) -> Originals:
+        """The uploads that stay after their import."""
+        return Originals(self.records, self.blobs, self.settings)
 
     @classmethod
     def from_settings(cls, settings: Settings, existing: bool = False) -> Context:

@@ -14,8 +14,8 @@ from regnf_core.options import RegistrationOptions
 from regnf_state.registration_request import RegistrationRequest
 
 Report = Callable[[str, float], None]
-Importer = Callable[[Path, Path, dict[str, Any]], dict[str, Any]]
-"""(upload, folder, description) -> report; writes folder/field.safetensors, and folder/preview.png if it can.
+Importer = Callable[[Path, Path, dict[str, Any], Path | None], dict[str, Any]]
+"""(upload, folder, description, settings) -> report; writes folder/field.safetensors, and folder/preview.png if it can.
 
 Raises FieldFormatError."""
 
@@ -168,7 +168,7 @@ class CoreEngine:
 def core_importer(limits: ImportLimits) -> Importer:
     """The import gate of regnf_core within ``limits``."""
 
-    def run(upload: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
-        return import_field(upload, folder, description or None, limits, picture=True).to_dict()
+    def run(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+        return import_field(upload, folder, description or None, limits, picture=True, settings=settings).to_dict()
 
     return run

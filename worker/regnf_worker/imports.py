@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,9 +17,10 @@ from rq.timeouts import JobTimeoutException
 from regnf_core.errors import RegnfError
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_state.blobs.base import StorageUnavailableError
+from regnf_state.originals import delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
 from regnf_state.problems import problem_document
-from regnf_state.records import FieldRecord, StaleAttemptError
+from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
 from regnf_worker.problems import are_files_away, fault, new_incident
@@ -33,12 +37,12 @@ def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bo
 
 
 def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
-    """Import with ``importer(upload, folder, description) -> report`` and write down how it ended.
+    """Import with ``importer(upload, folder, description, settings) -> report`` and write down how it ended.
 
-    The original is deleted before the record changes: a new upload of the same bytes finds either a validating record,
-    or one that has ended, and then stores its own original. Writes that Redis refuses for a while are waited for,
-    until the import's time is over. Raises RedisError, StorageUnavailableError when the end cannot be written down, and
-    OSError when a volume is away.
+    The original is deleted before the record changes, unless it is kept: a new upload of the same bytes finds either a
+    validating record, or one that has ended, and then stores its own original. Writes that Redis refuses for
+    a while are waited for, until the import's time is over. Raises RedisError, StorageUnavailableError when the end
+    cannot be written down, and OSError when a volume is away.
     """
     field = context.records.get_field(sha256)
     if field is None or field.attempt != attempt or field.state != "validating":
@@ -66,9 +70,11 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         logger.exception("import %s attempt %d failed, incident %s", sha256, attempt, incident)
         _refuse(context, sha256, attempt, fault(error, incident))
     else:
-        context.blobs.delete(_original(sha256))
+        ended = context.originals.keep_with(report, rejected=False)
+        if ORIGINAL_UNTIL not in ended:
+            delete_upload(context.blobs, field)
         retry_until_available(
-            f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=report)
+            f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=ended)
         )
 
 
@@ -77,16 +83,19 @@ def _refuse(context: Context, sha256: str, attempt: int, error: dict[str, Any]) 
 
 
 def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
-    """Drop everything the upload left and say why. Does nothing to a field that has moved on."""
+    """Drop everything the upload left and say why; an upload that another description may mend stays for a while.
+
+    Does nothing to a field that has moved on.
+    """
     field = context.records.get_field(sha256)
     if field is not None and field.attempt == attempt and field.state == "validating":
         context.records.remember_rejection(field, error)
-        context.blobs.delete_prefix(f"fields/{sha256}")
-        _end(context, sha256, attempt, state="rejected", error=error)
-
-
-def _original(sha256: str) -> str:
-    return f"fields/{sha256}/original"
+        ended = context.originals.keep_with(error, rejected=True)
+        if ORIGINAL_UNTIL in ended:
+            delete_all_but_upload(context.blobs, field)
+        else:
+            context.blobs.delete_prefix(f"fields/{sha256}")
+        _end(context, sha256, attempt, state="rejected", error=ended)
 
 
 def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:
@@ -122,10 +131,12 @@ def _report(sha256: str) -> str:
 def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str, Any]:
     """Import the upload. Raises StaleAttemptError, nothing stored, when the field was deleted in between."""
     sha256, description = field.sha256, field.description
-    with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(_original(sha256)) as upload:
+    with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(original_key(sha256)) as upload:
         folder = Path(temporary)
-        report: dict[str, Any] = importer(upload, folder, description)
+        with _settings(context, field) as settings:
+            report: dict[str, Any] = importer(upload, folder, field.said, settings)
         _require_current(context, field)
+        delete_all_but_upload(context.blobs, field)  # an object's model, of what the field was before
         if (folder / PICTURE_NAME).exists():
             context.blobs.put(f"fields/{sha256}/{PICTURE_NAME}", (folder / PICTURE_NAME).read_bytes())
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
@@ -134,6 +145,20 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
             writer.commit(f"fields/{sha256}/field.safetensors")
     context.blobs.put(_report(sha256), json.dumps({"description": description, "report": report}).encode())
     return report
+
+
+@contextmanager
+def _settings(context: Context, field: FieldRecord) -> Iterator[Path | None]:
+    """The settings that came with the upload, in a file of their own name; None where none came."""
+    if field.settings is None:
+        yield None
+        return
+    key = settings_key(field.sha256, field.settings.sha256)
+    with TemporaryDirectory(prefix="settings-") as temporary, context.blobs.open(key) as stored:
+        named = Path(temporary) / field.settings.name
+        with named.open("wb") as file:
+            shutil.copyfileobj(stored, file)
+        yield named
 
 
 def _require_current(context: Context, field: FieldRecord) -> None:

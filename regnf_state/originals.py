@@ -1,0 +1,115 @@
+"""Uploads that stay for a while after their import: a question of the import is then answered without a second upload.
+
+The record says until when, in its error or its report; the bytes count towards the caller's quota, and go for a new
+upload that needs their room. Of each caller so many bytes are kept at most, the latest.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from regnf_state.blobs.base import BlobStore
+from regnf_state.record_store import RecordStore
+from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, StaleAttemptError
+from regnf_state.settings import Settings
+
+QUESTIONS = frozenset(
+    {
+        "LAYOUT_AMBIGUOUS",
+        "HASH_GRID_NOT_RECOGNIZED",
+        "TRUNCATION_UNKNOWN",
+        "LATENT_MISSING",
+        "FIELD_IMPLAUSIBLE",
+        "SETTINGS_CONTRADICT_TENSORS",
+        "INVALID_DESCRIPTION",
+        "FAMILY_NOT_SUPPORTED",
+        "NO_ZERO_LEVEL",
+    }
+)
+"""Reasons of a rejection that another description of the same bytes may mend."""
+_MOST = 64
+"""Uploads of one caller."""
+logger = logging.getLogger(__name__)
+
+
+def original_key(reference: str) -> str:
+    """Where the uploaded bytes lie until the import has ended, or for as long as they are kept."""
+    return f"fields/{reference}/original"
+
+
+def settings_key(reference: str, sha256: str) -> str:
+    """Where the trainer's settings that came with them lie, for as long."""
+    return f"fields/{reference}/settings-{sha256}"
+
+
+def delete_upload(blobs: BlobStore, field: FieldRecord) -> None:
+    """Delete what was uploaded, but nothing that was made of it."""
+    blobs.delete(original_key(field.sha256))
+    if field.settings is not None:
+        blobs.delete(settings_key(field.sha256, field.settings.sha256))
+
+
+def delete_all_but_upload(blobs: BlobStore, field: FieldRecord) -> None:
+    """Delete what was made of an upload, and uploads of settings that are no longer its own."""
+    own = {original_key(field.sha256)}
+    if field.settings is not None:
+        own.add(settings_key(field.sha256, field.settings.sha256))
+    for key in list(blobs.list(f"fields/{field.sha256}")):
+        if key not in own:
+            blobs.delete(key)
+
+
+class Originals:
+    """The uploads that are kept. Any number of processes may use it at once. Methods raise RedisError, OSError."""
+
+    def __init__(self, records: RecordStore, blobs: BlobStore, settings: Settings) -> None:
+        self._records = records
+        self._blobs = blobs
+        self._choice = settings.keep_originals
+        self._kept_s = settings.keep_originals_s
+        self._most_bytes = settings.keep_originals_bytes
+
+    def keep_with(self, values: Mapping[str, Any], rejected: bool) -> dict[str, Any]:
+        """A field's error (``rejected``) or report, saying until when its upload is kept, if it is."""
+        kept = self._choice == "all" if not rejected else self._choice != "none" and values.get("reason") in QUESTIONS
+        plain = {name: value for name, value in values.items() if name != ORIGINAL_UNTIL}
+        return plain | {ORIGINAL_UNTIL: round(self._records.now() + self._kept_s, 3)} if kept else plain
+
+    def trim(self, owner: str) -> int:
+        """Let go of those whose time is over, and of the oldest beyond what is kept; how many."""
+        kept = self._kept(owner)
+        now, room, gone = self._records.now(), self._most_bytes, 0
+        for number, field in enumerate(reversed(kept)):
+            until = field.original_until or 0.0
+            room -= field.upload_bytes
+            if until <= now or room < 0 or number >= _MOST:
+                gone += self._drop(field)
+        return gone
+
+    def free(self, owner: str) -> bool:
+        """Let go of an owner's oldest; False when there is none."""
+        return any(self._drop(field) for field in self._kept(owner))
+
+    def bytes_of(self, owner: str) -> int:
+        """How many bytes an owner's kept uploads have: room that a new upload can have."""
+        return sum(field.upload_bytes for field in self._kept(owner))
+
+    def _kept(self, owner: str) -> list[FieldRecord]:
+        """Those whose time is over first, first."""
+        return self._records.fields_with_original(owner)
+
+    def _drop(self, field: FieldRecord) -> bool:
+        """The record first: what it says is kept is there. An upload of the same bytes in between keeps its own."""
+        holder, said = ("error", field.error) if field.state == "rejected" else ("report", field.report)
+        without = {name: value for name, value in (said or {}).items() if name != ORIGINAL_UNTIL}
+        try:
+            self._records.update_field(field.sha256, attempt=field.attempt, **{holder: without})
+        except StaleAttemptError:
+            return False
+        now = self._records.get_field(field.sha256)
+        if now is None or (now.attempt == field.attempt and now.state != "validating"):
+            delete_upload(self._blobs, field)
+            logger.info("the upload of field %s is no longer kept", field.sha256)
+        return True
