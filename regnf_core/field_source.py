@@ -92,8 +92,12 @@ def find_source(
         with naming(path):
             run = settings_beside(file)
     said = dict(description or {})
-    decides = "as" not in said and format_ not in _WITHOUT_ROLE
-    return FieldSource(path, file, run, config, said, role if decides else None)
+    return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"))
+
+
+def assumed_role(said: Mapping[str, Any], format_: str | None, role: Role | None) -> dict[str, Role]:
+    """The entry that a field's use adds to its description, where that decides something and it was not said."""
+    return {} if role is None or "as" in said or format_ in _WITHOUT_ROLE else {"as": role}
 
 
 @contextmanager

@@ -85,12 +85,12 @@ class Originals:
             until = field.original_until or 0.0
             room -= field.upload_bytes
             if until <= now or room < 0 or number >= _MOST:
-                gone += self._drop(field)
+                gone += self.drop(field)
         return gone
 
     def free(self, owner: str) -> bool:
         """Let go of an owner's oldest; False when there is none."""
-        return any(self._drop(field) for field in self._kept(owner))
+        return any(self.drop(field) for field in self._kept(owner))
 
     def bytes_of(self, owner: str) -> int:
         """How many bytes an owner's kept uploads have: room that a new upload can have."""
@@ -100,8 +100,10 @@ class Originals:
         """Those whose time is over first, first."""
         return self._records.fields_with_original(owner)
 
-    def _drop(self, field: FieldRecord) -> bool:
-        """The record first: what it says is kept is there. An upload of the same bytes in between keeps its own."""
+    def drop(self, field: FieldRecord) -> bool:
+        """Let go of the upload of a field whose import has ended; False when it has changed meanwhile.
+
+        The record first: what it says is kept is there. An upload of the same bytes in between keeps its own."""
         holder, said = ("error", field.error) if field.state == "rejected" else ("report", field.report)
         without = {name: value for name, value in (said or {}).items() if name != ORIGINAL_UNTIL}
         try:

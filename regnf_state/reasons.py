@@ -108,7 +108,14 @@ REASONS: dict[str, Reason] = {
     "FIELD_DESCRIPTION_DIFFERS": Reason(
         409,
         "Field stored with another description",
-        "The same bytes are stored with another description. Delete the field first.",
+        "The same bytes are stored with another description or other settings. Change it with `PATCH`, or delete the "
+        "field first.",
+    ),
+    "FIELD_VALIDATING": Reason(409, "Import has not ended", "The field is being imported. Wait for it, then repeat."),
+    "FIELD_BYTES_GONE": Reason(
+        409,
+        "Bytes no longer kept",
+        "The uploaded bytes were deleted after their import. Delete the field, and upload it with the description.",
     ),
     "FIELD_REJECTED": Reason(
         422, "Field was rejected", "The import refused the file; `GET /fields/{sha256}` says why in `error`."

@@ -20,7 +20,7 @@ FORMAT = 1
 _UNKNOWN = "unknown_members"
 LAST_TIME = 253402300800.0
 """The year 10000: what no calendar shows."""
-_TIMES = ("created", "updated", "started", "finished", "heartbeat", "phase_since")
+_TIMES = ("created", "updated", "started", "finished", "heartbeat", "phase_since", "original_until")
 _PROBLEM = {"type": str, "title": str, "status": int, "reason": str, "detail": str, "hint": str, "errors": list}
 _READERS: dict[type[Any], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in (JobRecord, FieldRecord)}
 _MEMBERS: dict[type[Any], frozenset[str]] = {

@@ -172,7 +172,7 @@ class Measured:
             await self._app(scope, counting_receive, noting_send)
         finally:
             route, method = route_of(scope), scope["method"]
-            known = method if method in ("GET", "HEAD", "POST", "PUT", "DELETE") else "other"
+            known = method if method in ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE") else "other"
             self._metrics.requests.labels(known, route, str(status)).inc()
             self._metrics.seconds.labels(route).observe((answered or time.perf_counter()) - began)
             if received:

@@ -16,6 +16,7 @@ from regnf_service.upload_slots import UploadSlots
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
+from regnf_state.originals import Originals
 from regnf_state.queue import JobQueue
 from regnf_state.records import Quota
 from regnf_state.room import Room
@@ -58,6 +59,11 @@ class Services:
     def room(self) -> Room:
         """Room for new records."""
         return Room(self.records, self.blobs, self.redis, self.settings)
+
+    @cached_property
+    def originals(self) -> Originals:
+        """The uploads that stay after their import."""
+        return Originals(self.records, self.blobs, self.settings)
 
     @cached_property
     def requests(self) -> Slots:

@@ -65,6 +65,7 @@ FIELD_ROUTES = [
     ("GET", "/fields/{field}?wait=1"),
     ("GET", "/fields/{field}/preview.png"),
     ("HEAD", "/fields/{field}/preview.png"),
+    ("PATCH", "/fields/{field}"),
     ("DELETE", "/fields/{field}"),
 ]
 JOB_ROUTES = [
@@ -97,8 +98,9 @@ def test_anothers_is_not_there(
     shared: World, bob: httpx.Client, alices_job: str, method: str, path: str, prefix: str
 ) -> None:
     """The answer is the one for an id that nobody has, member by member, and alice's still stands afterwards."""
-    answer = bob.request(method, prefix + path.format(field=sha256(SCENE), job=alices_job))
-    unknown = bob.request(method, prefix + path.format(field="0" * 64, job="0" * 32))
+    body = {"description": {"sign": -1}} if method == "PATCH" else None
+    answer = bob.request(method, prefix + path.format(field=sha256(SCENE), job=alices_job), json=body)
+    unknown = bob.request(method, prefix + path.format(field="0" * 64, job="0" * 32), json=body)
     assert answer.status_code == unknown.status_code == 404
     told, untold = (dict(one.json()) if one.content else {} for one in (answer, unknown))
     for document in (told, untold):

@@ -6,19 +6,68 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from regnf_core.field_source import Role, assumed_role
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.budget import check_budget
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.uploads import Received, Upload
+from regnf_service.fields.uploads import Received, ReceivedSettings, Upload
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
+from regnf_state.originals import delete_upload, original_key, settings_key
 from regnf_state.ownership import reference_of
-from regnf_state.records import FieldRecord, QuotaError, UnreadableRecordError
+from regnf_state.records import ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What came with a file. role: what the field will be used as, which decides where nothing else does."""
+
+    description: UploadDescription | None = None
+    settings: ReceivedSettings | None = None
+    role: Role | None = None
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether the caller says nothing of the file: then any field of the same bytes is meant."""
+        return self.description is None and self.settings is None
+
+    @property
+    def label(self) -> str | None:
+        """The field's name for people."""
+        return None if self.description is None else self.description.label
+
+    def function(self) -> dict[str, Any]:
+        """What makes another function of the same bytes: everything that was said but the label, and the settings."""
+        said = {} if self.description is None else function_of(self.description)
+        if self.settings is None:
+            return said
+        received = self.settings.received
+        return said | {SETTINGS: {"name": self.settings.name, "sha256": received.sha256, "bytes": received.bytes}}
+
+    def function_of_new(self, format_: str | None) -> dict[str, Any]:
+        """The same for a field that is not held: where the file does not say how to read it, its use does."""
+        said = self.function()
+        return said if self.role is None else said | assumed_role(said, format_, self.role)
+
+    def is_function_of(self, known: FieldRecord) -> bool:
+        """Whether a field that is held is the same function, settings by their content. Its use is no condition."""
+        said, held = self.function(), known.description
+        if "as" not in said:
+            held = {name: value for name, value in held.items() if name != "as"}
+        return _by_content(said) == _by_content(held)
+
+
+def _by_content(function: Mapping[str, Any]) -> dict[str, Any]:
+    settings = function.get(SETTINGS)
+    return dict(function) if settings is None else {**function, SETTINGS: settings["sha256"]}
 
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
     """What the import needs of a description: everything that was said but the label."""
     return {name: value for name, value in description.non_default().items() if name != "label"}
+
+
+_OF_ROOM = frozenset({"QUOTA_FIELDS", "QUOTA_STORED_BYTES"})
 
 
 def check_room(services: Services, caller: str, sha256: str) -> int | None:
@@ -31,20 +80,22 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
         return room_for_bytes(services, caller, known)
     check_workers(services, caller, CLOSE)
     most = services.quota.fields
-    if most is not None and services.records.stored(caller)[0] >= most:
-        raise Problem("QUOTA_FIELDS", headers=CLOSE)
+    while most is not None and services.records.stored(caller)[0] >= most:
+        if not services.originals.free(caller):
+            raise Problem("QUOTA_FIELDS", headers=CLOSE)
     return room_for_bytes(services, caller)
 
 
 def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = None) -> int | None:
     """How many bytes the caller may have under way: its quota less what it has stored. None: any number.
 
-    A field that is sent ``again`` takes no more than it has.
+    A field that is sent ``again`` takes no more than it has. Uploads that are kept after their import make room.
     """
     most = services.quota.stored_bytes
     if most is None:
         return None
-    return most - services.records.stored(caller)[1] + (0 if again is None else again.kept_bytes)
+    stored = services.records.stored(caller)[1] - services.originals.bytes_of(caller)
+    return most - stored + (0 if again is None else again.kept_bytes)
 
 
 def _known(services: Services, reference: str) -> FieldRecord | None:
@@ -76,71 +127,91 @@ class StoredUpload:
     created: bool
 
 
-def original_key(reference: str) -> str:
-    """Where the uploaded bytes lie until the import has ended."""
-    return f"fields/{reference}/original"
-
-
 async def store_upload(
-    services: Services, caller: str, upload: Upload, received: Received, description: UploadDescription | None = None
+    services: Services, caller: str, upload: Upload, received: Received, beside: Beside | None = None
 ) -> StoredUpload:
     """Keep a finished upload unless the caller has its bytes already, and see to it that its import is queued.
 
     Raises Problem FIELD_DESCRIPTION_DIFFERS when the same bytes are held as another function, QUOTA_IMPORTS,
     QUOTA_WORKER_SECONDS, and QuotaError.
     """
+    beside = beside or Beside()
     reference = reference_of(caller, received.sha256)
     known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
-        return await in_thread(_keep, services, known, description)
-    field = await in_thread(_field, services, reference, received.bytes, description)
-    if field.state == "rejected":
+        return await in_thread(_keep, services, known, beside)
+    if known is not None and known.original_until is not None:
+        await in_thread(services.originals.drop, known)  # nobody must let go of what is stored below
+    field = await in_thread(_field, services, reference, upload, received, beside)
+    if field.state == "validating":
+        await in_thread(check_workers, services, caller)
+        await in_thread(services.room.make, caller)
+    elif field.original_until is None:
         return StoredUpload((await in_thread(services.records.create_field, field))[0], created=True)
-    await in_thread(check_workers, services, caller)
-    await in_thread(services.room.make, caller)
+    if beside.settings is not None:
+        place = settings_key(reference, beside.settings.received.sha256)
+        await beside.settings.upload.commit(place)
     await upload.commit(original_key(reference))
-    return await in_thread(_record, services, field, description)
+    return await in_thread(_record, services, field, beside)
 
 
-def _keep(services: Services, known: FieldRecord, description: UploadDescription | None) -> StoredUpload:
-    if description is not None:
-        if function_of(description) != known.description:
-            raise Problem("FIELD_DESCRIPTION_DIFFERS")
-        if description.label is not None and description.label != known.label:
-            known = services.records.update_field(known.sha256, label=description.label)
+def _keep(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
+    if not beside.is_nothing and not beside.is_function_of(known):
+        raise Problem("FIELD_DESCRIPTION_DIFFERS")
+    if beside.label is not None and beside.label != known.label:
+        known = services.records.update_field(known.sha256, label=beside.label)
     if known.state == "validating":
         # mends an import that was recorded but never queued; queueing twice changes nothing
         services.queue.enqueue_import(known.sha256, known.attempt)
     return StoredUpload(known, created=False)
 
 
-def _field(services: Services, reference: str, size: int, description: UploadDescription | None) -> FieldRecord:
+def _field(services: Services, reference: str, upload: Upload, received: Received, beside: Beside) -> FieldRecord:
     """The field of a new upload: to be imported, or rejected at once if the same upload of this caller was lately."""
     now = services.records.now()
-    said: dict[str, Any] = {} if description is None else function_of(description)
     field = FieldRecord(
         sha256=reference,
         state="validating",
-        bytes=size,
+        bytes=received.bytes,
         created=now,
         updated=now,
-        label=None if description is None else description.label,
-        description=said,
+        label=beside.label,
+        description=beside.function_of_new(upload.format),
     )
     error = services.records.known_rejection(field)
-    return field if error is None else replace(field, state="rejected", error=error)
+    if error is None:
+        return field
+    return replace(field, state="rejected", error=services.originals.keep_with(error, rejected=True))
 
 
-def _record(services: Services, field: FieldRecord, description: UploadDescription | None) -> StoredUpload:
-    try:
-        record, created = services.records.create_field(field, services.quota)
-    except QuotaError:
-        services.blobs.delete(original_key(field.sha256))
-        raise
-    if record.state == "ready":
+def _record(services: Services, field: FieldRecord, beside: Beside) -> StoredUpload:
+    record, created = _create(services, field)
+    if record.state == "ready" and record.original_until is None:
         # another upload of the same bytes came first and is imported already
         services.blobs.delete(original_key(field.sha256))
     if not created:
-        return _keep(services, record, description)
-    services.queue.enqueue_import(record.sha256, record.attempt)
+        return _keep(services, record, beside)
+    if record.state == "validating":
+        services.queue.enqueue_import(record.sha256, record.attempt)
     return StoredUpload(record, created=True)
+
+
+def _create(services: Services, field: FieldRecord) -> tuple[FieldRecord, bool]:
+    """The record, once there is room: uploads that are kept after their import give way. Raises QuotaError.
+
+    A rejected field is recorded all the same, without its upload.
+    """
+    quota = services.quota
+    if field.state == "rejected":
+        quota = Quota(fields=quota.fields, stored_bytes=quota.stored_bytes)
+    while True:
+        try:
+            return services.records.create_field(field, quota)
+        except QuotaError as error:
+            if error.reason in _OF_ROOM and services.originals.free(field.owner):
+                continue
+            delete_upload(services.blobs, field)
+            if field.state != "rejected":
+                raise
+            error_alone = {name: value for name, value in (field.error or {}).items() if name != ORIGINAL_UNTIL}
+            return services.records.create_field(replace(field, error=error_alone))

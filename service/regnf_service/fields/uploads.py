@@ -1,4 +1,4 @@
-"""One upload on its way into the blob store: counted, hashed and looked at while it streams.
+"""One upload on its way into the blob store: counted, hashed and looked at while it streams; settings beside it too.
 
 Nothing is stored elsewhere, and the bytes have no name before ``commit``: an interrupted upload leaves nothing.
 Hashing and writing happen in a thread, a mebibyte at a time, so that the event loop keeps answering others.
@@ -7,6 +7,7 @@ Hashing and writing happen in a thread, a mebibyte at a time, so that the event 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
 
 _BLOCK_BYTES = 1 << 20
+SETTINGS_BYTES = 64 << 20
+"""The latent codes of a thousand shapes are the largest of settings."""
+_NAME_LENGTH = 100
 _Result = TypeVar("_Result")
 
 
@@ -37,6 +41,9 @@ class Received:
 class Upload:
     """Takes an upload's bytes in order. Use ``open_upload``; ``commit`` gives the bytes their name."""
 
+    format: str | None = None
+    """What the bytes seem to be, once enough of them have come."""
+
     def __init__(self, blobs: BlobStore, limit: int, limiter: CapacityLimiter, claim: Claim) -> None:
         self._blobs = blobs
         self._opened = ExitStack()
@@ -49,6 +56,9 @@ class Upload:
         self._bytes = 0
         self._pending = bytearray()
         self._recognized = False
+
+    def begin(self, filename: str) -> None:
+        """A part of a form has come. A field's name promises nothing."""
 
     async def feed(self, data: bytes | bytearray) -> None:
         """Take the next bytes.
@@ -86,7 +96,8 @@ class Upload:
 
     def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
-        if sniff_format(head) is None:
+        self.format = sniff_format(head)
+        if self.format is None:
             _, sentence = explain_refusal(head)
             raise Problem("FIELD_NOT_RECOGNIZED", f"The file is {sentence}.", headers=CLOSE)
         self._recognized = True
@@ -106,12 +117,65 @@ class Upload:
         return await to_thread.run_sync(work, limiter=self._limiter)
 
 
+class SettingsUpload(Upload):
+    """A trainer's settings that come with a field: of any format, under a name that says something."""
+
+    filename = "settings"
+    came = False
+
+    def begin(self, filename: str) -> None:
+        """The part has come."""
+        self.came = True
+        self.filename = plain_name(filename) or self.filename
+
+    async def received(self) -> ReceivedSettings | None:
+        """What came; None where nothing did. Raises Problem UPLOAD_EMPTY."""
+        return ReceivedSettings(self.filename, self, await self.finish()) if self.came else None
+
+    def _recognize(self) -> None:
+        self._recognized = True
+
+
+@dataclass(frozen=True)
+class ReceivedSettings:
+    """Settings whose bytes are all here."""
+
+    name: str
+    upload: SettingsUpload
+    received: Received
+
+
+def plain_name(filename: str) -> str:
+    """The file's own name, without folders and without what could be more than a name."""
+    name = re.split(r"[/\\]", filename)[-1]
+    return re.sub(r"[^A-Za-z0-9._-]", "_", name)[-_NAME_LENGTH:].lstrip(".")
+
+
 @asynccontextmanager
 async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
     """A new upload into the blob store, within the settings' limits."""
     upload = Upload(services.blobs, services.settings.max_upload_bytes, services.upload_limiter, claim)
-    try:
+    async with _closed(upload):
         yield upload
+
+
+@asynccontextmanager
+async def open_settings(services: Services, claim: Claim) -> AsyncIterator[SettingsUpload]:
+    """The settings that may come with an upload, which counts as one with them."""
+    upload = SettingsUpload(services.blobs, settings_limit(services), services.upload_limiter, claim)
+    async with _closed(upload):
+        yield upload
+
+
+def settings_limit(services: Services) -> int:
+    """The most bytes of settings."""
+    return min(SETTINGS_BYTES, services.settings.max_upload_bytes)
+
+
+@asynccontextmanager
+async def _closed(upload: Upload) -> AsyncIterator[None]:
+    try:
+        yield
     finally:
         # also when the request is cancelled: what was written must go
         with anyio.CancelScope(shield=True):

@@ -25,6 +25,10 @@ _MAX_HEADERS = 8
 class Sink(Protocol):
     """Where a file part's bytes go."""
 
+    def begin(self, filename: str) -> None:
+        """The part has come, under this name; "" for none."""
+        ...
+
     async def feed(self, data: bytes | bytearray) -> None: ...
 
 
@@ -34,6 +38,7 @@ class _Part:
     def __init__(self) -> None:
         self.headers: dict[str, str] = {}
         self.name = ""
+        self.filename = ""
         self.text = bytearray()
 
 
@@ -81,6 +86,7 @@ class _Collector:
         self._value.clear()
         if name == "content-disposition":
             self._part.name = _parameter(self._part.headers[name], "name") or ""
+            self._part.filename = _parameter(self._part.headers[name], "filename") or ""
 
     def feed(self, data: bytes) -> list[tuple[_Part, bytearray | None]]:
         self._parser.write(data)
@@ -150,6 +156,8 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
     if part.headers.get("content-transfer-encoding", "binary").lower() not in ("binary", "8bit", "7bit"):
         raise Problem("MALFORMED_MULTIPART", "Content-Transfer-Encoding is not taken.", headers=CLOSE)
     parts[part.name] = part
+    if part.name in files:
+        files[part.name].begin(part.filename)
 
 
 def _add_text(part: _Part, content: bytearray, limit: int) -> None:

@@ -28,4 +28,6 @@ async def refuse_unknown_parameters(request: Request) -> None:
         if name not in known or count > 1
     ]
     if errors:
-        raise Problem("INVALID_QUERY", errors=errors, headers=CLOSE if request.method in ("POST", "PUT") else None)
+        raise Problem(
+            "INVALID_QUERY", errors=errors, headers=CLOSE if request.method in ("POST", "PUT", "PATCH") else None
+        )

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_state.records import FieldRecord
 from regnf_state.registration_request import RegistrationRequest
 
 _ID_DIGITS = 32
@@ -23,8 +25,13 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def job_id_of(request: RegistrationRequest) -> str:
-    """The job's id: a digest of what the result depends on, the engine's revision included.
+def functions_of(fields: Iterable[FieldRecord | None]) -> dict[str, str]:
+    """What was said of each field of which anything was: the same bytes with another description are another field."""
+    return {field.sha256: digest(field.description) for field in fields if field is not None and field.description}
+
+
+def job_id_of(request: RegistrationRequest, functions: Mapping[str, str] | None = None) -> str:
+    """The job's id: a digest of what the result depends on, the engine's revision and the fields' functions included.
 
     The webhook and the detection's label and score change nothing in a result, so they do not enter. The record of a
     job that exists keeps the label and score of the request that made it, and gets the webhook of each later one.
@@ -32,4 +39,5 @@ def job_id_of(request: RegistrationRequest) -> str:
     values = request.values()
     detection = {name: value for name, value in values["detection"].items() if name not in _WITHOUT_EFFECT}
     asked = {name: value for name, value in values.items() if name != "webhook"} | {"detection": detection}
-    return digest({"kind": "registration", "engine": ENGINE_REVISION, "request": asked})[:_ID_DIGITS]
+    described = {"functions": dict(functions)} if functions else {}
+    return digest({"kind": "registration", "engine": ENGINE_REVISION, "request": asked} | described)[:_ID_DIGITS]

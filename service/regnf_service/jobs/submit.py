@@ -10,7 +10,7 @@ from regnf_core.detections import Bounds, require_in_scene
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.budget import check_budget
 from regnf_service.jobs.cost_limits import check_cost
-from regnf_service.jobs.identity import digest, job_id_of
+from regnf_service.jobs.identity import digest, functions_of, job_id_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
@@ -72,6 +72,13 @@ def _bounds(found: FieldRecord | None) -> Bounds | None:
     return None
 
 
+def future_job_id(services: Services, caller: str, asked: RegistrationRequest) -> str:
+    """The id of the job for a caller's request, by what its fields are now."""
+    request = asked.owned_by(caller)
+    found = services.records.get_fields([request.scene, *request.objects])
+    return job_id_of(request, functions_of(found))
+
+
 def submit(services: Services, caller: str, asked: RegistrationRequest, idempotency_key: str | None) -> JobRecord:
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
@@ -79,7 +86,7 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
     Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
-    job_id = job_id_of(request)
+    job_id = future_job_id(services, caller, asked)
     services.room.make(caller)
     if idempotency_key is not None:
         key = idempotency_key if caller == ANONYMOUS else [caller, idempotency_key]

@@ -58,7 +58,7 @@ def links(parameter: str, source: str, *operations: str, **fixed: str) -> dict[s
     return {operation: {"operationId": operation, "parameters": parameters} for operation in operations}
 
 
-FIELD_LINKS = links("sha256", "/sha256", "get_field", "delete_field")
+FIELD_LINKS = links("sha256", "/sha256", "get_field", "patch_field", "delete_field")
 JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
 FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
 NOT_MODIFIED: dict[str, Any] = {"description": "Nothing has changed since one of the ETags given."}

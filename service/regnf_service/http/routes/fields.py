@@ -5,24 +5,39 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Query
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
+from regnf_service.fields.redescribe import described_anew, redescribe
+from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.routes.documentation import BINARY, NOT_MODIFIED, get_and_head, header, refusals
+from regnf_service.http.parsing import read_body
+from regnf_service.http.routes.documentation import (
+    BINARY,
+    FIELD_LINKS,
+    JSON,
+    NOT_MODIFIED,
+    get_and_head,
+    header,
+    refusals,
+)
 from regnf_service.http.routes.uploads import field_etag
-from regnf_service.http.schemas.fields import FieldDocument, FieldPage, field_document
+from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
+from regnf_service.http.schemas.references import reference
 from regnf_service.http.waiting import wait_for
-from regnf_service.problem import Problem
+from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
+_PATCHES = (JSON, "application/merge-patch+json")
+_CHANGE = {"schema": reference(FieldChange)}
 
 
 def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
@@ -111,6 +126,57 @@ async def list_fields(
     page = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
     documents = [field_document(record, prefix) for record in page.records]
     return JSONResponse({"fields": documents, "next_page_token": encode_token(page.rest)})
+
+
+@router.patch(
+    "/fields/{sha256}",
+    summary="Describe a field anew",
+    response_model=FieldDocument,
+    status_code=200,
+    responses={
+        200: {"description": "The label alone has changed, or nothing.", "headers": {"ETag": header("For GET.")}},
+        202: {"description": "The kept bytes are imported anew.", "model": FieldDocument, "links": FIELD_LINKS},
+        **refusals(
+            "INVALID_HEADER",
+            "MALFORMED_JSON",
+            "UPLOAD_INCOMPLETE",
+            "UPLOAD_STALLED",
+            "REQUEST_TOO_LARGE",
+            "UNSUPPORTED_MEDIA_TYPE",
+            "INVALID_REQUEST",
+            "INVALID_DESCRIPTION",
+            "FIELD_NOT_FOUND",
+            "FIELD_VALIDATING",
+            "FIELD_IN_USE",
+            "FIELD_BYTES_GONE",
+            "CONFLICT",
+            "QUOTA_IMPORTS",
+            "QUOTA_WORKER_SECONDS",
+        ),
+    },
+    openapi_extra={"requestBody": {"required": True, "content": dict.fromkeys(_PATCHES, _CHANGE)}},
+)
+async def patch_field(
+    sha256: str, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
+) -> JSONResponse:
+    """Answers a question of the import without a second upload, as long as the bytes are kept (`kept_until`).
+
+    Another description is another function of the same bytes. It is refused while an active job uses the field.
+    """
+    if body.media_type(request) not in _PATCHES:
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
+    change = await read_body(services, FieldChange, await body.read_small(request, services.settings))
+    record, imported = await in_thread(_changed, services, caller, sha256, change)
+    headers = {"ETag": field_etag(record)} | ({"Retry-After": "1"} if imported else {})
+    return JSONResponse(field_document(record, prefix), status_code=202 if imported else 200, headers=headers)
+
+
+def _changed(services: Services, caller: str, sha256: str, change: FieldChange) -> tuple[FieldRecord, bool]:
+    known = _require(services, caller, sha256)
+    said = described_anew(known, change.description_change(known.said))
+    label = change.label if "label" in change.model_fields_set else (said.label or known.label)
+    imported = redescribe(services, caller, known, said, label)
+    return _require(services, caller, sha256), imported
 
 
 @router.delete(

@@ -10,9 +10,11 @@ from fastapi import APIRouter, Header, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
+from regnf_core.field_source import Role
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import room_for_bytes, store_upload
-from regnf_service.fields.uploads import open_upload
+from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
+from regnf_service.fields.uploads import open_settings, open_upload, settings_limit
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
@@ -29,13 +31,13 @@ from regnf_service.http.routes.documentation import (
 )
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
 from regnf_service.http.routes.jobs import job_answer
+from regnf_service.http.routes.uploads import DESCRIPTION_BYTES, read_description
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
 from regnf_service.http.turns import fair_key
 from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.identity import job_id_of
-from regnf_service.jobs.submit import check_fields, check_idempotency_key, submit
+from regnf_service.jobs.submit import check_fields, check_idempotency_key, future_job_id, submit
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.records import ACTIVE, FINISHED
@@ -44,12 +46,19 @@ from regnf_state.registration_request import RegistrationRequest
 router = APIRouter(tags=["registrations"])
 _PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
 _MAX_WAIT_S = 30
+_ROLES: tuple[Role, Role] = ("scene", "object")
 _ONE_SHOT = {
     "schema": {
         "type": "object",
         "required": ["scene", "object", "request"],
         "additionalProperties": False,
-        "properties": {"scene": FILE, "object": FILE, "request": reference(RegistrationSpec)},
+        "properties": {
+            "scene": FILE,
+            "object": FILE,
+            "request": reference(RegistrationSpec),
+            **{f"{role}_description": reference(UploadDescription) for role in ("scene", "object")},
+            **{f"{role}_settings": FILE for role in ("scene", "object")},
+        },
     }
 }
 
@@ -94,6 +103,8 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INITIAL_TRANSFORM_UNSUPPORTED",
             "LIBRARY_SEARCH_UNSUPPORTED",
             "FIELD_REJECTED",
+            "FIELD_DESCRIPTION_DIFFERS",
+            "INVALID_DESCRIPTION",
             "INVALID_WEBHOOK",
             "WEBHOOK_NOT_ALLOWED",
             "DETECTION_OUTSIDE_SCENE",
@@ -135,7 +146,7 @@ async def register(
     check_idempotency_key(idempotency_key)
     asked = await _read(request, services, caller, keep=not dry_run)
     if dry_run:
-        job_id = job_id_of(asked.owned_by(caller))
+        job_id = await in_thread(future_job_id, services, caller, asked)
         return JSONResponse({"valid": True, "id": job_id, "request": asked.values()})
     record = await in_thread(submit, services, caller, asked, idempotency_key)
     wait = preferred_wait(prefer)
@@ -181,26 +192,30 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
     """Both files and the request in one body. Nothing is kept before all of it has arrived and been checked."""
     body.refuse_encoding(request)
     settings = services.settings
-    besides = 2 * settings.max_request_bytes
-    limit = 2 * settings.max_upload_bytes + besides
+    besides = 2 * settings.max_request_bytes + 4 * DESCRIPTION_BYTES
+    limit = 2 * (settings.max_upload_bytes + settings_limit(services)) + besides
     declared = body.declared_length(request, besides)
     pace = Pace(settings)
     async with AsyncExitStack() as stack:
         await stack.enter_async_context(services.uploads.held(fair_key(request.scope, caller), pace, count=2))
         room = await in_thread(room_for_bytes, services, caller)
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
-        files = {name: await stack.enter_async_context(open_upload(services, claim)) for name in ("scene", "object")}
+        files = {name: await stack.enter_async_context(open_upload(services, claim)) for name in _ROLES}
+        configs = {name: await stack.enter_async_context(open_settings(services, claim)) for name in _ROLES}
+        sinks = files | {f"{name}_settings": config for name, config in configs.items()}
+        texts = {"request": settings.max_request_bytes} | {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
         data = body.chunks(request, limit, pace)
-        texts = {"request": settings.max_request_bytes}
-        parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
+        parts = await read_parts(data, boundary_of(request), sinks, texts, services.parse_limiter)
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
         spec = await read_body(services, RegistrationSpec, parts["request"])
+        said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}
+        beside = {name: Beside(said[name], await configs[name].received(), name) for name in _ROLES}
         asked = spec.to_request(received["scene"].sha256, received["object"].sha256)
         await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:
             for name, upload in files.items():
-                await store_upload(services, caller, upload, received[name])
+                await store_upload(services, caller, upload, received[name], beside[name])
     return asked

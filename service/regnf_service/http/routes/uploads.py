@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path
@@ -12,8 +13,8 @@ from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import StoredUpload, check_room, room_for_bytes, store_upload
-from regnf_service.fields.uploads import Received, Upload, open_upload
+from regnf_service.fields.ingest import Beside, StoredUpload, check_room, room_for_bytes, store_upload
+from regnf_service.fields.uploads import Received, SettingsUpload, Upload, open_settings, open_upload, settings_limit
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.digests import announced_digest, is_sha256
@@ -53,7 +54,7 @@ _MULTIPART = {
         "type": "object",
         "required": ["file"],
         "additionalProperties": False,
-        "properties": {"file": FILE, "description": reference(UploadDescription)},
+        "properties": {"file": FILE, "description": reference(UploadDescription), "settings": FILE},
     }
 }
 
@@ -125,24 +126,29 @@ async def post_field(
         str | None, Header(description="RFC 9530, of the body as sent.", json_schema_extra=_DIGEST)
     ] = None,
 ) -> JSONResponse:
-    """The bytes alone, or multipart with the parts `file` and `description` (JSON: what the file does not say)."""
+    """The bytes alone, or multipart with the part `file` and what goes with it.
+
+    `settings` is the file of settings that the trainer left, or a zip or tar file of several; `description` is JSON:
+    what no file says. An archive of a whole training run needs neither.
+    """
     if body.media_type(request).startswith("text/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
     digest = announced_digest(content_digest)
     in_parts = body.media_type(request) == "multipart/form-data"
     declared = body.declared_length(request, besides=2 * DESCRIPTION_BYTES if in_parts else 0)
     pace = Pace(services.settings)
-    async with services.uploads.held(fair_key(request.scope, caller), pace):
+    async with services.uploads.held(fair_key(request.scope, caller), pace), AsyncExitStack() as stack:
         room = await in_thread(room_for_bytes, services, caller)
-        with services.under_way.claim(caller, room, declared) as claim:
-            async with open_upload(services, claim) as upload:
-                if in_parts:
-                    received, description = await _receive_parts(request, services, upload, pace, digest)
-                else:
-                    received, description = await _receive_raw(request, services, upload, pace), None
-                    if digest not in (None, received.sha256):
-                        raise Problem("DIGEST_MISMATCH")
-                taken = await store_upload(services, caller, upload, received, description)
+        claim = stack.enter_context(services.under_way.claim(caller, room, declared))
+        upload = await stack.enter_async_context(open_upload(services, claim))
+        if in_parts:
+            settings = await stack.enter_async_context(open_settings(services, claim))
+            received, beside = await _receive_parts(request, services, upload, settings, pace, digest)
+        else:
+            received, beside = await _receive_raw(request, services, upload, pace), Beside()
+            if digest not in (None, received.sha256):
+                raise Problem("DIGEST_MISMATCH")
+        taken = await store_upload(services, caller, upload, received, beside)
     return _answer(taken, prefix)
 
 
@@ -154,20 +160,30 @@ async def _receive_raw(request: Request, services: Services, upload: Upload, pac
 
 
 async def _receive_parts(
-    request: Request, services: Services, upload: Upload, pace: Pace, digest: str | None
-) -> tuple[Received, UploadDescription | None]:
+    request: Request,
+    services: Services,
+    upload: Upload,
+    settings: SettingsUpload,
+    pace: Pace,
+    digest: str | None,
+) -> tuple[Received, Beside]:
     body.refuse_encoding(request)
-    limit = services.settings.max_upload_bytes + 2 * DESCRIPTION_BYTES
+    limit = services.settings.max_upload_bytes + settings_limit(services) + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit, pace)
     if digest is not None:
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES}
-    parts = await read_parts(data, boundary_of(request), {"file": upload}, texts, services.parse_limiter)
+    files = {"file": upload, "settings": settings}
+    parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
     if "file" not in parts:
         raise Problem("MISSING_PART", "The part `file` is missing.")
-    text = parts.get("description")
-    description = None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
-    return await upload.finish(), description
+    description = read_description(parts.get("description"))
+    return await upload.finish(), Beside(description, await settings.received())
+
+
+def read_description(text: bytes | None) -> UploadDescription | None:
+    """What a part says of a file. Raises Problem MALFORMED_JSON, INVALID_DESCRIPTION."""
+    return None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
 
 
 async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:

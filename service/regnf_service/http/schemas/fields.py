@@ -7,11 +7,27 @@ from typing import Any, Literal
 from pydantic import Field
 
 from regnf_service.http.paging import NEXT_PAGE
-from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, Sha256, outgoing_problem
+from regnf_service.http.schemas.common import (
+    Incoming,
+    Label,
+    Links,
+    Outgoing,
+    ProblemDocument,
+    Sha256,
+    outgoing_problem,
+)
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
-from regnf_state.records import FieldRecord
+from regnf_state.records import ORIGINAL_UNTIL, FieldRecord
+
+
+class SettingsDocument(Outgoing):
+    """A trainer's settings that came with an upload."""
+
+    name: str
+    sha256: Sha256
+    bytes: int
 
 
 class FieldDocument(Outgoing):
@@ -22,14 +38,35 @@ class FieldDocument(Outgoing):
     bytes: int
     label: str | None = None
     description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
+    settings: SettingsDocument | None = Field(None, description="The file of settings that came with the upload.")
     report: dict[str, Any] = Field({}, description="What the import found: family, bounds, parameters, plausibility.")
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's own, found by the first job that registers the field as an object."
     )
     error: ProblemDocument | None = Field(None, description="Why the field was rejected.")
+    kept_until: str | None = Field(
+        None, description="Until when the upload can be imported anew with another description: PATCH. Null: it cannot."
+    )
     created_at: str
     updated_at: str
     links: Links
+
+
+class FieldChange(Incoming):
+    """What is to be changed of a field. What is left out stays as it is."""
+
+    description: dict[str, Any] | None = Field(
+        None,
+        description="Entries to add to what was said, or to replace; null takes an entry back (RFC 7396). Another "
+        "description is another function: the kept bytes are imported anew.",
+    )
+    label: Label | None = Field(None, description="A name for people; null: none. Nothing is imported for it.")
+
+    def description_change(self, held: dict[str, Any]) -> dict[str, Any]:
+        """What is to be changed of what is ``held``; null for the whole takes back all of it."""
+        if "description" in self.model_fields_set and self.description is None:
+            return dict.fromkeys(held)
+        return self.description or {}
 
 
 class FieldPage(Outgoing):
@@ -46,14 +83,20 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "state": record.state,
         "bytes": record.bytes,
         "label": record.label,
-        "description": record.description,
-        "report": record.report,
+        "description": record.said,
+        "settings": None if record.settings is None else record.settings._asdict(),
+        "report": _without_time(record.report),
         "symmetry": record.symmetry,
-        "error": outgoing_problem(record.error),
+        "error": None if record.error is None else outgoing_problem(_without_time(record.error)),
+        "kept_until": rfc3339(record.original_until),
         "created_at": rfc3339(record.created),
         "updated_at": rfc3339(record.updated),
         "links": _links(record, f"{prefix}/fields/{sha256_of(record.sha256)}"),
     }
+
+
+def _without_time(said: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in said.items() if name != ORIGINAL_UNTIL}
 
 
 def _links(record: FieldRecord, address: str) -> Links:

@@ -1,0 +1,100 @@
+"""Another description of a field that is held: its bytes are imported anew, if they are still there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_service.fields.ingest import check_workers, function_of
+from regnf_service.http.schemas.reading import read_model
+from regnf_service.problem import Problem
+from regnf_service.services import Services
+from regnf_state.originals import original_key, settings_key
+from regnf_state.records import SETTINGS, FieldRecord, StaleAttemptError
+
+
+def described_anew(known: FieldRecord, change: Mapping[str, Any]) -> UploadDescription:
+    """What is said of a field after a change as RFC 7396 has it. Raises Problem INVALID_DESCRIPTION."""
+    merged = _merged(known.said, change)
+    try:
+        return read_model(UploadDescription, json.dumps(merged).encode(), "INVALID_DESCRIPTION")
+    except Problem as problem:
+        faults = [{**fault, "pointer": "/description" + fault.get("pointer", "")} for fault in problem.errors]
+        raise Problem(problem.reason, problem.detail, errors=faults, hint=problem.hint) from problem
+
+
+def _merged(held: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(held)
+    for name, value in change.items():
+        if value is None:
+            merged.pop(name, None)
+        elif isinstance(value, dict):
+            inner = merged.get(name)
+            merged[name] = _merged(inner if isinstance(inner, dict) else {}, value)
+        else:
+            merged[name] = value
+    return merged
+
+
+def redescribe(services: Services, caller: str, known: FieldRecord, said: UploadDescription, label: str | None) -> bool:
+    """Have the field imported as another function, or change its label alone. Whether it is imported.
+
+    Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_IMPORTS, QUOTA_WORKER_SECONDS, CONFLICT, and
+    RecordsFullError.
+    """
+    function = function_of(said) | {name: value for name, value in known.description.items() if name == SETTINGS}
+    if function == known.description:
+        if label != known.label:
+            _changed(services, known, label)
+        return False
+    if known.state == "validating":
+        raise Problem("FIELD_VALIDATING", headers={"Retry-After": "1"})
+    _require_unused(services, known)
+    _require_bytes(services, known)
+    check_workers(services, caller)
+    services.room.make(caller)
+    _import_anew(services, known, function, label)
+    return True
+
+
+def _changed(services: Services, known: FieldRecord, label: str | None) -> None:
+    try:
+        services.records.update_field(known.sha256, attempt=known.attempt, label=label)
+    except StaleAttemptError as error:
+        raise Problem("CONFLICT") from error
+
+
+def _require_unused(services: Services, field: FieldRecord) -> None:
+    if next(iter(services.records.jobs_using_field(field.sha256)), None) is not None:
+        raise Problem("FIELD_IN_USE")
+
+
+def _require_bytes(services: Services, field: FieldRecord) -> None:
+    keys = [original_key(field.sha256)]
+    if field.settings is not None:
+        keys.append(settings_key(field.sha256, field.settings.sha256))
+    if field.original_until is None or not all(map(services.blobs.exists, keys)):
+        raise Problem("FIELD_BYTES_GONE")
+
+
+def _import_anew(services: Services, known: FieldRecord, function: dict[str, Any], label: str | None) -> None:
+    """The record changes first. A job that was accepted in between keeps its function: then it changes back."""
+    try:
+        field = services.records.reimport_field(known, function, label)
+    except StaleAttemptError as error:
+        raise Problem("CONFLICT") from error
+    try:
+        _require_unused(services, field)
+        _require_bytes_of(services, field)
+    except Problem:
+        services.records.undo_reimport(known, field.attempt)
+        raise
+    services.queue.enqueue_import(field.sha256, field.attempt)
+
+
+def _require_bytes_of(services: Services, field: FieldRecord) -> None:
+    """They may have been let go of in between."""
+    if not services.blobs.exists(original_key(field.sha256)):
+        raise Problem("FIELD_BYTES_GONE")
