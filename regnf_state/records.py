@@ -119,6 +119,8 @@ class JobRecord:
 
 ORIGINAL_UNTIL = "original_until"
 """In a rejected field's error or a ready field's report: until when the upload itself is kept."""
+WARNINGS = "warnings"
+"""In a job's inputs: what the imports of its fields have warned of."""
 SETTINGS = "settings"
 """In a field's description: the file of settings that came with the upload. No description has such an entry."""
 

@@ -286,3 +286,18 @@ def test_a_rejected_field_that_is_sent_again_is_this_upload(world: World) -> Non
     answer = send(world, {"latent_index": 1})
     assert (answer.status_code, answer.json()["state"], answer.json()["settings"]) == (201, "validating", None)
     assert set(world.blobs.blobs) == {ORIGINAL}
+
+
+# warnings
+
+
+def test_a_job_names_what_the_imports_of_its_fields_warned_of(world: World) -> None:
+    job_id = world.submit()
+    warned = {"scene": ["TRUNCATION_ASSUMED"]}
+    record = world.records.get_job(job_id)
+    assert record is not None
+    assert world.client.get(f"/jobs/{job_id}").json()["warnings"] == {}
+    world.records.update_job(job_id, record.attempt, inputs=record.inputs | {"warnings": warned})
+    job = world.client.get(f"/jobs/{job_id}").json()
+    assert job["warnings"] == warned
+    assert job["inputs"] == record.inputs

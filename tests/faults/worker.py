@@ -43,10 +43,17 @@ class HeldEngine(TinyEngine):
     """Succeeds, in its own time."""
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Report, folder: Path
+        self,
+        scene: Path,
+        object_: Path,
+        model: Any,
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
+        notes: Any,
     ) -> list[str]:
         held = replace(request, detection=replace(request.detection, label="while_held"))
-        return super().register(scene, object_, model, held, report, folder)
+        return super().register(scene, object_, model, held, report, folder, notes)
 
     def while_held(self, report: Report) -> None:
         while True:

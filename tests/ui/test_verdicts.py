@@ -8,7 +8,7 @@ from playwright.sync_api import expect
 
 from tests.ui.conftest import Visit
 from tests.ui.pixels import canvas_pixels, changed_share
-from tests.ui.verdicts import DETAIL, ORDERING, SIGMAS
+from tests.ui.verdicts import DETAIL, ORDERING, SIGMAS, WARNING
 
 pytestmark = pytest.mark.browser
 
@@ -25,6 +25,11 @@ def test_the_reason_is_told_in_words_and_what_to_do(visit: Visit) -> None:
     assert "SEVERAL_POSES_AGREE" in said
     assert "up_axis" in said
     assert "± 0.5 %" in page.locator("#figures").inner_text()
+
+
+def test_what_the_imports_warned_of_is_told_beside_the_verdict(visit: Visit) -> None:
+    page = visit.open("ambiguous")
+    assert page.locator("#warnings li").all_inner_texts() == [f"Scene: {WARNING}"]
 
 
 def test_every_alternative_moves_the_object_and_the_result_comes_back(visit: Visit) -> None:

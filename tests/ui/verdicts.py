@@ -12,6 +12,7 @@ from tests.ui.synthetic import Synthetic, rotation, sim3_document, similarity
 
 SIGMAS = [math.radians(0.4), math.radians(0.8), math.radians(0.2), 0.003, 0.001, 0.002, 0.005]
 ORDERING = ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
+WARNING = "TRUNCATION_ASSUMED: taken for <b>8</b> voxels"
 DETAIL = "Several poses match the data equally well: this one and the alternatives."
 
 
@@ -34,6 +35,10 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
             "rotation_deg": [0.4, 0.8, 0.2],
             "translation": SIGMAS[3:6],
             "scale_percent": 100 * SIGMAS[6],
+        },
+        "fields": {
+            "scene": {"family": "neus", "settings": ["config.yml"], "warnings": [WARNING]},
+            "object": {"family": None, "settings": [], "warnings": []},
         },
         "symmetry": {"order": 2, "axis": [-0.001, 0.0, 1.0], "continuous": False},
         "metrics": data.result["metrics"] | {"score": 0.041},

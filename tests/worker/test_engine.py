@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from regnf_core.field_notes import FieldNotes
 from regnf_core.options import RegistrationOptions
 from regnf_worker.engine import CoreEngine
 from tests.requests import registration_request
@@ -19,12 +20,20 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
     monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
-    monkeypatch.setattr("regnf_core.viewing.write_artifacts", lambda result, folder, **said: ["result.json"])
+    written: list[Any] = []
+
+    def write_artifacts(result: Any, folder: Path, **said: Any) -> list[str]:
+        written.append(said["fields"])
+        return ["result.json"]
+
+    monkeypatch.setattr("regnf_core.viewing.write_artifacts", write_artifacts)
     request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), seed=3, initial_transform=start)
     files = Path("scene"), Path("object")
-    names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path)
+    notes = {"scene": FieldNotes("neus", (), ("SIGN_UNCERTAIN: perhaps",))}
+    names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
     ((scene, obj, box, options, seed, _, warm),) = calls
     assert (scene, obj, seed, warm.object_model, names) == ("scene", "object", 3, "the model", ["result.json"])
+    assert written == [{"scene": notes["scene"], "object": FieldNotes()}]
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
     assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start

@@ -35,20 +35,35 @@ class ModelEngine:
     made: list[bytes] = field(default_factory=list)
     registered: list[Any] = field(default_factory=list)
     searched: list[Sequence[Candidate]] = field(default_factory=list)
+    notes: list[Any] = field(default_factory=list)
     while_making: Any = None
 
     def describe(self) -> dict[str, Any]:
         return {"version": "models", "device": "none"}
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Any, folder: Path
+        self,
+        scene: Path,
+        object_: Path,
+        model: Any,
+        request: RegistrationRequest,
+        report: Any,
+        folder: Path,
+        notes: Any,
     ) -> list[str]:
         self.registered.append(model)
+        self.notes.append(notes)
         (folder / "result.json").write_text("{}")
         return ["result.json"]
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Any, folder: Path
+        self,
+        scene: Path,
+        candidates: Sequence[Candidate],
+        request: RegistrationRequest,
+        report: Any,
+        folder: Path,
+        notes: Any,
     ) -> list[str]:
         self.searched.append(candidates)
         opened = [one.open().read_bytes().decode() for one in candidates]
@@ -215,3 +230,17 @@ def test_a_search_stops_between_models_when_it_is_cancelled(context: Context, mo
     assert run(context, engine, "j1", candidates=[CHAIR, TABLE, AIR]).status == "dismissed"
     assert engine.made == [b"chair"]
     assert engine.searched == []
+
+
+def test_what_the_imports_said_reaches_the_result_and_the_job(context: Context) -> None:
+    report = {"family": "neus", "warnings": ["TRUNCATION_ASSUMED: 8 voxels", "TRUNCATION_ASSUMED: again", "x" * 99]}
+    context.records.update_field(SCENE, report=report)
+    config = {"name": "config.yml", "sha256": "0" * 64, "bytes": 3}
+    context.records.update_field(CHAIR, description={"settings": config}, report={"warnings": "no list"})
+    engine = ModelEngine()
+    record = run(context, engine, "j1", object=CHAIR)
+    assert record.inputs["warnings"] == {"scene": ["TRUNCATION_ASSUMED", "x" * 64]}
+    (notes,) = engine.notes
+    assert notes["scene"].to_dict() == {**report, "settings": []}
+    assert notes[CHAIR].to_dict() == {"family": None, "settings": ["config.yml"], "warnings": []}
+    assert run(context, engine, "j2", candidates=[CHAIR, TABLE]).inputs["warnings"] == record.inputs["warnings"]

@@ -36,7 +36,14 @@ class TinyEngine:
         return {"version": "tiny", "device": "none"}
 
     def register(
-        self, scene: Path, object_: Path, model: Any, request: RegistrationRequest, report: Report, folder: Path
+        self,
+        scene: Path,
+        object_: Path,
+        model: Any,
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
+        notes: Any,
     ) -> list[str]:
         report("sampling", 0.1)
         (folder / "half-written").write_bytes(b".")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from regnf_core import __version__
 from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.field_notes import NO_NOTES, FieldNotes
 from regnf_core.importing.gate.gate import ImportLimits, import_field
 from regnf_core.options import RegistrationOptions
 from regnf_state.registration_request import RegistrationRequest
@@ -20,6 +21,8 @@ Importer = Callable[[Path, Path, dict[str, Any], Path | None], dict[str, Any]]
 Raises FieldFormatError."""
 
 
+Notes = Mapping[str, FieldNotes]
+"""What is known of the fields' imports: of `scene`, and of each object by its SHA-256."""
 Model = Any
 """An object's model, of whatever kind the engine makes: only the engine looks inside."""
 
@@ -52,12 +55,19 @@ class RegistrationEngine(Protocol):
         request: RegistrationRequest,
         report: Report,
         folder: Path,
+        notes: Notes,
     ) -> list[str]:
         """Do what a request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
         ...
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Report, folder: Path
+        self,
+        scene: Path,
+        candidates: Sequence[Candidate],
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
+        notes: Notes,
     ) -> list[str]:
         """The same for a request with candidates."""
         ...
@@ -103,6 +113,7 @@ class CoreEngine:
         request: RegistrationRequest,
         report: Report,
         folder: Path,
+        notes: Notes,
     ) -> list[str]:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
@@ -122,11 +133,18 @@ class CoreEngine:
         )
         report("exporting", 0.95)
         T_true = Sim3.from_matrix(truth) if truth else None
-        names: list[str] = write_artifacts(result, folder, truth=T_true, object_name=request.object)
+        said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
+        names: list[str] = write_artifacts(result, folder, truth=T_true, **said)
         return names
 
     def search(
-        self, scene: Path, candidates: Sequence[Candidate], request: RegistrationRequest, report: Report, folder: Path
+        self,
+        scene: Path,
+        candidates: Sequence[Candidate],
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
+        notes: Notes,
     ) -> list[str]:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
@@ -147,7 +165,8 @@ class CoreEngine:
         )
         report("exporting", 0.95)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
-        names: list[str] = write_artifacts(found.result, folder, object_name=winner, candidates=ranking)
+        said: dict[str, Any] = {"object_name": winner, "candidates": ranking, "fields": _fields(notes, winner)}
+        names: list[str] = write_artifacts(found.result, folder, **said)
         return names
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
@@ -163,6 +182,11 @@ class CoreEngine:
 
     def symmetry(self, model: Model) -> dict[str, Any]:
         return asdict(model.symmetry.group())
+
+
+def _fields(notes: Notes, obj: str | None) -> dict[str, FieldNotes]:
+    """What a result repeats of the notes: the scene's and those of its object."""
+    return {"scene": notes.get("scene", NO_NOTES), "object": notes.get(obj or "", NO_NOTES)}
 
 
 def core_importer(limits: ImportLimits) -> Importer:

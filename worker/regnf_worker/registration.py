@@ -23,6 +23,7 @@ from regnf_state.registration_request import RegistrationRequest
 from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
+from regnf_worker.field_notes import notes_of, warned_of
 from regnf_worker.fields import Fields, FieldsNotReadyError
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.job_limits import JobLimits, held_memory_limit, open_reserve
@@ -126,7 +127,8 @@ def _work(
         objects = [fields.ready(sha256) for sha256 in request.objects]
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="job-")))
         engine = make_engine()
-        _update(context, record.id, record.attempt, engine=engine.describe())
+        inputs = record.inputs | warned_of(scene, objects)
+        _update(context, record.id, record.attempt, engine=engine.describe(), inputs=inputs)
         names = _register(context, engine, request, fields, scene, objects, heartbeat, folder)
         heartbeat.confirm()
         manifest = store_artifacts(context.blobs, record.id, record.attempt, folder, names)
@@ -150,18 +152,19 @@ def _register(
 ) -> list[str]:
     """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
     options, scene_file = request.options, fields.file(scene.sha256)
+    notes = {"scene": notes_of(scene)} | {sha256_of(one.sha256): notes_of(one) for one in objects}
     if request.candidates is not None:
         models = ObjectModels(context, engine, options, folder)
         candidates = [_candidate(models, one, fields, heartbeat) for one in objects]
         if all(one.model is None for one in candidates):
             raise NoSurfaceError("none of the candidates is usable as an object", reason="NO_SURFACE_IN_OBJECT")
-        return engine.search(scene_file, candidates, request, heartbeat.report, folder)
+        return engine.search(scene_file, candidates, request, heartbeat.report, folder, notes)
     (one,) = objects
     object_file, model = fields.file(one.sha256), None
     if options.preset == "robust":
         model = ObjectModels(context, engine, options, folder).of(one, lambda: object_file)
     named = replace(request, object=sha256_of(one.sha256))
-    return engine.register(scene_file, object_file, model, named, heartbeat.report, folder)
+    return engine.register(scene_file, object_file, model, named, heartbeat.report, folder, notes)
 
 
 def _candidate(models: ObjectModels, field: FieldRecord, fields: Fields, heartbeat: Heartbeat) -> Candidate:

@@ -54,6 +54,7 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
         "verdict_reason",
         "verdict_detail",
         "verdict_hint",
+        "fields",
         "T_object_scene",
         "T_scene_object",
         "T_object_scene_initial",

@@ -12,7 +12,7 @@ from pydantic import Field
 from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem
 from regnf_service.times import rfc3339
-from regnf_state.records import ACTIVE, JobRecord
+from regnf_state.records import ACTIVE, WARNINGS, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
@@ -57,6 +57,10 @@ class JobDocument(Outgoing):
     engine: dict[str, Any] = Field(
         {}, description="Version, revision and device. The revision grows with changed results."
     )
+    warnings: dict[str, list[str]] = Field(
+        {},
+        description="What the imports of `scene` and `object` were not sure of: words; the result has sentences.",
+    )
     verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     webhooks: list[WebhookDocument] = Field([], description="Told of the job's end, in the order of asking.")
@@ -88,8 +92,9 @@ def job_document(
         "started_at": rfc3339(record.started),
         "finished_at": rfc3339(record.finished),
         "expires_at": None if record.finished is None else rfc3339(record.finished + retention_s),
-        "inputs": record.inputs,
+        "inputs": {name: value for name, value in record.inputs.items() if name != WARNINGS},
         "engine": record.engine,
+        "warnings": record.inputs.get(WARNINGS) or {},
         "verdict": record.verdict,
         "error": outgoing_problem(record.error),
         "webhooks": [_webhook(url, one) for url, one in zip_longest(record.webhooks, deliveries)],

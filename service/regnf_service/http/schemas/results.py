@@ -62,6 +62,14 @@ class CandidateDocument(Outgoing):
     T_object_scene: TransformDocument | None = Field(None, description="Of refined ones.")
 
 
+class FieldNotesDocument(Outgoing):
+    """What the import of a field said that a result repeats."""
+
+    family: str | None = Field(None, description="The format that was recognized.")
+    settings: list[str] = Field([], description="The trainer's files of settings that were used.")
+    warnings: list[str] = Field([], description="Each begins with a stable word and a colon: docs/import-gate.md.")
+
+
 class ArtifactEntry(Outgoing):
     """One file that the job wrote."""
 
@@ -96,6 +104,9 @@ class ResultDocument(Outgoing):
     object: str | None = Field(None, description="SHA-256 of the object's field; of a search, of the likeliest's.")
     candidates: list[CandidateDocument] | None = Field(
         None, description="All candidates of a search, the likeliest first; null for one object."
+    )
+    fields: dict[Literal["scene", "object"], FieldNotesDocument] | None = Field(
+        None, description="What is known of the imports of scene and object."
     )
     seed: int = 0
     options: dict[str, Any] = Field({}, description="Every option that was used, defaults included.")

@@ -19,6 +19,7 @@ export function showVerdict(result) {
   byId('verdict-reason').replaceChildren(why, ' ', el('code', { title: 'Stable reason, for programs' }, reason ?? ''));
   const hint = result.verdict_hint;
   if (hint) byId('verdict-reason').append(el('span', { className: 'hint' }, hint));
+  showWarnings(result.fields);
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;
   const total = totalSeconds(metrics);
@@ -30,6 +31,16 @@ export function showVerdict(result) {
     ['Time', figure(seconds(total), metrics.iterations ? `${number(metrics.iterations)} iterations` : '')],
   ]);
   show(byId('verdict'));
+}
+
+/** What the imports of scene and object were not sure of: a line each. */
+function showWarnings(fields) {
+  const lines = ['scene', 'object'].flatMap((name) => {
+    const warnings = fields?.[name]?.warnings;
+    return Array.isArray(warnings) ? warnings.map((warning) => `${words(name)}: ${warning}`) : [];
+  });
+  byId('warnings').replaceChildren(...lines.map((line) => el('li', {}, line)));
+  show(byId('warnings'), lines.length > 0);
 }
 
 /** The matrix in both directions, as text to read and to copy; note says whose it is when it is not the result's. */
