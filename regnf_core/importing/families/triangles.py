@@ -30,7 +30,8 @@ def mesh_field(
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
     require_within(mesh_seconds(vertices, faces, 3 * SAMPLES), work_s)
-    facing = facing_of(vertices.astype(np.float64), faces, overrides.as_)
+    asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
+    facing = facing_of(vertices.astype(np.float64), faces, asked)
     faces = facing.faces
     low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
     diagonal = float(np.linalg.norm(high - low))
