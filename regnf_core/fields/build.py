@@ -18,8 +18,10 @@ from regnf_core.fields.neus_facto import build_neus_facto
 from regnf_core.fields.observation import ObservedField, stored_observation
 from regnf_core.fields.onnx.graph import build_onnx
 from regnf_core.fields.scaled import ScaledField
+from regnf_core.fields.transformed import TransformedField
 from regnf_core.fields.voxel_blocks import build_voxel_blocks
 from regnf_core.fields.voxel_grid import build_voxel_grid
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription
 from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
@@ -54,9 +56,11 @@ def build_field(description: FieldDescription, tensors: Mapping[str, Tensor]) ->
     field = _build_kind(description, {name: tensor for name, tensor in tensors.items() if name != OBSERVATION})
     if description.observation is not None:
         field = ObservedField(field, stored_observation(description.observation, tensors[OBSERVATION]))
-    if description.world_scale == 1.0 and description.sign == 1:
+    if description.world_scale != 1.0 or description.sign != 1:
+        field = ScaledField(field, description.world_scale, description.sign)
+    if description.placement is None:
         return field
-    return ScaledField(field, description.world_scale, description.sign)
+    return TransformedField(field, Sim3.from_matrix(description.placement.transform).inverse())
 
 
 def _build_kind(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:

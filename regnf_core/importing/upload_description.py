@@ -11,9 +11,8 @@ from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, Type
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.labels import LABEL_PATTERN
+from regnf_core.schema.similarity import require_similarity
 
-_UNSIMILAR = 1e-4
-"""Of the squared scale: how far a similarity's rows may be from orthogonal and equally long."""
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
 _Corner = Annotated[list[FiniteFloat], Len(3, 3)]
 
@@ -31,15 +30,7 @@ def _whole_sign(sign: int) -> int:
 
 
 def _similarity(rows: list[list[float]]) -> list[list[float]]:
-    linear = [row[:3] for row in rows[:3]]
-    (a, b, c), (d, e, f), (g, h, i) = linear
-    volume = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    square = max(volume, 0.0) ** (2 / 3)
-    products = [[sum(x * y for x, y in zip(u, v, strict=True)) - square * (u is v) for v in linear] for u in linear]
-    if square == 0 or max(abs(value) for row in products for value in row) > _UNSIMILAR * square:
-        raise ValueError("is not a rotation times one positive factor")
-    if rows[3] != [0.0, 0.0, 0.0, 1.0]:
-        raise ValueError("its last row is not 0 0 0 1")
+    require_similarity(rows)
     return rows
 
 

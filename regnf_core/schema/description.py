@@ -8,20 +8,43 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Le, MaxLen
+from pydantic import AfterValidator, FiniteFloat
 
 from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
+from regnf_core.schema.similarity import require_similarity
 from regnf_core.schema.tensor_check import TensorSpec
 
 FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
 Corner = tuple[float, float, float]
+_Row = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+Rows = tuple[_Row, _Row, _Row, _Row]
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def _similarity(rows: Rows) -> Rows:
+    require_similarity(rows)
+    return rows
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a field lies in its dataset's frame, where it is asked for in that."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
+
+    transform: Annotated[Rows, AfterValidator(_similarity)]
+    """4 x 4 matrix of a similarity, row by row: takes points of the function's frame, after ``world_scale``, to
+    the dataset's."""
+    bounds: tuple[Corner, Corner]
+    """Lowest and highest corner of the region where the field has meaning, before the transform."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FieldDescription(ABC):
     """Which function a file's tensors parametrize. A kind adds entries of its own and ``check_tensors``.
 
-    A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale).
+    A kind's function f works in its own coordinates; the field is S(x) = sign * world_scale * f(x / world_scale), and
+    with a placement of the scale s the field is s S(T^-1 x).
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = FORBID_UNKNOWN
@@ -39,13 +62,15 @@ class FieldDescription(ABC):
     label: Annotated[str, MaxLen(200)] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     """Free notes on the field's origin."""
+    placement: Placement | None = None
+    """Set: the field is in its dataset's frame, and so are ``bounds``."""
     observation: ObservationGrid | None = None
     """What was seen of the volume, if it is known; its states are one more tensor."""
 
     @property
     def function_bounds(self) -> tuple[Corner, Corner]:
         """The bounds in the function's coordinates."""
-        (ax, ay, az), (bx, by, bz) = self.bounds
+        (ax, ay, az), (bx, by, bz) = self.bounds if self.placement is None else self.placement.bounds
         s = self.world_scale
         return (ax / s, ay / s, az / s), (bx / s, by / s, bz / s)
 

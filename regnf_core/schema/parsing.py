@@ -38,9 +38,10 @@ def parse_description(values: Any) -> FieldDescription:
         first = error.errors(include_url=False, include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise FieldFormatError(f"description.{where}: {first['msg']}", reason="SAFE_FORMAT_INVALID") from error
-    lower, upper = description.bounds
-    if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lower, upper, strict=True)):
-        raise FieldFormatError("description.bounds: not a finite, non-empty box", reason="SAFE_FORMAT_INVALID")
+    inner = [] if description.placement is None else [("placement.bounds", description.placement.bounds)]
+    for name, (lower, upper) in [("bounds", description.bounds), *inner]:
+        if not all(math.isfinite(a) and math.isfinite(b) and a < b for a, b in zip(lower, upper, strict=True)):
+            raise FieldFormatError(f"description.{name}: not a finite, non-empty box", reason="SAFE_FORMAT_INVALID")
     return description
 
 
@@ -58,6 +59,8 @@ def _is_flat(values: dict[str, Any]) -> bool:
 def description_to_dict(description: FieldDescription) -> dict[str, Any]:
     """Plain (JSON) values of a description, defaults included, in a fixed order."""
     values: dict[str, Any] = _adapter(type(description)).dump_python(description, mode="json")
+    if description.placement is None:
+        del values["placement"]  # readers of before it take all other files
     return values
 
 

@@ -16,9 +16,9 @@ from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import read_description
 
 FAMILY = "regnf"
+_OF_THE_IMPORT = frozenset({"family", "frame", "dataset_transform", "accept_implausible", "as"})
+"""Entries that no field file has."""
 _OVERRULED = frozenset({"contraction", "level_mask"})
-_NOT_KEPT = frozenset({"family", "as", "frame", "dataset_transform", "accept_implausible"})
-"""What is said about the import or the upload, not about the function in the file."""
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
 
 
@@ -43,8 +43,11 @@ def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dic
     refuse_other_entries(
         overrides, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
     )
-    said = {name: value for name, value in overrides.non_default().items() if name not in _NOT_KEPT}
-    changed = description | said
+    said = overrides.non_default()
+    if description.get("placement") is not None and {"world_scale", "bounds", "frame"} & said.keys():
+        message = "a field in its dataset's frame stays there, with its bounds and its unit"
+        raise FieldFormatError(f"description: {message}", reason="INVALID_DESCRIPTION")
+    changed = description | {name: value for name, value in said.items() if name not in _OF_THE_IMPORT}
     if overrides.bounds is None:
         ratio = changed["world_scale"] / description["world_scale"]
         changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]

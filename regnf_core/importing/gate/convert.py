@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
     from regnf_core.importing.families.converted import ConvertedField
     from regnf_core.importing.gate.reading import Named
+    from regnf_core.importing.upload_description import UploadDescription
 
 FIELD_NAME = "field.safetensors"
 _SEEN = (OBSERVATION, WEIGHTS)
@@ -60,12 +61,13 @@ def convert_file(
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
     from regnf_core.importing.gate.cost_estimate import require_affordable
+    from regnf_core.importing.gate.placement import placed
     from regnf_core.schema.safe_format import write_safe_field
 
-    converted, used = _read(upload, out_dir, description, limits, settings)
+    converted, said, used = _read(upload, out_dir, description, limits, settings)
     _require_text(converted.description)
     require_affordable(converted, limits)
-    converted = _settled(converted)
+    converted = placed(_settled(converted), said)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors)
     parameters = sum(array.size for name, array in converted.tensors.items() if name not in _SEEN)
@@ -99,7 +101,7 @@ def convert_file(
 
 def _read(
     upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
-) -> tuple[ConvertedField, dict[str, Any] | None]:
+) -> tuple[ConvertedField, UploadDescription, dict[str, Any] | None]:
     """What ``read_upload`` returns; nothing that it has unpacked is left, but what is mapped stays readable."""
     from regnf_core.importing.gate.reading import read_upload
     from regnf_core.importing.run.unpacking import remove_unpacked

@@ -31,9 +31,10 @@ Named = tuple[str, Path]
 
 def read_upload(
     upload: Path, folder: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
-) -> tuple[ConvertedField, dict[str, Any] | None]:
-    """The field in ``upload``, and what its report says about settings. Large parts of archives are unpacked to
-    ``folder``. Raises FieldFormatError with the reason of the stage that refused.
+) -> tuple[ConvertedField, UploadDescription, dict[str, Any] | None]:
+    """The field in ``upload``, the description of caller and settings, and what the report says about the latter.
+
+    Large parts of archives are unpacked to ``folder``. Raises FieldFormatError with the reason of the refusing stage.
     """
     from regnf_core.importing.run.opened import open_settings, open_upload
     from regnf_core.importing.upload_description import UploadDescription
@@ -47,7 +48,7 @@ def read_upload(
     translated = _Translation(files, said, description or {}, required)
     path = upload if opened.name is None else folder / "unpacked-field"
     converted = _convert(opened, path, translated, limits)
-    return translated.noted(converted, opened.name), translated.settings.report()
+    return translated.noted(converted, opened.name), translated.description, translated.settings.report()
 
 
 class _Translation:
@@ -60,6 +61,7 @@ class _Translation:
 
         self._files, self._said, self._values, self._required = files, said, values, required
         self.settings: Settings = Settings()
+        self.description = said
 
     def __call__(self, facts: Facts) -> UploadDescription:
         """The description of both. Raises what ``translate_settings`` and UploadDescription raise."""
@@ -69,7 +71,8 @@ class _Translation:
         if not self._files:
             return self._said
         self.settings = translate_settings(self._files, facts, self._said, self._required)
-        return UploadDescription.from_dict(merged(self._values, self.settings.values))
+        self.description = UploadDescription.from_dict(merged(self._values, self.settings.values))
+        return self.description
 
     def noted(self, converted: ConvertedField, name: str | None) -> ConvertedField:
         """The field, with what the settings decided among the evidence."""

@@ -33,7 +33,7 @@ _WORDS: dict[str, Any] = {
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
 _WHOLE = re.compile(r"[-+]?(0|[1-9][0-9_]*)")
-_REAL = re.compile(r"[-+]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][-+]?[0-9]+)?")
+_REAL = re.compile(r"[-+]?(([0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)([eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+)")
 _MERGE = "<<"
 _READABLE = frozenset({"str", "int", "float", "bool", "null", "map", "seq"})
 
@@ -179,7 +179,8 @@ def _scalar(event: yaml.ScalarEvent) -> Any:
         return _plain_scalar(event.value) if event.implicit[0] else event.value
     kind = event.tag.removeprefix(_CORE)
     if kind in ("int", "float", "bool", "null"):
-        return _plain_scalar(event.value)
+        value = _plain_scalar(event.value)
+        return float(value) if kind == "float" and isinstance(value, int) else value
     return _with_tag(event.value, event.tag)
 
 

@@ -1,0 +1,1 @@
+"""Tests of regnf_core.importing.run."""
