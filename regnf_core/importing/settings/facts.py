@@ -43,6 +43,11 @@ class Facts:
         """How many tensors there are with ``part`` in their keys that end so."""
         return sum(part in name and name.endswith(end) for name in self.tensors)
 
+    def hidden_layers(self, part: str) -> int | None:
+        """How many layers with a bias there are with ``part`` in their keys, but for the last; None without any."""
+        layers = self.count(part, ".bias")
+        return layers - 1 if layers else None
+
     def _name(self, end: str) -> str | None:
         found = [name for name in self.tensors if name == end or name.endswith("." + end)]
         return found[0] if len(found) == 1 else None

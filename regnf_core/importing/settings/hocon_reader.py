@@ -72,7 +72,7 @@ class _Reader:
         if _INCLUDE.match(self._text, self._at):
             raise unsafe(f"{self._name} includes another file; put its settings into this one")
         path = self._path()
-        self._skip()
+        self._skip(lines=True)
         if self._text.startswith("{", self._at):
             value = self._value(depth + 1, self._object_at(into, path))
         elif self._take("=") or self._take(":"):

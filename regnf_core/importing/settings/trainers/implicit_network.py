@@ -9,7 +9,7 @@ from regnf_core.importing.settings.said import Said
 from regnf_core.importing.settings.trainers.skips import agree_on_skips
 
 _NETWORK = "model.implicit_network"
-_SPHERES = ("model.scene_bounding_sphere", "model.object_bounding_sphere", "train.object_bounding_sphere")
+_SPHERES = ("model.scene_bounding_sphere", "model.ray_tracer.object_bounding_sphere", "model.object_bounding_sphere")
 
 
 def main_file(documents: Documents) -> Keys | None:
@@ -22,9 +22,8 @@ def translate(keys: Keys, said: Said) -> None:
     network = keys.below(_NETWORK)
     if network.whole("d_in") not in (None, 3):
         said.refuse(network, "d_in")
-    for key in ("use_grid_feature", "Grid_MLP"):
-        if network.flag(key) or keys.flag(f"model.{key}"):
-            said.refuse(network if network.has(key) else keys.below("model"), key)
+    if network.flag("use_grid_feature"):
+        said.refuse(network, "use_grid_feature")
     said.put("positional_encoding.degree", network.whole("multires"), network, "multires")
     dims, prefix = network.wholes("dims"), "implicit_network.lin"
     layers = said.facts.count(prefix, ".bias")

@@ -64,10 +64,7 @@ def _network(network: Keys, geometry: Keys, said: Said) -> None:
         said.refuse(network, "output_activation")
     first = said.facts.shape("geometry.network.layers.0.bias") or said.facts.shape("geometry.network.layers.0.weight_v")
     said.agree(network, "n_neurons", first[0] if first else None)
-    hidden = said.facts.count("geometry.network.layers.", ".bias") or said.facts.count(
-        "geometry.network.layers.", ".weight"
-    )
-    said.agree(network, "n_hidden_layers", hidden - 1 if hidden else None)
+    said.agree(network, "n_hidden_layers", said.facts.hidden_layers("geometry.network.layers."))
     if network.flag("sphere_init") is False:
         said.put("activation", "relu", network, "sphere_init")
     elif network.has("sphere_init"):
@@ -96,7 +93,7 @@ def _output(geometry: Keys, said: Said) -> None:
 
 def _radius(keys: Keys, said: Said) -> None:
     """The scene's half edge, which the checkpoint has too."""
-    radius = keys.number(f"{_GEOMETRY}.radius") or keys.number("model.radius")
+    radius = keys.number("model.radius")
     box = said.facts.few("scene_aabb")
     if radius is None or box is None:
         return

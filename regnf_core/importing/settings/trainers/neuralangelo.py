@@ -32,8 +32,7 @@ def translate(keys: Keys, said: Said) -> None:
     _open_levels(keys, encoding, said)
     first = said.facts.shape("neural_sdf.mlp.linears.0.bias")
     said.agree(network, "hidden_dim", first[0] if first else None)
-    layers = said.facts.count("neural_sdf.mlp.linears.", ".bias")
-    said.agree(network, "num_layers", layers - 1 if layers else None)
+    said.agree(network, "num_layers", said.facts.hidden_layers("neural_sdf.mlp.linears."))
     _frame(keys, said)
 
 

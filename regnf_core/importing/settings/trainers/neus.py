@@ -29,7 +29,7 @@ def translate(keys: Keys, said: Said) -> None:
     if scale is not None:
         said.put("input_scale", scale, network, "scale")
         said.put("output_scale", 1.0 / scale, network, "scale")
-    said.agree(network, "n_layers", said.facts.count("sdf_network_fine.lin", ".bias") - 1 or None)
+    said.agree(network, "n_layers", said.facts.hidden_layers("sdf_network_fine.lin"))
     first = said.facts.shape("sdf_network_fine.lin0.bias")
     said.agree(network, "d_hidden", first[0] if first else None)
     agree_on_skips(network, "skip_in", "sdf_network_fine.lin", said)

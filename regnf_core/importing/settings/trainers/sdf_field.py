@@ -40,7 +40,7 @@ def translate(keys: Keys, said: Said) -> None:
         said.put("family", "nerfstudio_neus_facto", keys, "method_name")
     elif layers is not None:
         said.put("family", _variant(layers), field, "num_layers")
-    said.agree(field, "num_layers", said.facts.count("field.glin", ".bias") - 1 or None)
+    said.agree(field, "num_layers", said.facts.hidden_layers("field.glin"))
     width = said.facts.shape("field.glin0.bias")
     said.agree(field, "hidden_dim", width[0] if width and layers else None)
     _grid(

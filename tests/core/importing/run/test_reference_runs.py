@@ -1,0 +1,150 @@
+"""Runs as their trainers leave them, whole or packed, against values computed by the trainers' own code."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import tarfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from regnf_core.fields.build import open_field
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
+from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.report import ImportLimits
+from regnf_core.importing.run.folder import find_run, pack_settings
+from tests.core.importing.archives import assert_refused
+from tests.core.importing.test_reference_checkpoints import assert_reproduces
+from tests.devdata import dev_data
+
+RUNS = {"instant_nsr_pl": "exp", "neuralangelo": "."}
+SAID: dict[str, dict[str, Any]] = {"deepsdf": {"latent_index": 1}}
+
+
+def with_settings(folder: Path, out: Path, said: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The report of the run in ``folder``, its settings packed as for the gate."""
+    run = find_run(folder)
+    packed = pack_settings(run, out)
+    return convert_file(run.checkpoint, out, said, ImportLimits(), settings=(packed.name, packed))
+
+
+def zipped(folder: Path) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in sorted(folder.rglob("*")):
+            archive.write(path, Path("run") / path.relative_to(folder))
+    return buffer.getvalue()
+
+
+def tarred(folder: Path) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.PAX_FORMAT) as archive:
+        archive.add(folder, "./run/" + "long-" * 30)  # beyond what the plain header holds
+    return buffer.getvalue()
+
+
+PACKINGS: dict[str, Callable[[Path], bytes]] = {
+    "zip": zipped,
+    "tar": tarred,
+    "tar.gz": lambda folder: gzip.compress(tarred(folder)),
+    "tar.bz2": lambda folder: bz2.compress(tarred(folder)),
+    "tar.xz": lambda folder: lzma.compress(tarred(folder), preset=0),
+}
+
+
+@pytest.mark.parametrize("family", RUNS)
+def test_a_run_with_its_settings_is_reproduced(tmp_path: Path, family: str) -> None:
+    folder = dev_data("formats", family)
+    report = with_settings(folder, tmp_path, SAID.get(family))
+    assert report["family"] == family
+    assert report["settings"]["used"]["family"] == family
+    assert report["warnings"] == []
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+
+
+@pytest.mark.parametrize("packing", PACKINGS)
+def test_a_whole_run_in_one_archive_is_reproduced(tmp_path: Path, packing: str) -> None:
+    folder = dev_data("formats", "instant_nsr_pl")
+    upload = tmp_path / f"run.{packing}"
+    upload.write_bytes(PACKINGS[packing](folder / RUNS["instant_nsr_pl"]))
+    report = convert_file(upload, tmp_path, None, ImportLimits())
+    assert report["settings"]["trainer"] == "instant-nsr-pl"
+    assert report["why"][0].endswith("ckpt/epoch=0-step=20000.ckpt")
+    assert_reproduces(tmp_path / FIELD_NAME, folder)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [FIELD_NAME, upload.name]
+
+
+def test_a_run_through_the_gate_s_own_process(tmp_path: Path) -> None:
+    """The settings are opened before the process is confined, and what is unpacked lies in its own folder."""
+    folder = dev_data("formats", "neuralangelo")
+    upload = tmp_path / "run.tgz"
+    upload.write_bytes(gzip.compress(tarred(folder / "logs")))
+    sphere = folder / "datasets" / "toy" / "transforms.json"
+    report = import_field(upload, tmp_path / "packed", {"frame": "field"})
+    assert report.settings is not None
+    assert report.settings["files"] == ["config.yaml"]
+    run = find_run(folder)
+    packed = pack_settings(run, tmp_path)
+    report = import_field(run.checkpoint, tmp_path / "beside", settings=packed)
+    assert report.settings is not None
+    assert report.settings["files"] == ["config.yaml", sphere.name]
+    assert any("dataset's frame is known" in line for line in report.why)
+
+
+def test_a_field_in_its_dataset_s_frame(tmp_path: Path) -> None:
+    folder = dev_data("formats", "neuralangelo")
+    report = with_settings(folder, tmp_path, {"frame": "dataset"})
+    points = torch.from_numpy(np.load(folder / "points_world.npy")).float()
+    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(points)
+    expected = 1.75 * np.load(folder / "sdf.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+    np.testing.assert_allclose(gradient.numpy(), np.load(folder / "gradient.npy"), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(report["bounds"], [[-1.55, -2.15, -0.65], [1.95, 1.35, 2.85]], atol=1e-6)
+
+
+def test_world_scale_scales_the_dataset_s_unit(tmp_path: Path) -> None:
+    folder = dev_data("formats", "neuralangelo")
+    with_settings(folder, tmp_path, {"frame": "dataset", "world_scale": 0.1})
+    points = 0.1 * torch.from_numpy(np.load(folder / "points_world.npy")).float()
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(points)
+    expected = 0.175 * np.load(folder / "sdf.npy").reshape(-1)
+    np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=2e-5 * np.ptp(expected))
+
+
+def test_a_placed_field_is_taken_again_and_stays_where_it_is(tmp_path: Path) -> None:
+    folder = dev_data("formats", "neuralangelo")
+    with_settings(folder, tmp_path, {"frame": "dataset"})
+    again = tmp_path / "again"
+    again.mkdir()
+    convert_file(tmp_path / FIELD_NAME, again, {"label": "placed"}, ImportLimits())
+    points = torch.from_numpy(np.load(folder / "points_world.npy")).float()
+    before, after = (open_field(path / FIELD_NAME).signed_distance(points) for path in (tmp_path, again))
+    assert torch.equal(before, after)
+    for said in ({"world_scale": 2.0}, {"frame": "dataset"}):
+        assert_refused(
+            lambda said=said: convert_file(tmp_path / FIELD_NAME, again, said, ImportLimits()), "INVALID_DESCRIPTION"
+        )
+
+
+def test_the_dataset_s_frame_must_be_known(tmp_path: Path) -> None:
+    checkpoint = find_run(dev_data("formats", "neuralangelo")).checkpoint
+    assert_refused(
+        lambda: convert_file(checkpoint, tmp_path, {"frame": "dataset"}, ImportLimits()), "INVALID_DESCRIPTION"
+    )
+
+
+def test_another_run_s_settings_are_refused(tmp_path: Path) -> None:
+    checkpoint = find_run(dev_data("formats", "neuralangelo")).checkpoint
+    other = find_run(dev_data("formats", "instant_nsr_pl")).settings[0]
+    assert_refused(
+        lambda: convert_file(checkpoint, tmp_path, None, ImportLimits(), settings=(other.name, other)),
+        "FAMILY_NOT_SUPPORTED",
+    )
