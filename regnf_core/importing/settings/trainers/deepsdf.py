@@ -38,7 +38,7 @@ def _agree(keys: Keys, network: Keys, said: Said) -> None:
         return
     said.agree(keys, "CodeLength", first[1] - 3)
     dims = network.wholes("dims")
-    layers = said.facts.count("lin", ".bias") - said.facts.count("bn", ".bias")
+    layers = said.facts.count("lin", ".bias")
     if dims is not None:
         if len(dims) != layers - 1:
             raise contradiction(f"{keys.file}: NetworkSpecs.dims", f"{len(dims)} hidden layers", layers - 1)
