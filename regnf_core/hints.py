@@ -31,7 +31,6 @@ HINTS: dict[str, str] = {
     "iterations.",
     "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote; docs/families.md lists what is taken.",
     "FORMAT_NOT_SUPPORTED": "docs/families.md lists the files that are taken.",
-    "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it.",
     "FIELD_NOT_RECOGNIZED": "docs/families.md lists the networks that are taken, and what a description may add.",
     "FILE_EMPTY": "Copy or download the file again.",
     "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",

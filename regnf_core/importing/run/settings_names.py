@@ -11,6 +11,7 @@ _LEVELS = 4
 RUN_FILES = (
     "config.yml",
     "config.yaml",
+    "config.json",
     "parsed.yaml",
     "config/parsed.yaml",
     "config/config.yaml",

@@ -21,6 +21,7 @@ from regnf_core.importing.settings.trainers import (
     fusion,
     implicit_network,
     instant_nsr_pl,
+    isdf,
     neuralangelo,
     neus,
     pin_slam,
@@ -48,6 +49,7 @@ TRAINERS = (
     Trainer(lambda _: "IDR, VolSDF or MonoSDF", implicit_network),
     Trainer(lambda _: "DeepSDF", deepsdf),
     Trainer(lambda _: "PIN-SLAM", pin_slam),
+    Trainer(lambda _: "iSDF", isdf),
     Trainer(lambda _: "a network of sines", sines),
     Trainer(lambda _: "a map of truncated distances", fusion),
 )

@@ -1,0 +1,28 @@
+"""The table of the comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.trainer_runs.compare import Outcome
+
+_HEAD = "| trainer | runs | within 1e-5 | within 1e-3 | wrong, untold | refused or asked | s (median) | reasons |"
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """One row a trainer, and one for all."""
+    names = list(dict.fromkeys(outcome.trainer for outcome in outcomes))
+    rows = [_row(name, [o for o in outcomes if o.trainer == name]) for name in names]
+    return "\n".join([_HEAD, "|---" * 8 + "|", *rows, _row("all", outcomes)])
+
+
+def _row(name: str, outcomes: Sequence[Outcome]) -> str:
+    counts = {kind: sum(o.kind == kind for o in outcomes) for kind in ("exact", "right", "wrong", "refused")}
+    seconds = sorted(o.seconds for o in outcomes)[len(outcomes) // 2]
+    reasons = [o.reason for o in outcomes if o.reason]
+    told = ", ".join(f"{reason} {reasons.count(reason)}" for reason in sorted(set(reasons)))
+    within = counts["exact"] + counts["right"]
+    return (
+        f"| {name} | {len(outcomes)} | {counts['exact']} | {within} | {counts['wrong']} | {counts['refused']}"
+        f" | {seconds:.1f} | {told} |"
+    )
