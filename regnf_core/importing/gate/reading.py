@@ -37,6 +37,7 @@ def read_upload(
     Large parts of archives are unpacked to ``folder``. Raises FieldFormatError with the reason of the refusing stage.
     """
     from regnf_core.importing.run.opened import open_settings, open_upload
+    from regnf_core.importing.run.unpacking import new_file
     from regnf_core.importing.upload_description import UploadDescription
 
     said = UploadDescription.from_dict(description)
@@ -46,7 +47,7 @@ def read_upload(
         files = open_settings(_mapped(settings[1]), settings[0], folder, limits.file_bytes)
     required = settings is not None and len(files) == 1 and files[0].name == settings[0]
     translated = _Translation(files, said, description or {}, required)
-    path = upload if opened.name is None else folder / "unpacked-field"
+    path = upload if opened.name is None else new_file(folder)
     converted = _convert(opened, path, translated, limits)
     return translated.noted(converted, opened.name), translated.description, translated.settings.report()
 

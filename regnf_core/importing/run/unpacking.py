@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import mmap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from regnf_core.errors import FieldFormatError
@@ -33,15 +34,25 @@ def kept(pieces: Iterable[bytes | memoryview], size: int, folder: Path) -> memor
     """The pieces, ``size`` bytes in all, in one. A large one lies in a new file in ``folder`` until that is removed."""
     if size <= _IN_MEMORY:
         return memoryview(b"".join(pieces))
-    path = folder / f"unpacked-{len(list(folder.glob('unpacked-*')))}"
-    with open(path, "x+b") as file:
+    with open(new_file(folder), "x+b") as file:
         for piece in pieces:
             file.write(piece)
         file.flush()
         return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
 
 
+def new_file(folder: Path) -> Path:
+    """Where the next part of an archive may be written."""
+    return next(path for path in _places(folder) if not path.exists())
+
+
 def remove_unpacked(folder: Path) -> None:
-    """Remove the files that ``kept`` has made. What is mapped stays readable."""
-    for path in folder.glob("unpacked-*"):
+    """Remove the files that were written to ``new_file``. What is mapped stays readable."""
+    for path in _places(folder):
+        if not path.exists():
+            return
         path.unlink()
+
+
+def _places(folder: Path) -> Iterator[Path]:
+    return (folder / f"unpacked-{number}" for number in itertools.count())

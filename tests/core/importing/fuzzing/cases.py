@@ -16,7 +16,8 @@ from tests.core.importing.fuzzing.seeds import EMPTY, Seeds
 STAGES = ("container", "pickle", "tensors", "header", "file", *SPOILERS)
 """container: any bytes as an archive. pickle: any bytes as a pickle. tensors: an archive that is sound but for its
 pickle and storages, up to the field. header: any bytes as a safetensors file. file: any bytes as an upload. legacy,
-arrays, database, mesh, onnx: a file of that container, damaged, as an upload; other: so other trainers' checkpoints."""
+arrays, database, mesh, onnx: a file of that container, damaged, as an upload; other: so other trainers' checkpoints;
+run: so an archive of a run. settings: a file of settings behind a line with its name."""
 
 _LEGACY = bytes.fromhex("80028a0a6cfc9c46f9206aa850192e")
 

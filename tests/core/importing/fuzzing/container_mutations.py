@@ -15,6 +15,7 @@ from tests.core.importing.fuzzing.archive_model import Ending, Record, archive_b
 from tests.core.importing.fuzzing.byte_mutations import NUMBERS, damaged, little, number
 from tests.core.importing.fuzzing.header_mutations import altered
 from tests.core.importing.fuzzing.pickle_mutations import opcodes_of, respelt
+from tests.core.importing.fuzzing.run_mutations import repacked, spoilt_settings
 from tests.core.importing.fuzzing.wire_mutations import rewired
 
 _WORDS: tuple[bytes, ...] = (
@@ -50,6 +51,11 @@ _VALUES: tuple[str, ...] = (
     *("NULL", "1", "-1", "0", "1e308", "9e999", "'x'", "x''", "9223372036854775807", "1048577", _BLOB),
     *("zeroblob(4096)", "zeroblob(2000000)", "cast(zeroblob(4096) as text)", "{random}"),
 )
+
+
+def spoilt_run(random: Random, file: bytes, other: bytes) -> bytes:
+    """An archive of a run: a zip as any other, a tar by its headers."""
+    return spoilt(random, file, other) if file.startswith(b"PK\x03\x04") else repacked(random, file, other)
 
 
 def spoilt(random: Random, file: bytes, other: bytes) -> bytes:
@@ -226,5 +232,7 @@ SPOILERS: dict[str, Callable[[Random, bytes, bytes], bytes]] = {
     "mesh": spoilt_mesh,
     "onnx": spoilt_model,
     "other": spoilt,
+    "run": spoilt_run,
+    "settings": spoilt_settings,
 }
 """What damages the files of each stage that is named after a container."""

@@ -22,6 +22,7 @@ from tests.core.importing import (
 )
 from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
+from tests.core.importing.fuzzing.run_files import make_runs, make_settings
 from tests.core.importing.meshes import mesh_files, test_point_clouds
 
 
@@ -34,6 +35,8 @@ def make_others() -> dict[str, dict[str, bytes]]:
         "mesh": _mesh_files(),
         "onnx": _models(),
         "other": _checkpoints(),
+        "run": _runs(),
+        "settings": make_settings(),
     }
 
 
@@ -79,6 +82,13 @@ def _checkpoints() -> dict[str, bytes]:
     for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
         files[make.__name__] = _saved(make().checkpoint)
     return files
+
+
+def _runs() -> dict[str, bytes]:
+    whole = small.deepsdf().checkpoint
+    network = {name: value for name, value in whole.items() if name != "latent_codes"}
+    scaling = _arrays(offset=np.zeros(3, np.float32), scale=np.array([0.5], np.float32))
+    return make_runs(_saved(network), _saved({"epoch": 1, "latent_codes": whole["latent_codes"]}, legacy=True), scaling)
 
 
 def _bytes(data: bytes | str) -> bytes:

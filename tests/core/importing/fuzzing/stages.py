@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,15 +15,19 @@ from regnf_core.importing.containers.safetensors_header import read_header
 from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
 from regnf_core.importing.gate.cost_estimate import require_affordable
+from regnf_core.importing.gate.placement import placed
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.pickle.pickle_reader import read_pickle
+from regnf_core.importing.run.opened import SettingsFile
+from regnf_core.importing.settings.facts import Facts
+from regnf_core.importing.settings.translate import merged, translate_settings
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import write_safe_field
 
 BUDGET = 1 << 24
 """Bytes of tensors that one case may have."""
-PARTS = ("container", "pickle", "tensors", "header")
+PARTS = ("container", "pickle", "tensors", "header", "settings")
 """The stages that see a part of the gate; all others begin with a whole file."""
 _TAKEN = "taken"
 _LIMITS = ImportLimits(tensor_bytes=BUDGET)
@@ -59,7 +64,7 @@ class Watch:
     def _hear(self, event: str, args: tuple[Any, ...]) -> None:
         if not self._armed or event.startswith(_QUIET) or (self._files and event in ("open", "os.remove", "os.rename")):
             return
-        if self._stage == "arrays" and event == "compile" and args[1] == _LITERAL:
+        if self._stage in ("arrays", "run") and event == "compile" and args[1] == _LITERAL:
             return
         self.events.append(f"{event} {args!r:.200}")
 
@@ -85,6 +90,8 @@ def run_stage(stage: str, data: bytes, folder: Path) -> str:
                 _tensors(data)
             case "header":
                 read_header(memoryview(data))
+            case "settings":
+                _settings(data)
             case _:
                 _file(data, folder)
     except FieldFormatError as error:
@@ -117,11 +124,22 @@ def _values(value: Any) -> list[tuple[str, Any]]:
     return [(key if isinstance(key, str) else "odd", found) for key, found in members][:100]
 
 
+def _settings(data: bytes) -> None:
+    """A file of settings behind a line with its name."""
+    name, _, content = data.partition(b"\n")
+    file = SettingsFile(name.decode("latin-1"), memoryview(content))
+    facts = Facts({"step": 60_000, "global_step": 5000, "iteration": 20_000})
+    settings = translate_settings((file,), facts, UploadDescription(), required=False)
+    UploadDescription.from_dict(merged({"hash": {"levels": 4}, "world_scale": 2.0}, settings.values))
+    json.dumps(settings.report(), allow_nan=False)
+
+
 def _file(data: bytes, folder: Path) -> None:
     upload, out = folder / "upload", folder / "out"
     upload.write_bytes(data)
     try:
-        converted = convert._convert(upload, None, _LIMITS)
+        converted, said, _ = convert._read(upload, folder, None, _LIMITS, None)
+        converted = placed(converted, said)
         convert._require_text(converted.description)
         require_affordable(converted, _LIMITS)
         write_safe_field(out, converted.description, converted.tensors)
