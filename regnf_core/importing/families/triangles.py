@@ -11,6 +11,7 @@ from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.facing import SAMPLES, facing_of
+from regnf_core.importing.families.orientation import agreeing
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
@@ -30,6 +31,7 @@ def mesh_field(
     _check(geometry)
     vertices, faces = _welded(geometry.vertices, geometry.faces)
     require_within(mesh_seconds(vertices, faces, 3 * SAMPLES), work_s)
+    faces, turned = agreeing(vertices.astype(np.float64), faces)
     asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
     facing = facing_of(vertices.astype(np.float64), faces, asked)
     faces = facing.faces
@@ -42,6 +44,7 @@ def mesh_field(
         "watertight"
         if loose == 0.0
         else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
+        *turned,
         *facing.why,
         *(f"ignored: {what}" for what in geometry.left_out),
     )

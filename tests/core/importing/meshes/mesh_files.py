@@ -67,7 +67,7 @@ def off_binary(colors: int = 0) -> bytes:
         struct.pack(">5i", 3, *face, colors) + struct.pack(f">{colors}f", *[1.0] * colors) for face in FACES
     )
     counts = struct.pack(">3i", len(BALL.vertices), len(FACES), 0)
-    return b"OFF BINARY\n" + counts + BALL.vertices.astype(">f4").tobytes() + rows
+    return b"OFF BINARY\n" + counts + bytes(BALL.vertices.astype(">f4").tobytes()) + rows
 
 
 def dae(body: str = "", nodes: str = '<node id="n"><instance_geometry url="#g"/></node>', head: str = "") -> bytes:

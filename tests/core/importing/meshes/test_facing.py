@@ -165,3 +165,13 @@ def test_an_object_with_a_third_missing_keeps_its_inside() -> None:
     directions = ball.vertices[ball.vertices[:, 2] < 0.2]
     assert (distance(found, 0.97 * directions) < 0).all()
     assert (distance(found, 1.03 * directions) > 0).all()
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_faces_that_are_turned_among_their_neighbors_are_turned_back(share: float) -> None:
+    ball = trimesh.creation.icosphere(3)
+    turned = np.random.default_rng(4).random(len(ball.faces)) < share
+    faces = np.where(turned[:, None], ball.faces[:, ::-1], ball.faces)
+    found = converted(trimesh.Trimesh(ball.vertices, faces, process=False))
+    assert any("was turned round, to agree" in why for why in found.why)
+    np.testing.assert_array_equal(found.tensors["faces"], converted(ball).tensors["faces"])
