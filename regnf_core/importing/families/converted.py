@@ -29,6 +29,8 @@ class OpenReading:
     make: Callable[[], Reading]
     ends_at: float | None = None
     """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
+    nearby: tuple[Callable[[], Reading], ...] = ()
+    """Readings a little off this one, which behave less well if it is the right one of a family of many."""
 
 
 @dataclass(frozen=True)

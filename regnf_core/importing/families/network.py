@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -148,6 +148,8 @@ class OpenForm:
     """Where its layers are other ones than the network's own."""
     ends_at: float | None = None
     """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
+    scale_is_open: bool = False
+    """Whether the activation's factor is a guess at a number that might be any."""
 
 
 def network_field(
@@ -162,9 +164,21 @@ def network_field(
         return network_reading(one.name, one.network or network, one.form, entries, {"family": one.family})
 
     first = make(forms[0])
-    others = tuple(OpenReading(one.name, one.family, partial(make, one), one.ends_at) for one in forms)
+    others = tuple(_open_reading(one, make) for one in forms)
     tried = others if assumed or len(forms) > 1 else ()
     return ConvertedField(forms[0].family, why, first.description, first.tensors, open_readings=tried)
+
+
+def _open_reading(one: OpenForm, make: Callable[[OpenForm], Reading]) -> OpenReading:
+    nearby = [partial(make, replace(one, form=form)) for form in _nearby(one.form)] if one.scale_is_open else []
+    return OpenReading(one.name, one.family, partial(make, one), one.ends_at, tuple(nearby))
+
+
+def _nearby(form: Form) -> list[Form]:
+    """With the activation's factor a little smaller and larger."""
+    if form.activation not in _USUAL_SCALES:
+        return []
+    return [replace(form, activation_scale=form.scale * factor) for factor in (0.93, 1.07)]
 
 
 def _folded(network: Network, form: Form) -> dict[str, Float32Array]:

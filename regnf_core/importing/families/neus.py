@@ -78,9 +78,7 @@ def _converted(
     form = Form("softplus", degree=degree, skip_factor=math.sqrt(0.5)).said(scaled(overrides))
     forms = [OpenForm("as the description says", form, family)]
     if scales:
-        forms = [
-            OpenForm(f"input_scale {s:g}", replace(form, input_scale=s, output_scale=1.0 / s), family) for s in scales
-        ]
+        forms = [_at_scale(form, scale, overrides.world_scale or 1.0) for scale in scales]
     why = (
         f"keys {where}.lin*, {len(names)} layers, {degree} frequencies",
         "bounds [-1, 1]: the unit sphere's cube, in which it trains",

@@ -59,12 +59,14 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     layers = read_layers(state, chain.names, source, None, overrides.output_column or 0)
     network = Network(layers, chain.skips)
     forms = list(open_forms(network, degree, overrides))
+    if not forms:
+        raise FieldFormatError("description: no network of plain layers is so", reason="INVALID_DESCRIPTION")
     place = f" under {where}" if where.isprintable() and where else ""
     why = (
         f"a chain of {len(chain.names)} linear layers{place}, of {chain.input_width} numbers",
         "bounds [-1, 1]: assumed; say bounds if the field's region is another",
     )
-    converted = network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why, assumed=True)
+    converted = network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why)
     return replace(converted, sign_is_open=overrides.sign is None)
 
 
@@ -89,7 +91,7 @@ def open_forms(network: Network, degree: int, overrides: UploadDescription) -> I
         (*_ACTIVATIONS, *(("sine", omega) for omega in OMEGAS if not degree)),
         (0, 1),
     ):
-        if overrides.activation not in (None, activation):
+        if not _may_be(overrides, activation, scale, tanh):
             continue
         base = Form(
             activation,
@@ -101,12 +103,28 @@ def open_forms(network: Network, degree: int, overrides: UploadDescription) -> I
             input_first=first,
             output_tanh=tanh,
         )
-        if overrides.activation_scale is not None and scale is None:
-            continue
         form = base.said(overrides)
         if form not in seen:
             seen.add(form)
-            yield OpenForm(_told(form, bool(network.skips)), form, FAMILY)
+            name = _told(form, bool(network.skips))
+            yield OpenForm(name, form, FAMILY, scale_is_open=overrides.activation_scale is None)
+
+
+def _may_be(overrides: UploadDescription, activation: str, scale: float | None, tanh: int) -> bool:
+    """Whether what the description says has a meaning for such a form."""
+    said = overrides.activation_scale
+    if overrides.activation not in (None, activation):
+        return False
+    if (
+        said is not None
+        and overrides.activation is None
+        and (scale is None or (activation == "leaky_relu" and said > 1.0))
+    ):
+        return False
+    if overrides.first_activation_scale is not None and overrides.activation is None and activation != "sine":
+        return False
+    scaled = overrides.output_scale is not None or overrides.output_bias is not None
+    return not (scaled and tanh and overrides.output_tanh is None)
 
 
 def _told(form: Form, skips: bool) -> str:

@@ -40,8 +40,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         f"keys {_PREFIX}*.0, {len(names)} layers",
         "bounds [-1, 1]: beyond the cube in which SIREN trains its sines repeat",
     )
-    forms = [OpenForm(sine_name(form), form, FAMILY) for form in sine_forms(said, overrides)]
     assumed = overrides.activation_scale is None
+    forms = [OpenForm(sine_name(form), form, FAMILY, scale_is_open=assumed) for form in sine_forms(said, overrides)]
     converted = network_field(Network(layers), forms, shared_entries(overrides, UNIT_CUBE), why, assumed)
     return replace(converted, sign_is_open=overrides.sign is None)
 

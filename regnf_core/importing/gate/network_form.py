@@ -8,6 +8,7 @@ training ended. What none of this decides is refused with what to say.
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -35,6 +36,8 @@ _CLEARLY = 1.5
 """So many times the best one's misfit, or error of values, must another reading's be to be left out."""
 _MARGIN = 0.03
 """And greater by this."""
+_BETTER = 0.97
+"""So much less misfit of a reading near the chosen one says that neither is right."""
 _FINALISTS = 8
 _SHOWN = 4
 _SHARP_END = 2.5
@@ -72,6 +75,8 @@ def settle_form(converted: ConvertedField) -> ConvertedField:
     chosen, how = _decided(finalists)
     if len(tried) < len(converted.open_readings):
         raise _undecided([chosen], "the network is too large to try all")
+    if any(full_trial(quick_trial(make())).misfit < _BETTER * chosen.misfit for make in chosen.open.nearby):
+        raise _undecided([chosen], "others near the usual ones behave better")
     reading = chosen.open.make()
     why = f"{chosen.open.name}: {how}; {len(converted.open_readings)} readings were tried"
     return replace(
@@ -104,21 +109,15 @@ def _finalists(readings: Sequence[OpenReading]) -> list[_Candidate]:
 
 def _decided(finalists: list[_Candidate]) -> tuple[_Candidate, str]:
     best = finalists[0]
+    if any(one.open.ends_at is not None for one in finalists):
+        return _by_end(finalists)
     limit = max(_CLEARLY * best.misfit, best.misfit + _MARGIN)
     rivals = _different([one for one in finalists if one.misfit <= limit])
     how = f"the gradient's length near the surface differs from 1 by {best.misfit:.3f} in the mean"
     others = [one.misfit for one in finalists if one.misfit > limit]
     if others:
         how += f", in the next reading by {min(others):.3f}"
-    if len(rivals) == 1:
-        return rivals[0], how
-    by_end = _by_end(rivals)
-    if by_end is not None:
-        return by_end
-    by_values = _by_values(rivals)
-    if by_values is not None:
-        return by_values
-    raise _undecided(rivals, "they behave alike")
+    return (rivals[0], how) if len(rivals) == 1 else _by_values(rivals)
 
 
 def _different(candidates: list[_Candidate]) -> list[_Candidate]:
@@ -130,20 +129,20 @@ def _different(candidates: list[_Candidate]) -> list[_Candidate]:
     return kept
 
 
-def _by_end(rivals: list[_Candidate]) -> tuple[_Candidate, str] | None:
-    """By where training ended, if every rival says where it would have."""
+def _by_end(candidates: list[_Candidate]) -> tuple[_Candidate, str]:
+    """By where training ended. Nothing else tells a network from itself at another scale."""
     fitting = []
-    for one in rivals:
-        ends_at = one.open.ends_at
-        if ends_at is None:
-            return None
+    for one in candidates:
         radius, contrast = end_of_training(one.field)
-        if contrast >= _SHARP_END and _END[0] <= radius / ends_at <= _END[1]:
+        ratio = radius / (one.open.ends_at or math.inf)
+        if contrast >= _SHARP_END and _END[0] <= ratio <= _END[1]:
             fitting.append((one, f"the gradient's length is 1 up to a radius of {radius:.2f} and not beyond"))
-    return fitting[0] if len(fitting) == 1 else None
+    if len(fitting) != 1:
+        raise _undecided(candidates, "where training ended does not show")
+    return fitting[0]
 
 
-def _by_values(rivals: list[_Candidate]) -> tuple[_Candidate, str] | None:
+def _by_values(rivals: list[_Candidate]) -> tuple[_Candidate, str]:
     """By how well values agree with distances to the zero level, at some reach."""
     errors = [distance_errors(one.field) for one in rivals]
     for reach in range(len(errors[0])):
@@ -152,7 +151,7 @@ def _by_values(rivals: list[_Candidate]) -> tuple[_Candidate, str] | None:
         if best < _MARGIN and second > max(3.0 * best, best + _MARGIN):
             how = f"its values differ from distances to its surface by {best:.3f} of them, the next by {second:.3f}"
             return rivals[winner], how
-    return None
+    raise _undecided(rivals, "they behave alike")
 
 
 def _as_candidates(readings: Sequence[OpenReading]) -> list[_Candidate]:

@@ -24,6 +24,7 @@ from tests.core.importing import small_families as small
 from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.fuzzing.run_files import make_runs, make_settings
 from tests.core.importing.meshes import mesh_files, test_point_clouds
+from tests.core.importing.networks.cases import FAMILIES
 
 
 def make_others() -> dict[str, dict[str, bytes]]:
@@ -71,7 +72,11 @@ def _mesh_files() -> dict[str, bytes]:
 def _models() -> dict[str, bytes]:
     layers = {"w": np.eye(3, 8, dtype=np.float32), "b": np.zeros(8, np.float32), "v": np.ones((8, 1), np.float32)}
     network = onnx_models.model("h = Gemm x w b; a = Relu h; y = MatMul a v", layers)
-    return {name: each.SerializeToString() for name, each in (("sphere", onnx_models.sphere()), ("network", network))}
+    older = onnx_models.model(
+        "h = Gemm x w b; a = Clip h min:0.0; s = Softmax a axis:1; y = MatMul s v", layers, opset=9
+    )
+    models = {"sphere": onnx_models.sphere(), "network": network, "older": older}
+    return {name: each.SerializeToString() for name, each in models.items()}
 
 
 def _checkpoints() -> dict[str, bytes]:
@@ -81,6 +86,8 @@ def _checkpoints() -> dict[str, bytes]:
     files["torch_ngp"] = _saved(test_torch_ngp.tcnn_checkpoint())
     for make in (small.neus, small.siren, small.deepsdf, small.instant_nsr_pl):
         files[make.__name__] = _saved(make().checkpoint)
+    rng = np.random.default_rng(4)
+    files |= {family: _saved(FAMILIES[family](rng, 0).checkpoint) for family in ("idr, volsdf", "igr", "plain_network")}
     return files
 
 

@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regnf_core.fields.positional_encoding import _ICOSAHEDRON
+
 Array = NDArray[np.float64]
 State = Mapping[str, Any]
+ICOSAHEDRON = _ICOSAHEDRON
+"""The directions of mip-NeRF 360's matrix P: numbers of the paper's, not worth a second table."""
 
 ACTIVATIONS: dict[str, Callable[[Array, float], Array]] = {
     "relu": lambda a, _: np.maximum(a, 0.0),
@@ -85,3 +89,31 @@ def siren(state: State, x: Array, omega: float, first: float | None = None) -> f
         a = linear(state, f"net.net.{i}.0", h)
         h = np.sin((first or omega if i == 0 else omega) * a)
     return float(linear(state, f"net.net.{count - 1}.0", h)[0])
+
+
+def isdf(state: State, x: Array, degree: int, blocks: int, scales: tuple[float, float]) -> float:
+    directions = np.array(ICOSAHEDRON)
+    y = scales[0] * x
+    angles = [2.0**k * float(y @ direction) for direction in directions for k in range(degree)]
+    given = np.concatenate((y, np.sin(angles), np.cos(angles)))
+    h = ACTIVATIONS["softplus"](linear(state, "in_layer.0", given), 100.0)
+    for i in range(blocks):
+        h = ACTIVATIONS["softplus"](linear(state, f"mid1.{i}.0", h), 100.0)
+    h = ACTIVATIONS["softplus"](linear(state, "cat_layer.0", np.concatenate((h, given))), 100.0)
+    for i in range(blocks):
+        h = ACTIVATIONS["softplus"](linear(state, f"mid2.{i}.0", h), 100.0)
+    return float(scales[1] * linear(state, "out_alpha", h)[0])
+
+
+def plain(
+    state: State, x: Array, degree: int, activation: str, scale: float, skip: int | None, factor: float, tanh: bool
+) -> float:
+    given = h = waves(x, degree)
+    count = len(state) // 2
+    for i in range(count):
+        if i == skip:
+            h = factor * np.concatenate((h, given))
+        h = linear(state, f"layers.{i}", h)
+        if i < count - 1:
+            h = ACTIVATIONS[activation](h, scale)
+    return math.tanh(h[0]) if tanh else float(h[0])

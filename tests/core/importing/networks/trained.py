@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from tests.core.importing.networks.slow_network import ICOSAHEDRON
 
 State = OrderedDict[str, Tensor]
 
@@ -127,7 +130,87 @@ class Sines(nn.Module):
         h = torch.sin(self.first * self.net[0](x))
         for i in range(1, self.count - 1):
             h = torch.sin(self.omega * self.net[i](h))
-        return self.net[self.count - 1](h)[:, 0]
+        value: Tensor = self.net[self.count - 1](h)[:, 0]
+        return value
+
+
+class OffAxis(nn.Module):
+    """iSDF's: sines along 21 directions, softplus, the input again in the middle."""
+
+    def __init__(
+        self, rng: np.random.Generator, degree: int, blocks: int, hidden: int, scales: tuple[float, float]
+    ) -> None:
+        super().__init__()
+        torch.manual_seed(int(rng.integers(1 << 30)))
+        self.degree, self.scales = degree, scales
+        width = 3 + 42 * degree
+
+        def block(columns: int) -> nn.Sequential:
+            return nn.Sequential(nn.Linear(columns, hidden), nn.Softplus(beta=100))
+
+        self.in_layer, self.cat_layer = block(width), block(hidden + width)
+        self.mid1 = nn.Sequential(*(block(hidden) for _ in range(blocks)))
+        self.mid2 = nn.Sequential(*(block(hidden) for _ in range(blocks)))
+        self.out_alpha = nn.Linear(hidden, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.scales[0] * x
+        lengths = y @ torch.tensor(ICOSAHEDRON, dtype=torch.float32).T
+        angles = (lengths[..., None] * 2.0 ** torch.arange(self.degree)).flatten(1)
+        given = torch.cat((y, angles.sin(), angles.cos()), dim=-1)
+        h = self.mid1(self.in_layer(given))
+        h = self.mid2(self.cat_layer(torch.cat((h, given), dim=-1)))
+        value: Tensor = self.scales[1] * self.out_alpha(h)[:, 0]
+        return value
+
+
+class Plain(nn.Module):
+    """A network as people write their own."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        form: tuple[str, float | None, bool],
+        degree: int,
+        hidden: int,
+        layers: int,
+        skip: tuple[int | None, float],
+    ) -> None:
+        super().__init__()
+        torch.manual_seed(int(rng.integers(1 << 30)))
+        name, scale, self.tanh = form
+        self.degree, (self.skip, self.factor) = degree, skip
+        made: dict[str, Callable[[Tensor], Tensor]] = {
+            "relu": torch.relu,
+            "softplus": nn.Softplus(beta=scale or 1.0),
+            "sine": lambda a: torch.sin((scale or 1.0) * a),
+            "tanh": torch.tanh,
+            "elu": nn.ELU(),
+            "gelu": nn.GELU(),
+            "silu": nn.SiLU(),
+            "leaky_relu": nn.LeakyReLU(scale or 0.01),
+        }
+        self.activation = made[name]
+        width = 3 + 6 * degree
+        self.layers = nn.ModuleList(
+            nn.Linear(width if i == 0 else hidden + (width if i == self.skip else 0), 1 if i == layers - 1 else hidden)
+            for i in range(layers)
+        )
+        if name == "sine":
+            for i, layer in enumerate(self.layers):
+                limit = 1 / 3 if i == 0 else math.sqrt(6.0 / hidden) / (scale or 1.0)
+                for weight in list(layer.parameters())[:1]:
+                    nn.init.uniform_(weight, -limit, limit)
+
+    def forward(self, x: Tensor) -> Tensor:
+        given = h = torch.cat([x] + [f(2.0**k * x) for k in range(self.degree) for f in (torch.sin, torch.cos)], dim=-1)
+        for i, layer in enumerate(self.layers):
+            if i == self.skip:
+                h = self.factor * torch.cat((h, given), dim=-1)
+            h = layer(h)
+            if i < len(self.layers) - 1:
+                h = self.activation(h)
+        return torch.tanh(h[:, 0]) if self.tanh else h[:, 0]
 
 
 def split(state: dict[str, Tensor], names: list[str]) -> State:

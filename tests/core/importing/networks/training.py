@@ -18,7 +18,8 @@ def in_ball(radius: float) -> Sampler:
     def sample(count: int, generator: torch.Generator) -> Tensor:
         direction = torch.randn(count, 3, generator=generator)
         length = torch.rand(count, 1, generator=generator) ** (1 / 3)
-        return radius * length * direction / direction.norm(dim=-1, keepdim=True)
+        points: Tensor = radius * length * direction / direction.norm(dim=-1, keepdim=True)
+        return points
 
     return sample
 
@@ -37,9 +38,9 @@ def train(
     steps: int = 300,
     rate: float = 1e-3,
     clamp: float | None = None,
-    batch: int = 768,
 ) -> float:
     """Fit ``network``: (N, 3) to (N,). clamp: where DeepSDF cuts distances off. Returns the last loss of the values."""
+    batch = 320
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(parameters, lr=rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, eta_min=0.02 * rate)
@@ -67,7 +68,7 @@ def train(
             (found,) = torch.autograd.grad(value.sum(), points, create_graph=True)
             loss = (value - target).abs().mean() + 0.1 * (found - slope).norm(dim=-1).mean()
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
         last = float(loss.detach())
