@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,6 +22,8 @@ Interpolation = Literal["linear", "smoothstep"]
 _ENTRY_ALIGNMENT = 8
 MAX_GROWTH = 8.0
 """Of neighboring levels' resolutions, as far as the safe format takes it."""
+_MAX_PATTERNS = 4096
+"""Most patterns of rounding that are tried."""
 _ROUNDING_REACH = 1e-3
 """A scale this close to a whole number may be rounded either way by another machine's exp2f."""
 
@@ -85,8 +87,7 @@ class HashGridConfig:
 
     def level_entries(self) -> tuple[int, ...]:
         """Table entries per level: the lattice's nodes, rounded up to a multiple of 8, at most 2^log2_table_size."""
-        cap = 1 << self.log2_table_size
-        return tuple(min(_round_up(res**3), cap) for res in self.level_resolutions())
+        return tuple(self._entries_of(res) for res in self.level_resolutions())
 
     def level_strides(self) -> tuple[int, ...]:
         """Nodes along an edge by which each level's rows are indexed."""
@@ -110,19 +111,23 @@ class HashGridConfig:
 
         Raises FieldFormatError (FIELD_SHAPES_MISMATCH) when no pattern matches.
         """
-        for candidate in self._rounding_variants():
-            if candidate.entries == entries:
-                return candidate
+        usual, total = self.level_resolutions(), self.entries
+        if total == entries:
+            return self
+        counts = {
+            level: (self._entries_of(other) - self._entries_of(usual[level]), other)
+            for level, other in self._otherwise_rounded().items()
+        }
+        others = {level: other for level, (more, other) in counts.items() if more}
+        for chosen in itertools.islice(_combinations(others), _MAX_PATTERNS):
+            if total + sum(counts[level][0] for level in chosen) == entries:
+                return replace(self, resolutions=_with_others(usual, others, chosen))
         raise FieldFormatError(
             f"hash table has {entries} entries, its description gives {self.entries}", reason="FIELD_SHAPES_MISMATCH"
         )
 
-    def _rounding_variants(self) -> Iterator[HashGridConfig]:
-        """This config, then those with other roundings of the doubtful levels, fewest changes first."""
-        yield self
-        usual = self.level_resolutions()
-        for changed in _changed(usual, self._otherwise_rounded()):
-            yield replace(self, resolutions=changed)
+    def _entries_of(self, nodes: int) -> int:
+        return min(_round_up(nodes**3), 1 << self.log2_table_size)
 
     def stride_variants(self) -> Iterator[HashGridConfig]:
         """This table indexed by other roundings of its dense, doubtful levels, fewest changes first; not this config.
@@ -134,8 +139,9 @@ class HashGridConfig:
             for level, other in self._otherwise_rounded().items()
             if self.level_is_dense()[level] and other**3 <= self.level_entries()[level]
         }
-        for changed in _changed(self.level_resolutions(), fits):
-            yield replace(self, strides=changed)
+        usual = self.level_resolutions()
+        for chosen in itertools.islice(_combinations(fits), _MAX_PATTERNS):
+            yield replace(self, strides=_with_others(usual, fits, chosen))
 
     def _otherwise_rounded(self) -> dict[int, int]:
         """The levels whose resolution hangs on the last bit of exp2f, each with its other resolution."""
@@ -148,11 +154,16 @@ class HashGridConfig:
         return doubtful
 
 
-def _changed(usual: tuple[int, ...], others: dict[int, int]) -> Iterator[tuple[int, ...]]:
-    """``usual`` with one or more levels replaced by their other value, fewest changes first."""
-    for changes in range(1, len(others) + 1):
-        for chosen in itertools.combinations(others, changes):
-            yield tuple(others[level] if level in chosen else value for level, value in enumerate(usual))
+def _combinations(levels: Iterable[int]) -> Iterator[tuple[int, ...]]:
+    """Every choice of one or more of the levels, fewest first."""
+    listed = tuple(levels)
+    for count in range(1, len(listed) + 1):
+        yield from itertools.combinations(listed, count)
+
+
+def _with_others(usual: tuple[int, ...], others: dict[int, int], chosen: tuple[int, ...]) -> tuple[int, ...]:
+    """``usual`` with the ``chosen`` levels replaced by their other value."""
+    return tuple(others[level] if level in chosen else value for level, value in enumerate(usual))
 
 
 def _round_up(nodes: int) -> int:

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 SAMPLES = 16_384
 """Points that a field is checked at."""
-TRIAL_SAMPLES = 4_096
-"""Points that each of several readings is checked at."""
+TRIAL_POINTS = 1_024
+"""Points that each of several readings is tried at, with its gradient."""
+FINAL_POINTS, FINALISTS = 8_192, 12
+"""Points of the second round, and how many readings may come into it."""
 NEAREST_SHARE = 16
 ASKED_AGAIN = 64
 STEPS = 8
@@ -33,3 +35,9 @@ def calls_of_check(samples: int) -> Calls:
     """What one check of plausibility evaluates."""
     nearest = samples // NEAREST_SHARE
     return Calls((samples, ASKED_AGAIN, FACES * (samples // FACE_SHARE)), (nearest,) * (STEPS + 1))
+
+
+def calls_of_trials(readings: int) -> Calls:
+    """What the choice among so many readings evaluates at most: both rounds, and two interpolations."""
+    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + 2)
+    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS), (TRIAL_POINTS,) * (readings + 1) + final)

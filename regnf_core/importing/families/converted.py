@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from regnf_core.importing.arrays import StoredArray
 
@@ -17,6 +17,15 @@ class Reading:
     """A few words that distinguish it from the other readings."""
     description: dict[str, Any]
     tensors: Mapping[str, StoredArray]
+    say: dict[str, Any] = field(default_factory=dict)
+    """The entries of an upload's description that choose it."""
+    tier: int = 0
+    """How usual it is: 0 before all others. Of readings that fit alike, one of a lower number is taken."""
+    interpolation: Literal["known", "usual", "open"] = "known"
+    """How a grid is interpolated: said or the only way of the family, its habit unless the weights tell otherwise, or
+    asked unless they tell."""
+    scale: float | None = None
+    """Natural logarithm of the finest resolution: how far two layouts are apart."""
 
 
 @dataclass(frozen=True)
@@ -58,5 +67,5 @@ def converted_of(
 ) -> ConvertedField:
     """The field of the first of one or more readings, the others to be tried."""
     first = readings[0]
-    doubtful = readings if len(readings) > 1 else ()
+    doubtful = readings if len(readings) > 1 or first.interpolation != "known" else ()
     return ConvertedField(family, why, first.description, first.tensors, warnings, doubtful)

@@ -6,15 +6,15 @@ thousand steps, from four on; how many are open is not saved, but the number of 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.converted import ConvertedField, converted_of
-from regnf_core.importing.families.grid_field import grid_readings, step_of
-from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.grid_field import space_readings, step_of
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces
 from regnf_core.importing.families.layers import Layers, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.tensor_source import TensorSource, lookup
@@ -24,7 +24,7 @@ FAMILY = "instant_nsr_pl"
 _PREFIX = "model.geometry."
 _TABLE = "encoding.encoding.params"
 _PROGRESSIVE_TABLE = "encoding.encoding.encoding.params"
-_HABITS = GridHabits((2, 4, 8, 1), ((32, 2048), (16, 2048), (16, 1024), (32, 4096), (16, 4096), (16, 512)), "linear")
+_HABITS = GridHabits((2, 4, 8, 1), "linear", writes_growth=True)
 _FIRST_LEVELS, _STEPS_A_LEVEL = 4, 1000
 
 
@@ -44,19 +44,20 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     table_name = _PROGRESSIVE_TABLE if _PROGRESSIVE_TABLE in state else _TABLE
     table = source.array(table_name, lookup(state, table_name))
     require_shape(table_name, table, (None,))
-    grids = find_grids(table.size, layers.input_width - 3, _HABITS, overrides.hash)
+    spaces = find_spaces(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", f"scene_aabb: the scene lies within {radius:g} of 0"]
     warnings: list[str] = []
     mask = overrides.level_mask
     if mask is None and table_name == _PROGRESSIVE_TABLE:
-        mask = _open_levels(checkpoint, grids[0].levels, why, warnings)
+        mask = _open_levels(checkpoint, spaces[0].intervals[0].levels, why, warnings)
     entries = {
         **shared_entries(overrides, bounds),
         "grid_radius": radius,
         "level_mask": mask,
         "source": {"family": FAMILY},
     }
-    readings = grid_readings(table, grids, _in_scene_units(layers, radius), entries)
+    how: Literal["usual", "known"] = "usual" if overrides.hash.interpolation is None else "known"
+    readings = space_readings(table, spaces, _in_scene_units(layers, radius), entries, how)
     return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
 
 

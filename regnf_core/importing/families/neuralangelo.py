@@ -14,8 +14,8 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.converted import ConvertedField, converted_of
-from regnf_core.importing.families.grid_field import grid_readings, step_of
-from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.grid_field import space_readings, step_of
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.tensor_source import TensorSource, lookup
@@ -25,8 +25,7 @@ from regnf_core.schema.hash_grid_config import HashGridConfig
 FAMILY = "neuralangelo"
 _PREFIXES = ("module.neural_sdf.", "neural_sdf.")
 _TABLE = "tcnn_encoding.params"
-_FEATURES = (8, 4, 2, 1)
-_HABITS = GridHabits(_FEATURES, ((32, 2048), (16, 2048), (32, 4096), (16, 1024), (16, 512), (64, 4096)), "linear")
+_HABITS = GridHabits((8, 4, 2, 1), "linear")
 _WARM_UP, _STEPS_A_LEVEL = 5000, 5000
 _FIRST_LEVELS = (4, 8)
 """Levels open from the start: the usual number, and that of the large scenes' configuration."""
@@ -50,12 +49,12 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     layers = _layers(state, source)
     table = source.array(_TABLE, lookup(state, _TABLE))
     require_shape(_TABLE, table, (None,))
-    grids = find_grids(table.size, layers.input_width - 3, _HABITS, overrides.hash)
+    spaces = find_spaces(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {prefix}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
     warnings: list[str] = []
-    mask = overrides.level_mask or _open_levels(checkpoint, table, grids[0], why, warnings)
+    mask = overrides.level_mask or _open_levels(checkpoint, table, spaces[0].written()[0].grid, why, warnings)
     entries = {**shared_entries(overrides, UNIT_CUBE), "level_mask": mask, "source": {"family": FAMILY}}
-    readings = grid_readings(table, grids, layers.tensors(), entries)
+    readings = space_readings(table, spaces, layers.tensors(), entries)
     return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
 
 

@@ -8,27 +8,30 @@ uploader may overrule. Training state, color, background, proposal networks and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.arrays import require_shape
+from regnf_core.importing.arrays import Float32Array, require_shape
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
-from regnf_core.importing.families.grid_field import grid_readings
-from regnf_core.importing.families.grid_search import GridHabits, find_grids
+from regnf_core.importing.families.grid_field import most_usual, space_readings
+from regnf_core.importing.families.grid_search import GridHabits, find_spaces
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, shared_entries
+from regnf_core.importing.families.shared import UNIT_CUBE, contradiction, refuse_other_entries, shared_entries
 from regnf_core.importing.pickle.pickle_values import GlobalRef, Placeholder
 from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
-from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.importing.upload_description import GridDescription, UploadDescription
 from regnf_core.schema.kinds.neus_facto import SKIP_LAYER
 
 _PREFIXES = ("_model.field.", "_model.module.field.")
-_DEGREE = 6
-_PLAIN_WIDTH = 3 + 6 * _DEGREE
-_FACTO = GridHabits((2, 4, 8, 1), ((16, 2048), (16, 1024), (16, 4096), (32, 2048), (16, 512), (64, 4096)), "smoothstep")
-_ANGELO = GridHabits((8, 4, 2, 1), ((64, 4096), (32, 4096), (16, 4096), (16, 2048), (32, 2048), (16, 512)), "linear")
+_DEGREES = (6, 4, 8, 10, 5, 7, 9, 3, 2, 1, 0)
+"""Of the sines and cosines: the usual number of frequencies first."""
+_FACTO = GridHabits((2, 4, 8, 1), "smoothstep")
+_ANGELO = GridHabits((8, 4, 2, 1), "linear")
+_UNTRAINED = 1.01e-4
+"""tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,11 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     if prefix is None:
         return None
     state = strip_prefix(pipeline, prefix)
-    refuse_other_entries(overrides, "a checkpoint of sdfstudio or nerfstudio", ("contraction", "level_mask", "hash"))
+    refuse_other_entries(
+        overrides,
+        "a checkpoint of sdfstudio or nerfstudio",
+        ("contraction", "level_mask", "hash", "use_grid", "positional_encoding"),
+    )
     names = layer_names(state, "glin")
     variant, why = _tell_variant(state, len(names), overrides)
     layers = read_layers(state, names, source)
@@ -99,28 +106,73 @@ def _assemble(
     overrides: UploadDescription,
 ) -> ConvertedField:
     warnings: list[str] = []
-    width = layers.input_width - _PLAIN_WIDTH
-    if width <= 0:
-        message = f"{layers.input_width} inputs; expected {_PLAIN_WIDTH} of the position and those of a hash grid"
-        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
     table = source.array("encoding.params", lookup(state, "encoding.params"))
     require_shape("encoding.params", table, (None,))
-    uses_sines = _uses_columns(layers, 3, _PLAIN_WIDTH)
+    bounds = _bounds(state, source, overrides, warnings)
+    readings: list[Reading] = []
+    for degree in _possible_degrees(layers, overrides):
+        readings += _readings(table, layers, variant, degree, bounds, overrides)
+    if not readings:
+        find_spaces(table.size, layers.input_width - 3 - 6 * _DEGREES[0], variant.habits, overrides.hash)
+    return converted_of(variant.name, why, most_usual(readings), tuple(warnings))
+
+
+def _possible_degrees(layers: Layers, overrides: UploadDescription) -> list[int]:
+    """Numbers of frequencies that leave columns for a grid, the most usual first."""
+    said = overrides.positional_encoding.degree
+    possible = [d for d in (_DEGREES if said is None else (said,)) if layers.input_width > 3 + 6 * d]
+    if said is None and layers.input_width == 3 + 6 * _DEGREES[0]:
+        possible = []  # the usual sines, and no grid
+    if not possible and said is not None:
+        raise contradiction("positional_encoding.degree", said, f"{layers.input_width} columns in the first layer")
+    if not possible:
+        message = f"{layers.input_width} inputs; expected those of the position, its sines and a hash grid"
+        raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
+    return possible
+
+
+def _readings(
+    table: Float32Array,
+    layers: Layers,
+    variant: _Variant,
+    degree: int,
+    bounds: Sequence[Sequence[float]],
+    overrides: UploadDescription,
+) -> list[Reading]:
+    """The functions that the tensors may stand for if the position has ``degree`` frequencies."""
+    plain = 3 + 6 * degree
+    two_pi = overrides.positional_encoding.two_pi
     entries = {
-        **shared_entries(overrides, _bounds(state, source, overrides, warnings)),
-        "positional_encoding": {"degree": _DEGREE, "two_pi": variant.two_pi, "used": uses_sines},
+        **shared_entries(overrides, bounds),
+        "positional_encoding": {
+            "degree": degree,
+            "two_pi": variant.two_pi if two_pi is None else two_pi,
+            "used": _uses_columns(layers, 3, plain),
+        },
         "contraction": overrides.contraction or variant.contraction,
         "level_mask": overrides.level_mask,
         "source": {"family": variant.name},
     }
-    if _uses_columns(layers, _PLAIN_WIDTH, None):
-        grids = find_grids(table.size, width, variant.habits, overrides.hash)
-        readings = grid_readings(table, grids, layers.tensors(), entries)
-    else:
-        unused = asdict(_unused_grid(table.size, width, variant, overrides))
+    usual = degree == _DEGREES[0] or overrides.positional_encoding.degree is not None
+    try:
+        spaces = find_spaces(table.size, layers.input_width - plain, variant.habits, overrides.hash)
+    except FieldFormatError:
+        if overrides.hash != GridDescription() and usual:
+            raise
+        return []
+    readings: list[Reading] = []
+    is_trained = bool(np.abs(table).max() > _UNTRAINED)
+    if overrides.use_grid is not False and _uses_columns(layers, plain, None):
+        readings += space_readings(
+            table, spaces, layers.tensors(), entries, "open" if overrides.hash.interpolation is None else "known"
+        )
+    if overrides.use_grid is not True and (not readings or not is_trained or len(layers.weights) > SKIP_LAYER):
+        unused = asdict(spaces[0].written()[0].grid)
         description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}
-        readings = (Reading("no grid", description, layers.tensors()),)
-    return converted_of(variant.name, why, readings, tuple(warnings))
+        readings.append(Reading("no grid", description, layers.tensors(), {"use_grid": False}))
+    told = {"positional_encoding": {"degree": degree}}
+    more = 0 if usual else 1
+    return [replace(r, say={**r.say, **told} if more else r.say, tier=r.tier + more) for r in readings]
 
 
 def _uses_columns(layers: Layers, start: int, stop: int | None) -> bool:
@@ -129,16 +181,6 @@ def _uses_columns(layers: Layers, start: int, stop: int | None) -> bool:
     if len(layers.weights) > SKIP_LAYER:
         seen.append(layers.weights[SKIP_LAYER][:, -layers.input_width :])
     return any(bool(weight[:, start:stop].any()) for weight in seen)
-
-
-def _unused_grid(size: int, width: int, variant: _Variant, overrides: UploadDescription) -> HashGridConfig:
-    """A grid that stands for the columns alone: no table is kept."""
-    try:
-        return find_grids(size, width, variant.habits, overrides.hash)[0]
-    except FieldFormatError:
-        if width > 32:
-            raise
-        return HashGridConfig(levels=width, features_per_level=1)
 
 
 def _bounds(

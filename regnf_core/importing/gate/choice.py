@@ -1,78 +1,141 @@
-"""Which of several functions a checkpoint's tensors stand for: the one that behaves most like a signed distance.
+"""Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-A hash grid read by another layout than it was trained with is noise: its gradient at the surface is anything but 1.
+Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the others
+the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident. What stays open
+is refused, with the line to add to the description for each.
 """
 
 from __future__ import annotations
 
+import json
 import math
-import warnings
-from dataclasses import dataclass, replace
-
-import torch
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.fields.build import build_field
-from regnf_core.importing.cost.calls import TRIAL_SAMPLES
+from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, TRIAL_POINTS
 from regnf_core.importing.families.converted import ConvertedField, Reading
-from regnf_core.importing.gate.plausibility import check_plausibility
-from regnf_core.schema.parsing import parse_description
+from regnf_core.importing.gate.evidence import Evidence, Trial
+from regnf_core.importing.gate.interpolation import told_interpolation
+from regnf_core.importing.gate.plausibility import without_new_code
+from regnf_core.schema.hash_grid_config import Interpolation
 
-_CLEARLY_BETTER = 0.05
-"""A reading must beat the most usual one by this much in its gradient's norm to be preferred."""
-
-
-@dataclass(frozen=True)
-class _Trial:
-    reading: Reading
-    misfit: float
-    """How far the gradient's norm at the surface is from 1: mean over its 10th, 50th and 90th percentile."""
+_SHOWN = 6
+_CLEARLY, _LEAST = 0.1, 0.01
+"""In the first round a reading is out that fits worse by this share of the best's misfit, and by this much at least."""
+_TELLING = 0.4
+"""A best reading that is itself farther from a distance speaks against no other: the least noisy one need not be right."""
+_FINALLY = 0.04
+"""The same in the second round, at more points."""
+_ACCIDENT = 0.5 * math.log(2.0)
+"""Usual numbers are powers of two: among layouts spread by less than this (log of the finest resolution), one of them
+is no accident."""
 
 
 def choose_reading(converted: ConvertedField) -> ConvertedField:
-    """``converted`` with the reading that fits best, and with what was chosen in ``why`` and ``warnings``.
+    """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
 
-    The most usual reading stays unless another is clearly better. A choice that others come close to is warned of:
-    HASH_GRID_AMBIGUOUS.
+    Raises FieldFormatError (LAYOUT_AMBIGUOUS): readings that differ fit alike.
     """
     if not converted.readings:
         return converted
-    trials = [_Trial(reading, _misfit(reading)) for reading in converted.readings]
-    best = min(trials, key=lambda trial: trial.misfit)
-    chosen = best if best.misfit < trials[0].misfit - _CLEARLY_BETTER else trials[0]
-    rest = [trial for trial in trials if trial is not chosen]
-    runner_up = min(rest, key=lambda trial: trial.misfit)
-    why = (
-        f"hash grid of {chosen.reading.name}: {len(trials)} layouts give a table of this size, under this one the"
-        f" gradient's norm at the surface is {_by(chosen)} from 1; under {runner_up.reading.name}, {_by(runner_up)}"
-    )
-    said = converted.warnings
-    if runner_up.misfit < chosen.misfit + _CLEARLY_BETTER:
-        text = f"{runner_up.reading.name} fits as well as {chosen.reading.name}; say which under 'hash'"
-        said = (*said, f"HASH_GRID_AMBIGUOUS: {text}")
+    with without_new_code():
+        chosen, why = _choose(converted.readings)
     return replace(
         converted,
-        why=(*converted.why, why),
-        description=chosen.reading.description,
-        tensors=chosen.reading.tensors,
-        warnings=said,
+        why=(*converted.why, *why),
+        description=chosen.description,
+        tensors=chosen.tensors,
         readings=(),
     )
 
 
-def _misfit(reading: Reading) -> float:
-    try:
-        description = parse_description(reading.description)
-        with warnings.catch_warnings():
-            # the map of the upload is only read
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
-            tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
-        measured, _ = check_plausibility(build_field(description, tensors), TRIAL_SAMPLES)
-    except FieldFormatError:  # a layout beyond what a field may have, no surface, or numbers that are not finite
-        return math.inf
-    norms = [measured[f"gradient_{quantile}"] for quantile in ("p10", "median", "p90")]
-    return sum(abs(norm - 1.0) for norm in norms) / len(norms)
+def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
+    evidence = Evidence(readings[0], TRIAL_POINTS)
+    trials = [evidence.of(reading) for reading in readings]
+    best = min(trials, key=lambda trial: trial.mean)
+    speaks = best.mean < _TELLING
+    left = [trial for trial in trials if not speaks or not best.is_better(trial, _CLEARLY, _LEAST)]
+    finest = Evidence(best.reading, FINAL_POINTS)
+    if speaks and len(left) > 1 and not all(trial.is_same(best) for trial in left):
+        left = _second_round(left, finest)
+    chosen = _settled(left)
+    why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
+    if chosen.reading.interpolation != "known" and chosen.distance is not None:
+        return _interpolated(chosen.reading, finest, why)
+    return chosen.reading, why
 
 
-def _by(trial: _Trial) -> str:
-    return f"{trial.misfit:.2f}" if math.isfinite(trial.misfit) else "any amount"
+def _second_round(trials: Sequence[Trial], finest: Evidence) -> list[Trial]:
+    """Those of ``trials`` that are as good as the best of them at more points. The least usual ones are not asked."""
+    finalists = sorted(trials, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
+    again = [finest.of(trial.reading) for trial in finalists]
+    best = min(again, key=lambda trial: trial.mean)
+    return [trial for trial in again if not best.is_better(trial, _FINALLY)]
+
+
+def _settled(left: Sequence[Trial]) -> Trial:
+    """The one of the trials left that stands, or a refusal."""
+    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
+    others = [trial for trial in left if not trial.is_same(usual)]
+    if not others:
+        return usual
+    rivals = [trial for trial in others if trial.reading.tier <= usual.reading.tier]
+    scales = [trial.reading.scale for trial in left if trial.reading.scale is not None]
+    if rivals or usual.reading.tier > 0 or len(scales) < len(left) or max(scales) - min(scales) > _ACCIDENT:
+        raise _ambiguous([trial.reading.say for trial in (usual, *others)])
+    return usual
+
+
+def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple[Reading, list[str]]:
+    """``reading`` with the interpolation that the evidence tells, or a refusal."""
+    kinds: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
+    linear, smooth = (evidence.of(_with_interpolation(reading, kind)) for kind in kinds)
+    if linear.is_same(smooth):
+        return reading, why
+    told = told_interpolation(linear, smooth)
+    if told is None and reading.interpolation == "usual":
+        return reading, why
+    if told is None:
+        habit = reading.description["hash"]["interpolation"]
+        raise _ambiguous([{"hash": {"interpolation": kind}} for kind in sorted(kinds, key=lambda kind: kind != habit)])
+    more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
+    return _with_interpolation(reading, told), [*why, more]
+
+
+def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:
+    grid = {**reading.description["hash"], "interpolation": kind}
+    return replace(reading, description={**reading.description, "hash": grid})
+
+
+def _ambiguous(say: Sequence[dict[str, Any]]) -> FieldFormatError:
+    """The refusal: what the description may say, the most usual first."""
+    lines = list(dict.fromkeys(json.dumps(_shortest(entry, say)) for entry in say))
+    more = f", or {len(lines) - _SHOWN} others" if len(lines) > _SHOWN else ""
+    message = f"{len(lines)} readings fit this table alike; add one to the description: {' or '.join(lines[:_SHOWN])}"
+    return FieldFormatError(message + more, reason="LAYOUT_AMBIGUOUS")
+
+
+def _shortest(entry: dict[str, Any], say: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """``entry`` without the parts of ``hash`` that all have in common."""
+    if not all("hash" in other for other in say):
+        return entry
+    parts = {name: value for name, value in entry["hash"].items() if any(o["hash"].get(name) != value for o in say)}
+    return {**entry, "hash": parts or entry["hash"]}
+
+
+def _said(trials: Sequence[Trial], chosen: Trial) -> str:
+    rest = [trial for trial in trials if not trial.is_same(chosen)]
+    start = f"hash grid of {chosen.reading.name}: {len(trials)} layouts give a table of this size"
+    if not rest:
+        return f"{start}, and all are the same function"
+    second = min(rest, key=lambda trial: trial.mean)
+    return (
+        f"{start}, under this one the gradient's norm is {_by(chosen)} from 1; under {second.reading.name},"
+        f" {_by(second)}"
+    )
+
+
+def _by(trial: Trial) -> str:
+    return f"{trial.mean:.2f}" if math.isfinite(trial.mean) else "any amount"

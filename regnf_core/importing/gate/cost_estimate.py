@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.budget import require_room, require_within
-from regnf_core.importing.cost.calls import SAMPLES, TRIAL_SAMPLES, Calls, calls_of_check
+from regnf_core.importing.cost.calls import SAMPLES, Calls, calls_of_check, calls_of_trials
 from regnf_core.importing.cost.mesh_work import mesh_work
 from regnf_core.importing.cost.network_work import network_work
 from regnf_core.importing.cost.onnx_memory import onnx_bytes
@@ -27,9 +27,11 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
     Raises FieldFormatError: IMPORT_TOO_COSTLY beyond the limits on work and memory, and what the description is
     refused for.
     """
-    if converted.readings:
-        seconds = sum(_seconds_of_reading(reading, TRIAL_SAMPLES) for reading in converted.readings)
-        seconds += max(_seconds_of_reading(reading, SAMPLES) for reading in converted.readings)
+    readings = converted.readings
+    if readings:
+        trials = calls_of_trials(len(readings))
+        seconds = max(_seconds_of_reading(reading, trials) for reading in readings)
+        seconds += max(_seconds_of_reading(reading, calls_of_check(SAMPLES)) for reading in readings)
     else:
         seconds = seconds_of(converted.description, converted.tensors, calls_of_check(SAMPLES))
     require_within(seconds, limits.work_s)
@@ -39,10 +41,10 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
     return seconds
 
 
-def _seconds_of_reading(reading: Reading, samples: int) -> float:
+def _seconds_of_reading(reading: Reading, calls: Calls) -> float:
     """A reading that is no field costs nothing: it is passed over when the readings are tried."""
     try:
-        return seconds_of(reading.description, reading.tensors, calls_of_check(samples))
+        return seconds_of(reading.description, reading.tensors, calls)
     except FieldFormatError:
         return 0.0
 

@@ -149,9 +149,12 @@ def test_a_ball_is_recognized_without_a_word(tmp_path: Path) -> None:
     torch.testing.assert_close(distance, points.norm(dim=-1) - 0.5, rtol=0, atol=0.01)
 
 
+GRID_TOLD = {"levels": 16, "features_per_level": 2, "base_resolution": 16, "top_resolution": 128}
+
+
 def test_tiny_cuda_nn(tmp_path: Path) -> None:
     checkpoint = tcnn_checkpoint()
-    report = converted(tmp_path, checkpoint, {"hash": {"top_resolution": 128, "features_per_level": 2}})
+    report = converted(tmp_path, checkpoint, {"hash": GRID_TOLD})
     assert report["family"] == "torch_ngp"
     stored = read_description(tmp_path / FIELD_NAME)["hash"]
     assert round(stored["per_level_scale"], 4) == round(8 ** (1 / 15), 4)

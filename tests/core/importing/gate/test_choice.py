@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import grid_readings
@@ -59,11 +61,19 @@ def test_the_order_does_not_matter_where_the_evidence_is_clear() -> None:
     assert chosen.description["hash"]["strides"] == OTHER.strides
 
 
-def test_layouts_that_fit_alike_leave_the_most_usual_one_and_a_warning() -> None:
+def test_layouts_that_are_one_function_are_not_asked_about() -> None:
     """Only level 0 has anything in it, and that is the same in both."""
     chosen = choose_reading(converted(ball_table(COARSE, 0), FINE, COARSE))
     assert chosen.description["hash"]["per_level_scale"] == FINE.per_level_scale
-    assert [warning.split(":")[0] for warning in chosen.warnings] == ["HASH_GRID_AMBIGUOUS"]
+    assert "all are the same function" in chosen.why[-1]
+
+
+def test_layouts_that_differ_and_fit_alike_are_asked_about() -> None:
+    """A table of noise fits no layout better than another."""
+    noise = np.random.default_rng(0).uniform(-1.0, 1.0, FINE.entries).astype(np.float32)
+    with pytest.raises(FieldFormatError) as caught:
+        choose_reading(converted(noise, FINE, COARSE))
+    assert caught.value.reason == "LAYOUT_AMBIGUOUS"
 
 
 def test_where_none_has_a_surface_the_most_usual_one_stays_and_plausibility_decides() -> None:

@@ -1,0 +1,42 @@
+"""Linear or smoothstep: how a hash grid was interpolated in training, told from the gradient within its cells.
+
+Smoothstep modulates a level's slope within each cell; training makes the other levels cancel that. So under the
+interpolation of training the rest of the gradient's norm does not follow the difference between the two
+interpolations, and under the other one it makes up for all of it. A field that was trained too shortly has cancelled
+nothing, and does not tell.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from regnf_core.importing.gate.evidence import Trial
+from regnf_core.schema.hash_grid_config import Interpolation
+
+_TRAINED = 0.08
+"""Only a field whose gradient is this near to 1 tells that it was interpolated linearly: one that was trained for
+shorter under smoothstep looks like that, too."""
+_SMOOTH, _LINEAR = 0.15, -0.3
+"""How much more the norm follows the difference under linear than under smoothstep, at least or at most."""
+_NEAR = 1.0
+
+
+def told_interpolation(linear: Trial, smoothstep: Trial) -> Interpolation | None:
+    """How the grid was interpolated, by one reading's trials under both; None where they do not tell."""
+    if linear.gradient is None or smoothstep.gradient is None:
+        return None
+    more = _share_undone(smoothstep.gradient, linear.gradient) - _share_undone(linear.gradient, smoothstep.gradient)
+    if more > _SMOOTH:
+        return "smoothstep"
+    if more < _LINEAR and linear.mean < _TRAINED:
+        return "linear"
+    return None
+
+
+def _share_undone(gradient: Tensor, other: Tensor) -> float:
+    """Slope of the norm of ``gradient`` over what the ``other`` one would add to it: 0 under the right one."""
+    norm = gradient.norm(dim=-1).clamp_min(1e-6)
+    added = ((other - gradient) * gradient).sum(dim=-1) / norm
+    kept = ((norm - 1.0).abs() < _NEAR) & (added.abs() < _NEAR)
+    added, beyond = added[kept] - added[kept].mean(), norm[kept] - norm[kept].mean()
+    return float((added * beyond).sum() / added.square().sum().clamp_min(1e-12))
