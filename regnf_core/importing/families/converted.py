@@ -21,9 +21,8 @@ class Reading:
     """The entries of an upload's description that choose it."""
     tier: int = 0
     """How usual it is: 0 before all others. Of readings that fit alike, one of a lower number is taken."""
-    interpolation: Literal["known", "usual", "open"] = "known"
-    """How a grid is interpolated: said or the only way of the family, its habit unless the weights tell otherwise, or
-    asked unless they tell."""
+    interpolation: Literal["known", "open"] = "known"
+    """How a grid is interpolated: said or the only way of the family, or asked unless the weights tell."""
     scale: float | None = None
     """Natural logarithm of the finest resolution: how far two layouts are apart."""
 

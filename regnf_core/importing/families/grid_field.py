@@ -24,7 +24,7 @@ def space_readings(
     spaces: Sequence[GridSpace],
     layers: dict[str, Float32Array],
     entries: dict[str, Any],
-    interpolation: Literal["known", "usual", "open"] = "known",
+    interpolation: Literal["known", "open"] = "known",
 ) -> tuple[Reading, ...]:
     """One reading a layout of ``spaces``, the most usual first.
 

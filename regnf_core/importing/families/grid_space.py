@@ -86,7 +86,7 @@ class GridSpace:
             yield 0, interval.lowest, {"per_level_scale": interval.lowest}
         else:
             yield from _tops(interval, base)
-            if self.writes_growth:
+            if self.writes_growth and (base in _USUAL_BASES or not interval.base_is_free):
                 yield from _short_growths(interval)
 
     def _grid(self, interval: GridInterval, base: int, growth: float) -> HashGridConfig | None:
@@ -125,6 +125,8 @@ def _short_growths(interval: GridInterval) -> Iterator[tuple[int, float, dict[st
     lowest, highest = interval.lowest * (1.0 - _EDGE), min(interval.highest * (1.0 + _EDGE), 2.5)
     for decimals, tier in ((2, 0), (3, 1), (4, 2)):
         first, last = math.ceil(lowest * 10**decimals), math.floor(highest * 10**decimals)
+        if decimals > 2 and interval.base_is_free:
+            return
         if last - first > _MOST_ROUND * (1 if decimals > 2 else 4):
             return
         for number in range(max(first, 10**decimals + 1), last + 1):

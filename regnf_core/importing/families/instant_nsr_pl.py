@@ -56,7 +56,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         "level_mask": mask,
         "source": {"family": FAMILY},
     }
-    how: Literal["usual", "known"] = "usual" if overrides.hash.interpolation is None else "known"
+    how: Literal["open", "known"] = "open" if overrides.hash.interpolation is None else "known"
     readings = space_readings(table, spaces, _in_scene_units(layers, radius), entries, how)
     return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
 

@@ -25,7 +25,7 @@ _SHOWN = 6
 _CLEARLY, _LEAST = 0.1, 0.01
 """In the first round a reading is out that fits worse by this share of the best's misfit, and by this much at least."""
 _TELLING = 0.4
-"""A best reading that is itself farther from a distance speaks against no other: the least noisy one need not be right."""
+"""A best reading that is itself farther from a distance speaks against no other: the least noisy may be wrong."""
 _FINALLY = 0.04
 """The same in the second round, at more points."""
 _ACCIDENT = 0.5 * math.log(2.0)
@@ -62,7 +62,7 @@ def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
         left = _second_round(left, finest)
     chosen = _settled(left)
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
-    if chosen.reading.interpolation != "known" and chosen.distance is not None:
+    if chosen.reading.interpolation == "open" and chosen.distance is not None:
         return _interpolated(chosen.reading, finest, why)
     return chosen.reading, why
 
@@ -95,8 +95,6 @@ def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple
     if linear.is_same(smooth):
         return reading, why
     told = told_interpolation(linear, smooth)
-    if told is None and reading.interpolation == "usual":
-        return reading, why
     if told is None:
         habit = reading.description["hash"]["interpolation"]
         raise _ambiguous([{"hash": {"interpolation": kind}} for kind in sorted(kinds, key=lambda kind: kind != habit)])

@@ -39,7 +39,7 @@ from regnf_core.importing.gate.convert import main
 sys.exit(main(sys.argv[2:]))
 """
 _REASON = re.compile(r"[A-Z][A-Z0-9_]{2,63}")
-_MAX_DETAIL = 500
+_MAX_DETAIL = 1000
 _OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocate memory", b"failed to map segment")
 _MAX_DESCRIPTION = 16_384
 _MAX_NAME = 120

@@ -18,7 +18,9 @@ from tests.core.fields.reference import central_differences
 from tests.core.importing import small_families as small
 from tests.core.importing.archives import assert_refused
 
-INSTANT_GRID = {"hash": {"base_resolution": 16, "top_resolution": 2048, "features_per_level": 2}}
+INSTANT_GRID = {
+    "hash": {"interpolation": "linear", "base_resolution": 16, "top_resolution": 2048, "features_per_level": 2}
+}
 ANGELO_GRID = {"hash": {"base_resolution": 32, "top_resolution": 2048, "features_per_level": 2}}
 NEUS_SAID, SIREN_SAID, DEEP_SAID = {"input_scale": 1.0}, {"activation_scale": 30.0}, {"output_tanh": 1}
 """What random networks, which are no distances, cannot tell by their behavior."""
