@@ -12,7 +12,7 @@ from regnf_core.errors import FieldFormatError
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
     (".safetensors", ".onnx", ".npz", ".nvblx", ".db", ".sqlite"),
-    (".glb", ".gltf", ".ply", ".obj", ".stl", ".off", ".dae"),
+    (".glb", ".gltf", ".ply", ".obj", ".stl", ".off", ".dae", ".pcd", ".xyz"),
 )
 """What may hold a field, by the ends of names. A run with files of an earlier line has its field in those."""
 _OTHER_FOLDERS = frozenset(

@@ -16,8 +16,8 @@ from regnf_core.importing.run.zip_run import ZipRun
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""
-_WITH_OTHER_FILES = frozenset({".gltf", ".obj", ".dae"})
-_OTHER_ENDS = frozenset({".bin", ".gltf", ".mtl"})
+_WITH_OTHER_FILES = frozenset({".gltf", ".glb"})
+_OTHER_ENDS = frozenset({".bin"})
 
 
 @dataclass(frozen=True)

@@ -15,17 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.run.folder import find_run, pack_settings
-from tests.core.importing.archives import assert_refused
+from tests.core.importing.archives import assert_refused, zip_bytes
 from tests.core.importing.test_reference_checkpoints import assert_reproduces
 from tests.devdata import dev_data
 
-RUNS = {"instant_nsr_pl": "exp", "neuralangelo": "."}
+FAMILIES = ("deepsdf", "instant_nsr_pl", "neuralangelo", "neus")
 SAID: dict[str, dict[str, Any]] = {"deepsdf": {"latent_index": 1}}
 
 
@@ -60,7 +61,7 @@ PACKINGS: dict[str, Callable[[Path], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("family", RUNS)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_a_run_with_its_settings_is_reproduced(tmp_path: Path, family: str) -> None:
     folder = dev_data("formats", family)
     report = with_settings(folder, tmp_path, SAID.get(family))
@@ -74,7 +75,7 @@ def test_a_run_with_its_settings_is_reproduced(tmp_path: Path, family: str) -> N
 def test_a_whole_run_in_one_archive_is_reproduced(tmp_path: Path, packing: str) -> None:
     folder = dev_data("formats", "instant_nsr_pl")
     upload = tmp_path / f"run.{packing}"
-    upload.write_bytes(PACKINGS[packing](folder / RUNS["instant_nsr_pl"]))
+    upload.write_bytes(PACKINGS[packing](folder / "exp"))
     report = convert_file(upload, tmp_path, None, ImportLimits())
     assert report["settings"]["trainer"] == "instant-nsr-pl"
     assert report["why"][0].endswith("ckpt/epoch=0-step=20000.ckpt")
@@ -99,15 +100,19 @@ def test_a_run_through_the_gate_s_own_process(tmp_path: Path) -> None:
     assert any("dataset's frame is known" in line for line in report.why)
 
 
-def test_a_field_in_its_dataset_s_frame(tmp_path: Path) -> None:
-    folder = dev_data("formats", "neuralangelo")
-    report = with_settings(folder, tmp_path, {"frame": "dataset"})
-    points = torch.from_numpy(np.load(folder / "points_world.npy")).float()
-    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(points)
-    expected = 1.75 * np.load(folder / "sdf.npy").reshape(-1)
+@pytest.mark.parametrize("family", ["neuralangelo", "neus", "deepsdf"])
+def test_a_field_in_its_dataset_s_frame(tmp_path: Path, family: str) -> None:
+    folder = dev_data("formats", family)
+    report = with_settings(folder, tmp_path, {"frame": "dataset", **SAID.get(family, {})})
+    world, own = (np.load(folder / name).astype(np.float64) for name in ("points_world.npy", "points.npy"))
+    unit = np.linalg.norm(world[1] - world[0]) / np.linalg.norm(own[1] - own[0])
+    distance, gradient = open_field(tmp_path / FIELD_NAME).signed_distance_and_gradient(torch.from_numpy(world).float())
+    expected = unit * np.load(folder / "sdf.npy").reshape(-1)
     np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
-    np.testing.assert_allclose(gradient.numpy(), np.load(folder / "gradient.npy"), rtol=0, atol=1e-3)
-    np.testing.assert_allclose(report["bounds"], [[-1.55, -2.15, -0.65], [1.95, 1.35, 2.85]], atol=1e-6)
+    steepness = np.linalg.norm(np.load(folder / "gradient.npy"), axis=1)
+    np.testing.assert_allclose(gradient.norm(dim=1).numpy(), steepness, rtol=0, atol=1e-3)
+    if family == "neuralangelo":
+        np.testing.assert_allclose(report["bounds"], [[-1.55, -2.15, -0.65], [1.95, 1.35, 2.85]], atol=1e-6)
 
 
 def test_world_scale_scales_the_dataset_s_unit(tmp_path: Path) -> None:
@@ -139,6 +144,15 @@ def test_the_dataset_s_frame_must_be_known(tmp_path: Path) -> None:
     assert_refused(
         lambda: convert_file(checkpoint, tmp_path, {"frame": "dataset"}, ImportLimits()), "INVALID_DESCRIPTION"
     )
+
+
+def test_a_mesh_finds_its_buffers_in_the_archive(tmp_path: Path) -> None:
+    files = trimesh.creation.icosphere(subdivisions=2).export(file_type="gltf")
+    upload = tmp_path / "ball.zip"
+    upload.write_bytes(zip_bytes([(f"scan/{name}", data) for name, data in files.items()]))
+    report = convert_file(upload, tmp_path, None, ImportLimits())
+    assert report["family"] == "mesh"
+    assert report["why"][0] == "the run's checkpoint is scan/model.gltf"
 
 
 def test_another_run_s_settings_are_refused(tmp_path: Path) -> None:

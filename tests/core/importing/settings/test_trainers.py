@@ -322,6 +322,10 @@ def test_the_frames_of_nerfstudio_and_sdfstudio() -> None:
     ("text", "values"),
     [
         ("model: {omega_0: 30}", {"activation_scale": 30.0}),
+        (
+            "network: {first_omega_0: 60, hidden_omega_0: 30}",
+            {"first_activation_scale": 60.0, "activation_scale": 30.0},
+        ),
         ("integrate: {voxel_size: 0.01, trunc_voxel_multiplier: 8}", {"truncation": 0.08}),
         ("sdf_trunc: 0.04", {"truncation": 0.04}),
     ],
