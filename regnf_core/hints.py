@@ -36,7 +36,8 @@ HINTS: dict[str, str] = {
     "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",
     "SAFE_FORMAT_INVALID": "The file is damaged, or no field of regnf. Copy it again, or give the checkpoint that it "
     "was made from.",
-    "RUN_WITHOUT_CHECKPOINT": "Pack the whole run, its checkpoint included; docs/families.md lists the files taken.",
+    "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
+    "files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",
     "ARCHIVE_LINK": "Pack the run again with `tar --dereference`, or as a zip.",
     "ARCHIVE_NESTED": "Unpack the outer archive, and give the inner one.",

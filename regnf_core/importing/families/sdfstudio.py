@@ -147,7 +147,7 @@ def _readings(
         "positional_encoding": {
             "degree": degree,
             "two_pi": variant.two_pi if two_pi is None else two_pi,
-            "used": _uses_columns(layers, 3, plain),
+            "used": overrides.positional_encoding.used is not False and _uses_columns(layers, 3, plain),
         },
         "contraction": overrides.contraction or variant.contraction,
         "level_mask": overrides.level_mask,

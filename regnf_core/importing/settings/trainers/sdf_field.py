@@ -78,9 +78,15 @@ def _grid(field: Keys, said: Said, features: str, smooth: str) -> None:
 def _encoding(field: Keys, said: Said, theirs: bool) -> None:
     if field.flag("off_axis") and field.flag("use_position_encoding") is not False:
         said.refuse(field, "off_axis")
-    degree = _DEGREE if theirs else field.whole("position_encoding_max_degree")
-    if degree is not None:
-        said.put("positional_encoding.degree", degree, field, "position_encoding_max_degree")
+    if theirs:  # no key of its own: it is always the same
+        said.values["positional_encoding.degree"] = _DEGREE
+    else:
+        said.put(
+            "positional_encoding.degree",
+            field.whole("position_encoding_max_degree"),
+            field,
+            "position_encoding_max_degree",
+        )
     said.put("positional_encoding.used", field.flag("use_position_encoding"), field, "use_position_encoding")
     said.values["positional_encoding.two_pi"] = theirs
 
