@@ -6,9 +6,11 @@ Nothing is parsed here. Names decide, as in an archive; links that lead out of t
 from __future__ import annotations
 
 import os
+import stat
 import tarfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 
 from regnf_core.errors import FieldFormatError
@@ -42,14 +44,25 @@ def find_run(folder: Path) -> Run:
 def settings_beside(checkpoint: Path) -> tuple[Path, ...]:
     """The settings that a checkpoint's trainer leaves round it; only their own few folders are looked into."""
     path = checkpoint.resolve(strict=True)
-    top = list(path.parents)[:_LEVELS][-1]
+    places = _places_of(path)
+    top = places[-1]
     names = [str(path.relative_to(top))]
-    for folder in list(path.parents)[:_LEVELS]:
+    for folder in places:
         for found in _known_near(folder):
             if _stays_in(found, top):
                 names.append(str(found.relative_to(top)))
     chosen = choose_settings(sorted(set(names)), names[0])
     return tuple(top / name for name in chosen)
+
+
+def _places_of(checkpoint: Path) -> list[Path]:
+    """The folder of a checkpoint and those above it that may be its run's: not a user's home, nor what all may write.
+
+    Who may write there could say how other people's files are read.
+    """
+    own, *above = list(checkpoint.parents)[:_LEVELS]
+    shared = {Path.home(), *Path.home().parents}
+    return [own, *takewhile(lambda folder: folder not in shared and not folder.stat().st_mode & stat.S_IWOTH, above)]
 
 
 def pack_settings(run: Run, into: Path) -> Path:
