@@ -118,6 +118,8 @@ class UploadDescription:
     """The factor of what a layer is given that sees the network's input again: 1, or 1 / sqrt 2."""
     skip_order: Literal["hidden_first", "input_first"] | None = None
     """What comes first in such a layer's columns."""
+    skip_layer: Annotated[int, Ge(0), Le(32)] | None = None
+    """How many blocks stand before the layer behind which the network sees its input again; 0: there is none."""
     truncation: Annotated[float, Ge(1e-9), Le(1e9)] | None = None
     """The distance, in the checkpoint's unit, that the value 1 of a map of truncated distances stands for."""
     frame: Literal["dataset", "field"] | None = None

@@ -8,6 +8,7 @@ from typing import Any
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
     deepsdf,
+    deepsdf_blocks,
     instant_nsr_pl,
     isdf,
     neuralangelo,
@@ -36,6 +37,7 @@ FAMILIES: tuple[Family, ...] = (
     instant_nsr_pl.convert,
     neuralangelo.convert,
     deepsdf.convert,
+    deepsdf_blocks.convert,
     siren.convert,
     pin_slam.convert,
     torch_ngp.convert,
