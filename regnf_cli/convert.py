@@ -16,7 +16,7 @@ from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
 from regnf_cli.paths import FIELD, folder
 from regnf_core.errors import InvalidOptionsError
-from regnf_core.field_source import FieldSource, naming
+from regnf_core.field_source import FieldSource
 
 _SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
 _GRID_MOST = 1024
@@ -72,7 +72,7 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None) -> No
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
-        with err.status("importing"), naming(source.file), source.packed_settings() as settings:
+        with err.status("importing"), source.naming(), source.packed_settings() as settings:
             said = source.description or None
             report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings)
         if images is not None:

@@ -14,7 +14,6 @@ from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
 from regnf_cli.paths import FIELD
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
-from regnf_core.field_source import naming
 
 
 def inspect(
@@ -48,7 +47,7 @@ def inspect(
         raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
     source = source_of(field, description, choice_of(config, no_config))
     with tempfile.TemporaryDirectory() as folder:
-        with naming(source.file), source.packed_settings() as settings:
+        with source.naming(), source.packed_settings() as settings:
             made = import_field(source.file, Path(folder), description, ImportLimits(), picture is not None, settings)
             report = made.to_dict()
         if picture is not None:

@@ -9,22 +9,24 @@ from typing import Any
 
 @dataclass(frozen=True)
 class FieldNotes:
-    """family: the format that was recognized · settings: the trainer's files that were used · warnings: of the import,
-    each with its word first."""
+    """family: the format that was recognized · settings: those of the trainer that counted, see ImportReport ·
+    warnings: of the import, each with its word first."""
 
     family: str | None = None
-    settings: tuple[str, ...] = ()
+    settings: Mapping[str, Any] | None = None
     warnings: tuple[str, ...] = ()
 
     @classmethod
     def of_report(cls, report: Mapping[str, Any]) -> FieldNotes:
         """From an import's report, as a record or a file holds it; what it does not say is left out."""
         family, settings, warnings = (report.get(name) for name in ("family", "settings", "warnings"))
-        return cls(str(family) if family else None, _texts(settings), _texts(warnings))
+        texts = tuple(map(str, warnings)) if isinstance(warnings, list | tuple) else ()
+        return cls(str(family) if family else None, settings if isinstance(settings, Mapping) else None, texts)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain (JSON) values."""
-        return {"family": self.family, "settings": list(self.settings), "warnings": list(self.warnings)}
+        settings = None if self.settings is None else dict(self.settings)
+        return {"family": self.family, "settings": settings, "warnings": list(self.warnings)}
 
     @property
     def words(self) -> list[str]:
@@ -34,7 +36,3 @@ class FieldNotes:
 
 NO_NOTES = FieldNotes()
 """Of a safe field that was given as it is: its import was another time."""
-
-
-def _texts(value: object) -> tuple[str, ...]:
-    return tuple(map(str, value)) if isinstance(value, list | tuple) else ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,15 +12,16 @@ from typing import Any, Literal
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.field_files import require_field_file, require_file
-from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
 from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
 
 Role = Literal["scene", "object"]
 SettingsChoice = str | Path | bool | None
 """A file of settings or an archive of them; None or True: those that lie beside the checkpoint; False: none."""
-_WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, "safetensors", "zip", "tar", "gzip", "bzip2", "xz"})
+_WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, *RUN_ARCHIVES, "safetensors"})
 """Formats that no trainer's settings say anything about, and archives, which have their own."""
+_FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python settings=False) leaves them unread."
 _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "sqlite", "onnx"})
 """Formats whose files say which side of the surface is free; of the others the use decides."""
 
@@ -54,7 +56,22 @@ class FieldSource:
         """The same as a person finds them again: by their places in the run's folder."""
         if self.config is not None:
             return [str(self.config)]
-        return [] if self.run is None else [str(path.relative_to(self.run.folder)) for path in self.run.settings]
+        if self.run is None:
+            return []
+        folder = os.path.commonpath([path.parent for path in (self.run.checkpoint, *self.run.settings)])
+        return [str(path.relative_to(folder)) for path in self.run.settings]
+
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """Errors about the content begin with the file's name; about settings, they say how these came in."""
+        try:
+            with naming(self.file):
+                yield
+        except FieldFormatError as error:
+            if self.run is None or not error.reason.startswith("SETTINGS_"):
+                raise
+            hint = " ".join(filter(None, [error.hint, _FOUND_BESIDE]))
+            raise FieldFormatError(str(error), reason=error.reason, hint=hint) from error
 
     @contextmanager
     def packed_settings(self) -> Iterator[Path | None]:
@@ -90,7 +107,7 @@ def find_source(
         run = None
     elif run is None and format_ not in _WITHOUT_SETTINGS:
         with naming(path):
-            run = settings_beside(file)
+            run = Run(file.resolve(), settings_beside(file))
     said = dict(description or {})
     return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"))
 

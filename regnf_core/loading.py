@@ -8,13 +8,13 @@ import os
 import tempfile
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.field_notes import NO_NOTES, FieldNotes
-from regnf_core.field_source import FieldSource, SettingsChoice, find_source, naming
+from regnf_core.field_source import FieldSource, SettingsChoice, find_source
 from regnf_core.files import atomic_path
 from regnf_core.version import __version__
 
@@ -70,7 +70,7 @@ def load_field(source: FieldSource, device: str = "cpu", cache_dir: Path | None 
     from regnf_core.fields.build import open_field as open_safe_field
 
     safe = safe_field(source, cache_dir)
-    with naming(source.file):
+    with source.naming():
         return LoadedField(open_safe_field(safe.path, device), safe.notes)
 
 
@@ -79,7 +79,7 @@ def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
 
     Raises FieldFormatError and InvalidInputError naming the file.
     """
-    with naming(source.file):
+    with source.naming():
         if _is_safe_field(source):
             return SafeField(source.file, NO_NOTES)
         return _imported(source, cache_dir or default_cache_dir())
@@ -112,17 +112,11 @@ def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
     with tempfile.TemporaryDirectory(dir=cache_dir) as folder, source.packed_settings() as settings:
         said = source.description or None
         made = import_field(source.file, Path(folder), said, ImportLimits(), settings=settings)
-        notes = notes_of(source, made.to_dict())
+        notes = FieldNotes.of_report(made.to_dict())
         with atomic_path(report) as path:
             path.write_text(json.dumps(notes.to_dict()), encoding="utf-8")
         os.replace(Path(folder) / FIELD_NAME, kept)
     return SafeField(kept, notes)
-
-
-def notes_of(source: FieldSource, report: Mapping[str, Any]) -> FieldNotes:
-    """What the import of a source said. Where it does not name the settings that it used, those that it was given."""
-    notes = FieldNotes.of_report(report)
-    return notes if notes.settings else replace(notes, settings=tuple(source.settings_names))
 
 
 def _read_notes(path: Path) -> FieldNotes | None:

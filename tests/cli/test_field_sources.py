@@ -47,7 +47,11 @@ class Gate:
         self.asked.append({"file": upload.name, "description": description, "settings": contents(settings)})
         name = "mix-room" if "room" in upload.name else "armchair"
         shutil.copy(DATA / f"{name}.safetensors", out_dir / "field.safetensors")
-        return ImportReport("deepsdf", "sdf", (), ((0, 0, 0), (1, 1, 1)), 1, {}, (WARNING,), None, 1, 0.1, 0.1, 1, {})
+        used = None if settings is None else {"trainer": "neus", "files": ["config.yml"], "used": {}}
+        told: dict[str, Any] = {"family": "deepsdf", "kind": "sdf", "why": (), "parameters": 1, "plausibility": {}}
+        told |= {"bounds": ((0, 0, 0), (1, 1, 1)), "warnings": (WARNING,), "label": None, "settings": used}
+        told |= {"field_bytes": 1, "seconds": 0.1, "cpu_seconds": 0.1, "peak_memory_bytes": 1, "isolation": {}}
+        return ImportReport(**told)
 
 
 @pytest.fixture
@@ -136,8 +140,8 @@ def test_a_result_repeats_what_the_imports_warned_of(gate: Gate, run: Run, run_f
     assert f"warning      scene: {WARNING}\n" in outcome.stdout
     fields = json.loads((tmp_path / "out" / "result.json").read_text())["fields"]
     assert (fields["scene"]["warnings"], fields["scene"]["family"]) == ([WARNING], "deepsdf")
-    assert fields["scene"]["settings"][0].endswith("config.yml")
-    assert fields["object"] == {"family": None, "settings": [], "warnings": []}
+    assert fields["scene"]["settings"]["files"] == ["config.yml"]
+    assert fields["object"] == {"family": None, "settings": None, "warnings": []}
     assert gate.asked == [{"file": "room.ckpt", "description": None, "settings": b"method: neus\n"}]
     outcome = run(*registration(room, DATA / "armchair.safetensors", "--no-config"))
     assert "settings: " not in outcome.stderr
@@ -189,16 +193,44 @@ def test_descriptions_that_are_refused(text: str, reason: str, run: Run) -> None
     assert "hint: " in outcome.stderr
 
 
+def test_settings_that_all_may_write_or_of_a_whole_home_are_no_runs(
+    gate: Gate, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint = run_folder / "sdfstudio_models" / "step-000000030.ckpt"
+    run_folder.chmod(0o1777)
+    opened(checkpoint)
+    run_folder.chmod(0o755)
+    monkeypatch.setenv("HOME", str(run_folder))
+    opened(checkpoint)
+    monkeypatch.setenv("HOME", str(run_folder.parents[1] / "home"))
+    opened(checkpoint)
+    assert [one["settings"] for one in gate.asked] == [None, b"method: neus\n"], "the first is kept, and found again"
+
+
+def test_settings_that_were_found_and_do_not_read_can_be_left(run: Run, run_folder: Path) -> None:
+    (run_folder / "config.yml").write_text("a: [")
+    outcome = run("inspect", run_folder)
+    assert outcome.code == 2
+    assert outcome.stderr.splitlines()[2].startswith("SETTINGS_")
+    assert "--no-config" in outcome.stderr
+
+
 @pytest.mark.usefixtures("gate")
 def test_settings_that_are_not_there_are_refused(run: Run, run_folder: Path) -> None:
     outcome = run("inspect", run_folder, "--config", run_folder / "absent.yml")
     assert (outcome.code, outcome.stderr.partition(" ")[0]) == (2, "FILE_NOT_FOUND")
 
 
-def test_a_real_run_is_converted(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    outcome = run("convert", dev_data("formats", "sdfstudio_neus_facto", "outputs"), tmp_path / "field.safetensors")
+def test_a_real_run_is_converted_from_its_folder(run: Run, tmp_path: Path) -> None:
+    outcome = run("convert", dev_data("formats", "neus", "exp"), tmp_path / "field.safetensors")
     assert outcome.code == 0, outcome.stderr
-    assert "settings: " in outcome.stderr
-    assert "config.yml" in outcome.stderr
-    assert outcome.stdout.startswith(f"{tmp_path / 'field.safetensors'}: sdfstudio_neus_facto, ")
+    assert "settings: recording/config.conf\n" in outcome.stderr
+    assert outcome.stdout.startswith(f"{tmp_path / 'field.safetensors'}: neus, ")
+
+
+def test_a_real_run_is_inspected_in_an_archive(run: Run, tmp_path: Path) -> None:
+    archive = shutil.make_archive(str(tmp_path / "run"), "gztar", dev_data("formats", "neus", "exp"))
+    outcome = run("inspect", archive, "--json")
+    assert outcome.code == 0, outcome.stderr
+    report = json.loads(outcome.stdout)
+    assert (report["family"], report["settings"]["trainer"]) == ("neus", "NeuS")

@@ -37,8 +37,8 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
             "scale_percent": 100 * SIGMAS[6],
         },
         "fields": {
-            "scene": {"family": "neus", "settings": ["config.yml"], "warnings": [WARNING]},
-            "object": {"family": None, "settings": [], "warnings": []},
+            "scene": {"family": "neus", "settings": None, "warnings": [WARNING]},
+            "object": {"family": None, "settings": None, "warnings": []},
         },
         "symmetry": {"order": 2, "axis": [-0.001, 0.0, 1.0], "continuous": False},
         "metrics": data.result["metrics"] | {"score": 0.041},

@@ -29,7 +29,7 @@ def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, mo
     monkeypatch.setattr("regnf_core.viewing.write_artifacts", write_artifacts)
     request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), seed=3, initial_transform=start)
     files = Path("scene"), Path("object")
-    notes = {"scene": FieldNotes("neus", (), ("SIGN_UNCERTAIN: perhaps",))}
+    notes = {"scene": FieldNotes("neus", None, ("SIGN_UNCERTAIN: perhaps",))}
     names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
     ((scene, obj, box, options, seed, _, warm),) = calls
     assert (scene, obj, seed, warm.object_model, names) == ("scene", "object", 3, "the model", ["result.json"])

@@ -235,12 +235,12 @@ def test_a_search_stops_between_models_when_it_is_cancelled(context: Context, mo
 def test_what_the_imports_said_reaches_the_result_and_the_job(context: Context) -> None:
     report = {"family": "neus", "warnings": ["TRUNCATION_ASSUMED: 8 voxels", "TRUNCATION_ASSUMED: again", "x" * 99]}
     context.records.update_field(SCENE, report=report)
-    config = {"name": "config.yml", "sha256": "0" * 64, "bytes": 3}
-    context.records.update_field(CHAIR, description={"settings": config}, report={"warnings": "no list"})
+    used = {"trainer": "neus", "files": ["config.conf"], "used": {"scale": 3.0}}
+    context.records.update_field(CHAIR, report={"warnings": "no list", "settings": used})
     engine = ModelEngine()
     record = run(context, engine, "j1", object=CHAIR)
     assert record.inputs["warnings"] == {"scene": ["TRUNCATION_ASSUMED", "x" * 64]}
     (notes,) = engine.notes
-    assert notes["scene"].to_dict() == {**report, "settings": []}
-    assert notes[CHAIR].to_dict() == {"family": None, "settings": ["config.yml"], "warnings": []}
+    assert notes["scene"].to_dict() == {**report, "settings": None}
+    assert notes[CHAIR].to_dict() == {"family": None, "settings": used, "warnings": []}
     assert run(context, engine, "j2", candidates=[CHAIR, TABLE]).inputs["warnings"] == record.inputs["warnings"]

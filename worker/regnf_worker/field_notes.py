@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from regnf_core.field_notes import FieldNotes
@@ -13,17 +12,12 @@ _MOST_WORDS = 16
 _WORD_LENGTH = 64
 
 
-def notes_of(field: FieldRecord) -> FieldNotes:
-    """What the import of a field said. Where it does not name the settings that it used, those that came with it."""
-    notes = FieldNotes.of_report(field.report)
-    if notes.settings or field.settings is None:
-        return notes
-    return replace(notes, settings=(field.settings.name,))
-
-
 def warned_of(scene: FieldRecord, objects: Sequence[FieldRecord]) -> dict[str, Any]:
     """An entry of a job's inputs: the words of the warnings of its scene, and of its object if it has one alone."""
     named = {"scene": scene} | ({"object": objects[0]} if len(objects) == 1 else {})
-    words = {name: [word[:_WORD_LENGTH] for word in notes_of(one).words[:_MOST_WORDS]] for name, one in named.items()}
+    words = {
+        name: [word[:_WORD_LENGTH] for word in FieldNotes.of_report(one.report).words[:_MOST_WORDS]]
+        for name, one in named.items()
+    }
     found = {name: list(dict.fromkeys(said)) for name, said in words.items() if said}
     return {WARNINGS: found} if found else {}

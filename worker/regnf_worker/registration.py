@@ -13,6 +13,7 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError, RegnfError
+from regnf_core.field_notes import FieldNotes
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.logs import log_context
 from regnf_state.manifest import Manifest, read_manifest
@@ -23,7 +24,7 @@ from regnf_state.registration_request import RegistrationRequest
 from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
 from regnf_worker.context import Context
 from regnf_worker.engine import Candidate, RegistrationEngine
-from regnf_worker.field_notes import notes_of, warned_of
+from regnf_worker.field_notes import warned_of
 from regnf_worker.fields import Fields, FieldsNotReadyError
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.job_limits import JobLimits, held_memory_limit, open_reserve
@@ -152,7 +153,8 @@ def _register(
 ) -> list[str]:
     """Have the engine do what the request asks for; the names of the artifacts in ``folder``."""
     options, scene_file = request.options, fields.file(scene.sha256)
-    notes = {"scene": notes_of(scene)} | {sha256_of(one.sha256): notes_of(one) for one in objects}
+    notes = {sha256_of(one.sha256): FieldNotes.of_report(one.report) for one in objects}
+    notes["scene"] = FieldNotes.of_report(scene.report)
     if request.candidates is not None:
         models = ObjectModels(context, engine, options, folder)
         candidates = [_candidate(models, one, fields, heartbeat) for one in objects]

@@ -10,9 +10,10 @@ from starlette.responses import JSONResponse, Response
 
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
-from regnf_service.fields.redescribe import described_anew, redescribe
+from regnf_service.fields.redescribe import redescribe
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
+from regnf_service.http.description_change import described_anew
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
 from regnf_service.http.paging import decode_token, encode_token

@@ -62,11 +62,19 @@ class CandidateDocument(Outgoing):
     T_object_scene: TransformDocument | None = Field(None, description="Of refined ones.")
 
 
+class SettingsUsedDocument(Outgoing):
+    """Which of a trainer's settings an import has used."""
+
+    trainer: str | None = None
+    files: list[str] = Field([], description="Their names.")
+    used: dict[str, Any] = Field({}, description="Entries of a description, such as `hash.levels`, and their values.")
+
+
 class FieldNotesDocument(Outgoing):
     """What the import of a field said that a result repeats."""
 
     family: str | None = Field(None, description="The format that was recognized.")
-    settings: list[str] = Field([], description="The trainer's files of settings that were used.")
+    settings: SettingsUsedDocument | None = Field(None, description="The trainer's settings that counted.")
     warnings: list[str] = Field([], description="Each begins with a stable word and a colon: docs/import-gate.md.")
 
 
