@@ -38,6 +38,7 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
             "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
             "LIBRARY_SEARCH_UNSUPPORTED",
             "INVALID_REQUEST",
+            "INVALID_DESCRIPTION",
             "WEBHOOK_NOT_ALLOWED",  # the operator's list
             "IDEMPOTENCY_KEY_REUSED",  # what was asked before
             "QUOTA_ACTIVE_JOBS",
@@ -47,6 +48,7 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
     "POST /fields": frozenset(
         {"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"}
     ),
+    "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
     "PUT /fields/{sha256}": frozenset({"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS"}),
     "GET /fields": frozenset({"INVALID_PAGE_TOKEN"}),
     "GET /jobs": frozenset({"INVALID_PAGE_TOKEN"}),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, WithJsonSchema
 
+from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import (
     Incoming,
@@ -16,6 +17,7 @@ from regnf_service.http.schemas.common import (
     Sha256,
     outgoing_problem,
 )
+from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
@@ -55,7 +57,7 @@ class FieldDocument(Outgoing):
 class FieldChange(Incoming):
     """What is to be changed of a field. What is left out stays as it is."""
 
-    description: dict[str, Any] | None = Field(
+    description: Annotated[dict[str, Any], WithJsonSchema(reference(UploadDescription))] | None = Field(
         None,
         description="Entries to add to what was said, or to replace; null takes an entry back (RFC 7396). Another "
         "description is another function: the kept bytes are imported anew.",
