@@ -166,7 +166,8 @@ def _readings(
         readings += space_readings(
             table, spaces, layers.tensors(), entries, "open" if overrides.hash.interpolation is None else "known"
         )
-    if overrides.use_grid is not True and (not readings or not is_trained or len(layers.weights) > SKIP_LAYER):
+    may_be_unused = overrides.use_grid is not True and (not is_trained or len(layers.weights) > SKIP_LAYER)
+    if not readings or may_be_unused:  # columns of zeros never see the grid, whatever is said
         unused = asdict(spaces[0].written()[0].grid)
         description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}
         readings.append(Reading("no grid", description, layers.tensors(), {"use_grid": False}))
