@@ -10,7 +10,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.layers import read_layers
+from regnf_core.importing.families.layers import Layers, read_layers
 from regnf_core.importing.families.linear_chains import find_chains
 from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, Order, network_field, told
 from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
@@ -55,19 +55,25 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     ((where, state, chain),) = found
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY, FORM_ENTRIES)
-    degree = degree_of(chain.input_width)
     layers = read_layers(state, chain.names, source, None, overrides.output_column or 0)
-    network = Network(layers, chain.skips)
-    forms = list(open_forms(network, degree, overrides))
+    place = f" under {where}" if where.isprintable() and where else ""
+    told = f"a chain of {len(chain.names)} linear layers{place}, of {chain.input_width} numbers"
+    return replace(plain_field(layers, chain.skips, told, overrides), sign_is_open=overrides.sign is None)
+
+
+def plain_field(
+    layers: Layers, skips: tuple[int, ...], recognized: str, overrides: UploadDescription
+) -> ConvertedField:
+    """The field of these layers in every form that the description leaves open.
+
+    Raises FieldFormatError: FIELD_NOT_RECOGNIZED, SETTINGS_CONTRADICT_TENSORS, INVALID_DESCRIPTION.
+    """
+    network = Network(layers, skips)
+    forms = list(open_forms(network, degree_of(layers.input_width), overrides))
     if not forms:
         raise FieldFormatError("description: no network of plain layers is so", reason="INVALID_DESCRIPTION")
-    place = f" under {where}" if where.isprintable() and where else ""
-    why = (
-        f"a chain of {len(chain.names)} linear layers{place}, of {chain.input_width} numbers",
-        "bounds [-1, 1]: assumed; say bounds if the field's region is another",
-    )
-    converted = network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why)
-    return replace(converted, sign_is_open=overrides.sign is None)
+    why = (recognized, "bounds [-1, 1]: assumed; say bounds if the field's region is another")
+    return network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why)
 
 
 def degree_of(width: int) -> int:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.importing.gate.convert import convert_file
+from regnf_core.fields.build import open_field
+from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.importing.networks.cases import FAMILIES, Case
 from tests.core.importing.networks.judging import judged
@@ -104,6 +105,35 @@ def test_layers_that_are_no_network_of_positions(values: dict[str, Any], reason:
     with pytest.raises(FieldFormatError) as caught:
         convert_file(tmp_path / "upload", tmp_path, None, ImportLimits())
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(("kernel", "bias"), [("dense_{}.kernel", "dense_{}.bias"), ("w{}", "b{}")])
+def test_layers_in_arrays(turned: bool, kernel: str, bias: str, tmp_path: Path) -> None:
+    """As Flax has them (in, out), or as torch (out, in); twelve layers, so that 10 stands before 2 in the alphabet."""
+    rng = np.random.default_rng(3)
+    sizes = [3, *[16] * 11, 1]
+    weights = [rng.normal(size=size).astype(np.float32) / 3.0 for size in zip(sizes[1:], sizes[:-1], strict=True)]
+    biases = [0.1 * rng.normal(size=rows).astype(np.float32) for rows in sizes[1:]]
+
+    def function(x: np.ndarray[Any, Any]) -> float:
+        h = x
+        for weight, b in zip(weights[:-1], biases[:-1], strict=True):
+            h = np.tanh(weight.astype(float) @ h + b)
+        return float((weights[-1].astype(float) @ h + biases[-1])[0])
+
+    biases[-1] -= np.float32(np.median([function(x) for x in rng.uniform(-1.0, 1.0, (200, 3))]))
+    stored = {kernel.format(i): weight if turned else weight.T for i, weight in enumerate(weights)}
+    stored |= {bias.format(i): b for i, b in enumerate(biases)}
+    with (tmp_path / "upload.npz").open("wb") as file:
+        np.savez(file, **stored)  # type: ignore[arg-type]
+    said = {"activation": "tanh", "output_tanh": 0}
+    report = convert_file(tmp_path / "upload.npz", tmp_path, said, ImportLimits())
+    assert report["family"] == "plain_network"
+    points = rng.uniform(-1.0, 1.0, (40, 3)).astype(np.float32)
+    found = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(points))
+    expected = np.array([function(x) for x in points.astype(float)])
+    np.testing.assert_allclose(found.numpy(), expected, atol=1e-5 * np.ptp(expected))
 
 
 @pytest.mark.slow
