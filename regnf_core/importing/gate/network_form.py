@@ -38,6 +38,8 @@ _MARGIN = 0.03
 """And greater by this."""
 _BETTER = 0.97
 """So much less misfit of a reading near the chosen one says that neither is right."""
+_TRUE, _MUCH = 0.05, 2.5
+"""Greatest error of values that were trained on distances, and how many times that of another reading must be."""
 _FINALISTS = 8
 _SHOWN = 4
 _SHARP_END = 2.5
@@ -148,7 +150,7 @@ def _by_values(rivals: list[_Candidate]) -> tuple[_Candidate, str]:
     for reach in range(len(errors[0])):
         ranked = sorted((found[reach], number) for number, found in enumerate(errors))
         (best, winner), (second, _) = ranked[0], ranked[1]
-        if best < _MARGIN and second > max(3.0 * best, best + _MARGIN):
+        if best < _TRUE and second > max(_MUCH * best, best + _MARGIN):
             how = f"its values differ from distances to its surface by {best:.3f} of them, the next by {second:.3f}"
             return rivals[winner], how
     raise _undecided(rivals, "they behave alike")

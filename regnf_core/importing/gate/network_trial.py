@@ -24,7 +24,7 @@ _NEAREST_SHARE = 8
 _STEPS = 6
 _BAND = 0.02
 """How far from the surface the gradient is looked at, of the bounds' diagonal."""
-_REACHES = (0.03, 0.06, 0.12, 0.2)
+_REACHES = (0.03, 0.06, 0.12, 0.2, 0.35)
 """Half widths of the bands in which values are compared with distances, of the bounds' diagonal."""
 _ARRIVED = 1e-4
 _FEWEST = 24
@@ -88,7 +88,7 @@ def surface_points(field: SdfField) -> tuple[Tensor, Tensor]:
 
 @without_new_code()
 def distance_errors(field: SdfField) -> list[float]:
-    """By how much values differ from the distance to the zero level, mean, in shells of growing reach, of that reach.
+    """By how much values differ from the distance to the zero level, median, of it, in shells of growing reach.
 
     The distance is that to the tangent planes of points of the zero level.
     """
@@ -107,7 +107,8 @@ def distance_errors(field: SdfField) -> list[float]:
         far = reach * diagonal
         shell = (distance.abs() > far / 2.0) & (distance.abs() < far)
         few = int(shell.sum()) < _FEWEST
-        errors.append(math.inf if few else float((value - distance)[shell].abs().median()) / far)
+        relative = (value - distance)[shell] / distance[shell]
+        errors.append(math.inf if few else float(relative.abs().median()))
     return errors
 
 
