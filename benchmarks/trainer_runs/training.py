@@ -33,7 +33,7 @@ def train(
         points = _points(shape, generator)
         target = shape(points)
         found = value(points)
-        if clamp is not None:
+        if clamp is not None and step > steps // 2:  # nothing would draw a first guess beyond the clamp to the surface
             found, target = found.clamp(-clamp, clamp), target.clamp(-clamp, clamp)
         error = (found - target).abs().mean()
         optimizer.zero_grad()
