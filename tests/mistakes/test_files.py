@@ -34,7 +34,7 @@ CASES = [
     Case("scene missing", "FILE_NOT_FOUND", 2, "rom.safetensors", "no such file", "Did you mean room.safetensors", "rom.safetensors"),
     Case("another ending", "FILE_NOT_FOUND", 2, "room.ckpt", "no such file", "Did you mean room.safetensors", "room.ckpt"),
     Case("folder missing", "FILE_NOT_FOUND", 2, "exports/room.ckpt", "no such file", "There is no folder exports", "exports/room.ckpt"),
-    Case("empty folder", "RUN_WITHOUT_CHECKPOINT", 2, "nothing", "checkpoint", "Give the whole run", "nothing"),
+    Case("empty folder", "RUN_WITHOUT_CHECKPOINT", 2, "nothing", "checkpoint", "Give the folder of one training run", "nothing"),
     Case("folder of a run cut short", "FILE_TRUNCATED", 2, "run/sdfstudio_models/step-000030000.ckpt", "cut short|too early|ends", "again", "run"),
     Case("config of a run", "FORMAT_NOT_RECOGNIZED", 2, "run/config.yml", FIELD, "mean run/sdfstudio_models/step-000030000.ckpt", "run/config.yml"),
     Case("detection as scene", "FORMAT_NOT_RECOGNIZED", 2, "box.json", FIELD, "mean run/|checkpoint", "box.json"),

@@ -19,7 +19,7 @@ def registered(box: object) -> Callable[[], object]:
 
 CASES = [
     Case("field missing", "FILE_NOT_FOUND", 0, "rom.safetensors", "no such file", "Did you mean room.safetensors", lambda: open_field("rom.safetensors")),
-    Case("folder of no run", "RUN_WITHOUT_CHECKPOINT", 0, "nothing", "checkpoint", "Give the whole run", lambda: open_field(Path("nothing"))),
+    Case("folder of no run", "RUN_WITHOUT_CHECKPOINT", 0, "nothing", "checkpoint", "Give the folder of one training run", lambda: open_field(Path("nothing"))),
     Case("config of a run", "FORMAT_NOT_RECOGNIZED", 0, "config.yml", "expected a field", "step-000030000.ckpt", lambda: open_field("run/config.yml")),
     Case("box without a size", "INVALID_DETECTION", 0, "detection.size", "is missing", '"min"', registered({"center": [0, 0, 0]})),
     Case("misspelled member", "INVALID_DETECTION", 0, "detection.cnter", "not a member", "Did you mean `center`", registered({"cnter": [0, 0, 0], "size": [1, 1, 1]})),
