@@ -53,6 +53,8 @@ class GridDescription:
     per_level_scale: Annotated[float, Ge(1), Le(8)] | None = None
     """Ratio of the resolutions of neighboring levels."""
     interpolation: Literal["linear", "smoothstep"] | None = None
+    radius: Annotated[float, Gt(0), Le(1e6)] | None = None
+    """The grid covers [-radius, radius]^3 of the coordinates that it is given."""
 
 
 @dataclass(frozen=True)

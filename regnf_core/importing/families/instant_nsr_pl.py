@@ -16,7 +16,7 @@ from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import space_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces
 from regnf_core.importing.families.layers import Layers, read_layers, require_extra_columns, strip_prefix
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import contradiction, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
@@ -41,6 +41,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     refuse_other_entries(overrides, FAMILY, ("level_mask", "hash"))
     layers = _layers(state, source)
     bounds, radius = _scene_cube(checkpoint["state_dict"], source)
+    if overrides.hash.radius not in (None, radius):
+        raise contradiction("hash.radius", overrides.hash.radius, f"{radius:g} (scene_aabb)")
     table_name = _PROGRESSIVE_TABLE if _PROGRESSIVE_TABLE in state else _TABLE
     table = source.array(table_name, lookup(state, table_name))
     require_shape(table_name, table, (None,))

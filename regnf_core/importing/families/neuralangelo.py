@@ -31,6 +31,8 @@ _FIRST_LEVELS = (4, 8)
 """Levels open from the start: the usual number, and that of the large scenes' configuration."""
 _UNTRAINED = 1.01e-4
 """tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
+_RADIUS = 2.0
+"""Half an edge of the cube that the grid covers, in all published configurations."""
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
@@ -53,7 +55,12 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     why = [f"keys {prefix}*, {len(layers.weights)} layers", "bounds [-1, 1]: the sphere's cube, in which it trains"]
     warnings: list[str] = []
     mask = overrides.level_mask or _open_levels(checkpoint, table, spaces[0].written()[0].grid, why, warnings)
-    entries = {**shared_entries(overrides, UNIT_CUBE), "level_mask": mask, "source": {"family": FAMILY}}
+    entries = {
+        **shared_entries(overrides, UNIT_CUBE),
+        "grid_radius": overrides.hash.radius or _RADIUS,
+        "level_mask": mask,
+        "source": {"family": FAMILY},
+    }
     readings = space_readings(table, spaces, layers.tensors(), entries)
     return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
 

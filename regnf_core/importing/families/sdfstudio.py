@@ -25,6 +25,8 @@ from regnf_core.importing.tensor_source import TensorSource, as_tensor, lookup
 from regnf_core.importing.upload_description import GridDescription, UploadDescription
 from regnf_core.schema.kinds.neus_facto import SKIP_LAYER
 
+_RADIUS = 2.0
+"""Half an edge of the cube that the grid covers: contracted space."""
 _PREFIXES = ("_model.field.", "_model.module.field.")
 _DEGREES = (6, 4, 8, 10, 5, 7, 9, 3, 2, 1, 0)
 """Of the sines and cosines: the usual number of frequencies first."""
@@ -144,6 +146,7 @@ def _readings(
     two_pi = overrides.positional_encoding.two_pi
     entries = {
         **shared_entries(overrides, bounds),
+        "grid_radius": overrides.hash.radius or _RADIUS,
         "positional_encoding": {
             "degree": degree,
             "two_pi": variant.two_pi if two_pi is None else two_pi,

@@ -58,7 +58,12 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         return None
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY, ("hash",))
-    entries = {"kind": "grid_mlp", **shared_entries(overrides, UNIT_CUBE), "source": {"family": FAMILY}}
+    entries = {
+        "kind": "grid_mlp",
+        **shared_entries(overrides, UNIT_CUBE),
+        "grid_radius": overrides.hash.radius or 1.0,
+        "source": {"family": FAMILY},
+    }
     read = _read_own if own else _read_tcnn
     readings, layers = read(state, source, entries, overrides.hash)
     told = "encoder.embeddings with offsets" if own else "encoder.params, backbone.params"

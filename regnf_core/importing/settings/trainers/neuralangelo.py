@@ -47,8 +47,11 @@ def _grid(encoding: Keys, said: Said) -> None:
             raise grid.fault(key, "an exponent of 2 from 0 to 20")
         if exponent is not None:
             said.put(entry, round(2.0**exponent), grid, key)
-    if grid.numbers("range") not in (None, [-2.0, 2.0]):
-        said.refuse(grid, "range")
+    reach = grid.numbers("range")
+    if reach is not None:
+        if len(reach) != 2 or not 0 < reach[1] == -reach[0]:
+            said.refuse(grid, "range")
+        said.put("hash.radius", reach[1], grid, "range")
     said.values["hash.interpolation"] = "linear"
 
 

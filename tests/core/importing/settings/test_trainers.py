@@ -192,6 +192,7 @@ def test_neuralangelo(enabled: str, first: int, iteration: int, opened: int) -> 
         "base_resolution": 32,
         "top_resolution": 2048,
         "interpolation": "linear",
+        "radius": 2.0,
     }
 
 
@@ -199,7 +200,7 @@ def test_neuralangelo_s_frame_and_refusals() -> None:
     sphere = json.dumps({"sphere_center": [1, 2, 3], "sphere_radius": 1.5, "frames": []})
     found = translated({"config.yaml": ANGELO % ("True", 4), "transforms.json": sphere})
     assert found.values["dataset_transform"] == [[3, 0, 0, 1], [0, 3, 0, 2], [0, 0, 3, 3], [0, 0, 0, 1]]
-    for old, new in (("hashgrid,", "fourier,"), ("[-2,2]", "[-1,1]"), ("skip: []", "skip: [4]"), ("softplus", "relu_")):
+    for old, new in (("hashgrid,", "fourier,"), ("[-2,2]", "[-1,2]"), ("skip: []", "skip: [4]"), ("softplus", "relu_")):
         text = (ANGELO % ("True", 4)).replace(old, new)
         assert_refused(lambda text=text: translated({"config.yaml": text}), "FAMILY_NOT_SUPPORTED")
 
