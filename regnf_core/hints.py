@@ -36,6 +36,8 @@ HINTS: dict[str, str] = {
     "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",
     "SAFE_FORMAT_INVALID": "The file is damaged, or no field of regnf. Copy it again, or give the checkpoint that it "
     "was made from.",
+    "FIELD_IMPLAUSIBLE": "Look at it: regnf inspect FILE --picture field.png --description "
+    "'{\"accept_implausible\": true}'",
     "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
     "files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",

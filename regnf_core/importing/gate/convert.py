@@ -76,14 +76,8 @@ def convert_file(
     bounds, label = converted.description["bounds"], converted.description["label"]
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
-    # These load torch, which takes seconds and which a file that is refused above never needs.
-    from regnf_core.fields.build import open_field
-    from regnf_core.importing.gate.plausibility import check_plausibility
-
-    field, started = open_field(target), time.process_time()
-    measured, more = check_plausibility(field)
-    if picture and time.process_time() - started < _QUICK_S:
-        _draw(field, up_axis, out_dir / PICTURE_NAME)
+    drawn_to = out_dir / PICTURE_NAME if picture else None
+    measured, more = _evaluated(target, up_axis, drawn_to, bool((description or {}).get("accept_implausible")))
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
@@ -110,6 +104,26 @@ def _read(
         return read_upload(upload, out_dir, description, limits, settings)
     finally:
         remove_unpacked(out_dir)
+
+
+def _evaluated(
+    path: Path, up_axis: str | None, picture: Path | None, accepted: bool
+) -> tuple[dict[str, float], list[str]]:
+    """What was measured of the field in the file ``path``, and warnings; it is drawn if that is quick.
+
+    accepted: even if it does not behave like a signed distance. Raises FieldFormatError.
+    """
+    # These load torch, which takes seconds and which a file that is refused before never needs.
+    from regnf_core.fields.build import open_field
+    from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
+
+    field, started = open_field(path), time.process_time()
+    measured, warnings = check_plausibility(field)
+    if not accepted:
+        require_plausible(measured)
+    if picture is not None and time.process_time() - started < _QUICK_S:
+        _draw(field, up_axis, picture)
+    return measured, warnings
 
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:

@@ -18,6 +18,8 @@ _SAME = 1e-3
 _SURFACE_SHARE = 1e-3
 """A point counts as on the surface when its |distance| is below this share of the bounds' diagonal."""
 _GRADIENT_RANGE = (0.5, 2.0)
+_PLAUSIBLE = (0.1, 10.0)
+"""Beyond these slopes distances are of no use. Trained fields are known from 0.2 (a loss that clamps them) to 2."""
 _MIN_SLOPE = 1e-6  # a field of any unit may be uploaded: only a gradient of zero is left out; the steps are bounded
 
 
@@ -65,6 +67,17 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
         "gradient_p90": high,
     }
     return measured, _warnings(measured)
+
+
+def require_plausible(measured: dict[str, float]) -> None:
+    """Raise FieldFormatError (FIELD_IMPLAUSIBLE) if what was measured is no signed distance's, not even a bad one's."""
+    slope = measured["gradient_median"]
+    if not _PLAUSIBLE[0] <= slope <= _PLAUSIBLE[1]:
+        message = (
+            f"the gradient's norm at the surface is {slope:.3g}, where a signed distance has 1: the settings may be of"
+            " another file, or the values no distances; with accept_implausible: true in the description it is taken"
+        )
+        raise FieldFormatError(message, reason="FIELD_IMPLAUSIBLE")
 
 
 def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None:

@@ -38,6 +38,15 @@ def converted(folder: Path, overrides: dict[str, Any] | None = None, **arrays: A
     return convert_file(folder / "grid.npz", folder, overrides, ImportLimits())
 
 
+def test_values_that_are_no_distances_are_taken_only_on_demand(tmp_path: Path) -> None:
+    arrays = {"sdf": 50.0 * BALL, "origin": LOW, "spacing": SPACING}
+    assert_refused(lambda: converted(tmp_path, **arrays), "FIELD_IMPLAUSIBLE")
+    assert_refused(lambda: converted(tmp_path, {"accept_implausible": False}, **arrays), "FIELD_IMPLAUSIBLE")
+    report = converted(tmp_path, {"accept_implausible": True}, **arrays)
+    assert [warning.partition(":")[0] for warning in report["warnings"]] == ["GRADIENT_NOT_UNIT"]
+    assert_refused(lambda: converted(tmp_path, **(arrays | {"sdf": 0.05 * BALL})), "FIELD_IMPLAUSIBLE")
+
+
 @pytest.mark.parametrize(
     "placement",
     [
