@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from regnf_core.errors import RegnfError
 
 MODULES = {
-    "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh"),
+    "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh", "yaml"),
     "service": (
         "fastapi",
         "obstore",

@@ -19,7 +19,8 @@ from regnf_fit.options import NetworkOptions
 
 GRID_RADIUS = 2.0
 """The hash grid covers [-2, 2]^3, in the units of the field."""
-_DEGREE = 6
+POSITION_DEGREE = 6
+"""Frequencies of the sines and cosines of the position."""
 _TABLE_SPREAD = 1e-4
 
 
@@ -46,7 +47,7 @@ class TrainableField(nn.Module):
         grid = options.grid
         table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
         self.table = nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
-        self._encoding = PositionalEncoding(_DEGREE)
+        self._encoding = PositionalEncoding(POSITION_DEGREE)
         widths = [3 + self._encoding.width + grid.width] + [options.hidden_width] * options.hidden_layers
         weights, biases = random_layers(widths, generator)
         weights[0][:, 3 : 3 + self._encoding.width] = 0.0
@@ -66,7 +67,7 @@ class TrainableField(nn.Module):
         return {
             "kind": "neus_facto",
             "hash": asdict(self.options.grid),
-            "positional_encoding": {"degree": _DEGREE, "two_pi": False},
+            "positional_encoding": {"degree": POSITION_DEGREE, "two_pi": False},
             "use_grid": True,
             "contraction": "none",
             "level_mask": None,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import torch
+import yaml
 from torch import Tensor
 
 from regnf_core.files import atomic_path
 from regnf_fit.images.network import RadianceField
+from regnf_fit.network import POSITION_DEGREE
 
 _EMBEDDING = 32
 """Columns of the color's network for an image's appearance, which our fields do not have: zeros."""
@@ -18,7 +21,8 @@ _EMBEDDING = 32
 def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path) -> None:
     """Write a checkpoint {step, pipeline} to ``path`` atomically. bounds: (2, 3), the field's frame.
 
-    The distances are those of the field before its table is rounded to half precision.
+    The distances are those of the field before its table is rounded to half precision. What the tensors do not say
+    stands in ``config.yml`` beside it, as sdfstudio names it; a file of that name that is there already stays.
     """
     layers = dict(enumerate(zip(field.weights, field.biases, strict=True)))
     last = len(layers) - 1
@@ -40,6 +44,29 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
     pipeline = {f"_model.field.{name}": value.detach().cpu().clone() for name, value in entries.items()}
     with atomic_path(path) as temporary:
         torch.save({"step": field.options.iterations, "pipeline": pipeline}, temporary)
+    settings = path.with_name("config.yml")
+    if not settings.exists():
+        with atomic_path(settings) as temporary:
+            temporary.write_text(yaml.safe_dump(_settings(field), sort_keys=False), encoding="utf-8")
+
+
+def _settings(field: RadianceField) -> dict[str, Any]:
+    grid = field.options.grid
+    sdf_field = {
+        "num_layers": field.options.hidden_layers,
+        "hidden_dim": field.options.hidden_width,
+        "use_grid_feature": True,
+        "encoding_type": "hash",
+        "num_levels": grid.levels,
+        "max_res": round(grid.scales()[-1]) + 1,
+        "base_res": grid.base_resolution,
+        "log2_hashmap_size": grid.log2_table_size,
+        "hash_features_per_level": grid.features_per_level,
+        "hash_smoothstep": grid.interpolation == "smoothstep",
+        "position_encoding_max_degree": POSITION_DEGREE,
+        "use_position_encoding": True,
+    }
+    return {"method_name": "neus-facto", "pipeline": {"model": {"sdf_field": sdf_field}}}
 
 
 def _normalized(name: str, weight: Tensor, bias: Tensor) -> dict[str, Tensor]:

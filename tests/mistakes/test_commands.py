@@ -33,7 +33,7 @@ CASES = [
     Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--truth", "box.json"]),
     Case("library empty", "LIBRARY_EMPTY", 2, "nothing", "expected safe fields", "Give the folder", ["search", "room.safetensors", "nothing", *REGISTER[3:]]),
     Case("library missing", "FILE_NOT_FOUND", 2, "nowhere", "no such file", "Check the path", ["search", "room.safetensors", "nowhere", *REGISTER[3:]]),
-    Case("library of a run's folder above", "LIBRARY_EMPTY", 2, "run", "expected safe fields", "folders inside it", ["search", "room.safetensors", "run", *REGISTER[3:]]),
+    Case("library of a run's folder above", "FILE_TRUNCATED", 2, "step-000030000.ckpt", "cut short", "Copy or download", ["search", "room.safetensors", "run", *REGISTER[3:]]),
     Case("converting to an unknown format", "INVALID_OPTIONS", 2, "out.xyz", "expected a name that ends in", "ending", ["convert", "chair.safetensors", "out.xyz"]),
     Case("converting into no folder", "INVALID_OPTIONS", 2, "there", "no such folder", "mkdir", ["convert", "chair.safetensors", "there/out.ply"]),
     Case("picture of no PNG", "INVALID_OPTIONS", 2, "a.jpg", "ends in .png", "--picture field.png", ["inspect", "chair.safetensors", "--picture", "a.jpg"]),

@@ -9,7 +9,10 @@ from regnf_core.importing.gate.convert import convert_file
 from regnf_core.importing.gate.report import ImportLimits
 
 
-def convert(upload: Path, folder: Path, description: dict[str, Any] | None = None) -> dict[str, Any]:
+def convert(
+    upload: Path, folder: Path, description: dict[str, Any] | None = None, settings: Path | None = None
+) -> dict[str, Any]:
     """The report of ``upload``, whose field is written below ``folder``."""
     folder.mkdir()
-    return convert_file(upload, folder, description, ImportLimits())
+    named = None if settings is None else (settings.name, settings)
+    return convert_file(upload, folder, description, ImportLimits(), settings=named)

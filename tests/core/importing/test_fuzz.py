@@ -34,7 +34,7 @@ from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 from tests.core.importing.fuzzing.stages import run_stage
 
 ROOT = Path(__file__).resolve().parents[3]
-CASES = 3_000
+CASES = 1_000
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
@@ -197,7 +197,11 @@ def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
 def test_every_sound_file_is_taken(seeds: Seeds, tmp_path: Path) -> None:
     """What is refused undamaged would never get deeper damaged."""
     files = {"checkpoint": seeds.archive, "field file": seeds.field_file, **seeds.other_files}
-    assert {kind: run_stage("file", data, tmp_path) for kind, data in files.items()} == dict.fromkeys(files, "taken")
+    ended = {
+        kind: run_stage("settings" if kind.startswith("settings ") else "file", data, tmp_path)
+        for kind, data in files.items()
+    }
+    assert ended == dict.fromkeys(files, "taken")
 
 
 @pytest.mark.parametrize("stage", STAGES)

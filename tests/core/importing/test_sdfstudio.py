@@ -226,7 +226,7 @@ def test_odd_objects_beside_the_weights_do_no_harm() -> None:
         ({"pipeline": _Odd()}, "UNSAFE_GLOBAL_IN_WEIGHTS"),
         (_Odd(), "UNSAFE_GLOBAL_IN_WEIGHTS"),
         ({"neural_points": 1}, "FAMILY_NOT_SUPPORTED"),
-        ({"model": {"encoder.embeddings": 1}}, "FAMILY_NOT_SUPPORTED"),
+        ({"model": {"encoder.embeddings": 1}}, "FIELD_NOT_RECOGNIZED"),
         ({"model_state_dict": {"in_layer.0.weight": torch.ones(3)}}, "FIELD_NOT_RECOGNIZED"),
     ],
 )

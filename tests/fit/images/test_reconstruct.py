@@ -125,7 +125,7 @@ def test_the_exported_layout_reads_back(tmp_path):
     options = replace(SMALL, iterations=40, half_table=False)
     files = FitFiles(path, sdfstudio=exported)
     reconstruct(scenes.images(count=4), files, options, device="cpu")
-    report = convert(exported, tmp_path / "imported")
+    report = convert(exported, tmp_path / "imported", settings=tmp_path / "config.yml")
     assert report["family"] == "sdfstudio_neus_facto", report
     imported = open_field(next((tmp_path / "imported").glob("*.safetensors")))
     points = torch.from_numpy(np.random.default_rng(0).uniform(*scenes.BOUNDS, size=(500, 3))).float()

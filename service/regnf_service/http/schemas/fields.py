@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, WithJsonSchema
+from pydantic import Field, GetJsonSchemaHandler, TypeAdapter
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.http.paging import NEXT_PAGE
@@ -17,7 +19,6 @@ from regnf_service.http.schemas.common import (
     Sha256,
     outgoing_problem,
 )
-from regnf_service.http.schemas.references import reference
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
@@ -54,10 +55,18 @@ class FieldDocument(Outgoing):
     links: Links
 
 
+class _DocumentedAsDescription:
+    """Has the contract show an UploadDescription where a part of one is taken."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, _: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return handler(TypeAdapter(UploadDescription).core_schema)
+
+
 class FieldChange(Incoming):
     """What is to be changed of a field. What is left out stays as it is."""
 
-    description: Annotated[dict[str, Any], WithJsonSchema(reference(UploadDescription))] | None = Field(
+    description: Annotated[dict[str, Any], _DocumentedAsDescription] | None = Field(
         None,
         description="Entries to add to what was said, or to replace; null takes an entry back (RFC 7396). Another "
         "description is another function: the kept bytes are imported anew.",
