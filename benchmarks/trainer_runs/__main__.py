@@ -23,6 +23,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=150, help="steps of training")
     parser.add_argument("--trainer", action="append", choices=list(TRAINERS), help="only this one; repeat for more")
+    parser.add_argument("--settings", choices=["with", "without", "both"], default="both", help="what is compared")
     parser.add_argument("--output", type=Path, help="the table to write")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -39,7 +40,7 @@ def _check(arguments: argparse.Namespace, trainers: list[str]) -> None:
     from benchmarks.trainer_runs.report import table
 
     sections = []
-    for with_settings in (True, False):
+    for with_settings in {"with": (True,), "without": (False,), "both": (True, False)}[arguments.settings]:
         outcomes = []
         for name in trainers:
             for facts in sorted((arguments.folder / name).glob(f"*/{FACTS}"))[: arguments.count]:
@@ -59,7 +60,8 @@ def _check(arguments: argparse.Namespace, trainers: list[str]) -> None:
     text = "\n\n".join(sections)
     _log.info("%s", text)
     if arguments.output:
-        command = f"python -m benchmarks.trainer_runs write|check --count {arguments.count} --seed {arguments.seed}"
+        told = f"--count {arguments.count} --seed {arguments.seed} --settings {arguments.settings}"
+        command = f"python -m benchmarks.trainer_runs write|check {told}"
         arguments.output.write_text(
             f"# Runs of every trainer with random settings\n\nCommand: `{command}`.\n\n{text}\n"
         )

@@ -118,10 +118,10 @@ class HashGridConfig:
             level: (self._entries_of(other) - self._entries_of(usual[level]), other)
             for level, other in self._otherwise_rounded().items()
         }
-        others = {level: other for level, (more, other) in counts.items() if more}
-        for chosen in itertools.islice(_combinations(others), _MAX_PATTERNS):
-            if total + sum(counts[level][0] for level in chosen) == entries:
-                return replace(self, resolutions=_with_others(usual, others, chosen))
+        chosen = _fewest({level: more for level, (more, _) in counts.items() if more}, entries - total)
+        if chosen is not None:
+            others = {level: other for level, (_, other) in counts.items()}
+            return replace(self, resolutions=_with_others(usual, others, chosen))
         raise FieldFormatError(
             f"hash table has {entries} entries, its description gives {self.entries}", reason="FIELD_SHAPES_MISMATCH"
         )
@@ -168,3 +168,15 @@ def _with_others(usual: tuple[int, ...], others: dict[int, int], chosen: tuple[i
 
 def _round_up(nodes: int) -> int:
     return -(-nodes // _ENTRY_ALIGNMENT) * _ENTRY_ALIGNMENT
+
+
+def _fewest(changes: dict[int, int], total: int) -> tuple[int, ...] | None:
+    """The fewest levels whose changes add up to ``total``; None where none do."""
+    reached: dict[int, tuple[int, ...]] = {0: ()}
+    for level, change in changes.items():
+        for before, chosen in list(reached.items()):
+            rank = (len(chosen) + 1, (*chosen, level))
+            held = reached.get(before + change)
+            if (held is None and len(reached) < _MAX_PATTERNS) or (held is not None and rank < (len(held), held)):
+                reached[before + change] = rank[1]
+    return reached.get(total)

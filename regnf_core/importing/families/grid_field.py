@@ -32,7 +32,8 @@ def space_readings(
     whether it is known.
     """
     readings = []
-    for entry in (entry for space in spaces for entry in space.written()):
+    written = sorted((entry for space in spaces for entry in space.written()), key=lambda entry: entry.tier)
+    for entry in written[:MAX_LAYOUTS]:
         # the training device may have indexed the same table otherwise
         others = tuple(itertools.islice(entry.grid.stride_variants(), _MAX_STRIDES)) if entry.tier == 0 else ()
         for reading in grid_readings(table, (entry.grid, *others), layers, entries):
