@@ -22,7 +22,7 @@ def test_a_dataset_becomes_a_field_with_snapshots_and_a_checkpoint(run: Run, tmp
     assert outcome.code == 0, outcome.stderr
     assert "eikonal_error" in outcome.stdout
     assert read_description(output)["label"] == "two"
-    names = {"images", "two.safetensors", "two.ckpt", "two-after-10-percent.safetensors"}
+    names = {"images", "two.safetensors", "two.ckpt", "config.yml", "two-after-10-percent.safetensors"}
     assert {path.name for path in tmp_path.iterdir()} == names | {"two-after-50-percent.safetensors"}
 
 
