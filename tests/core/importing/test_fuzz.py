@@ -34,7 +34,7 @@ from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 from tests.core.importing.fuzzing.stages import run_stage
 
 ROOT = Path(__file__).resolve().parents[3]
-CASES = 1_000
+CASES = 3_000
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
@@ -177,6 +177,7 @@ def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
     """No other exception, no import, no file left or opened, nothing slow, nothing large."""
     assert [(failure["at"], failure["fault"]) for failure in fuzzed["failures"]] == []
@@ -184,10 +185,11 @@ def test_no_invented_file_is_more_than_refused(fuzzed: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_fuzzer_reaches_what_lies_deep(fuzzed: dict[str, Any]) -> None:
     """A fuzzer whose cases all fail at the first check would find nothing."""
     outcomes = fuzzed["outcomes"]
-    assert all(outcomes[f"{stage} taken"] > CASES // 300 for stage in STAGES)
+    assert all(outcomes[f"{stage} taken"] > 10 for stage in STAGES)
     deep = ("ARCHIVE_CRC_MISMATCH", "TENSOR_NOT_DENSE", "TENSOR_NOT_FINITE", "TENSOR_STORAGE_MISMATCH", "TENSOR_SHAPE")
     assert all(any(key.endswith(reason) for key in outcomes) for reason in deep)
     assert len({key.split()[1] for key in outcomes}) > 40

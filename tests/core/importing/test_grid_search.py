@@ -8,7 +8,7 @@ import pytest
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces, grid_name
 from regnf_core.importing.families.grid_space import WrittenGrid
 from regnf_core.importing.upload_description import GridDescription
-from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig
 from tests.core.importing.archives import assert_refused
 
 HABITS = GridHabits((2, 4, 8), "smoothstep")
@@ -120,10 +120,20 @@ def test_no_grid_at_all_is_a_refusal() -> None:
     assert_refused(lambda: find(2, 1_000_000), "HASH_GRID_NOT_RECOGNIZED")
 
 
-def test_a_name_says_how_rows_are_indexed() -> None:
+def test_the_training_device_may_have_indexed_a_level_otherwise() -> None:
     """Neuralangelo's grid: level 5 has 129 nodes an edge by the table's length, its rows may be 128 apart."""
     usual = most_usual(365_792_384, 128)
-    assert usual.level_resolutions()[5] == 129
+    assert usual.level_strides()[5] == usual.level_resolutions()[5] == 129
     (other,) = usual.stride_variants()
+    assert (other.level_strides()[5], other.level_resolutions()[5]) == (128, 129)
+    assert other.entries == usual.entries
     assert "indexed level 5 by 128" in grid_name(other)
     assert "indexed" not in grid_name(usual)
+
+
+def test_levels_that_grow_faster_than_a_field_file_may_say_are_not_found() -> None:
+    """Two levels from 16 to 512 nodes would grow by 32; eight of them by 32^(1/7)."""
+    grid = HashGridConfig.from_top_resolution(512, levels=8, features_per_level=2, log2_table_size=12)
+    found = [entry.grid for entry in find(grid.entries * 2, 16)]
+    assert grid in found
+    assert all(config.per_level_scale <= MAX_GROWTH for config in found)
