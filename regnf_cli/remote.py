@@ -11,6 +11,7 @@ from typing import Any
 
 import httpx
 
+from regnf_cli.patient_client import PatientClient
 from regnf_cli.remote_errors import ServiceError, checked, checked_address, service_error
 from regnf_cli.worker_watch import WorkerWatch
 from regnf_core.field_source import FieldSource
@@ -27,6 +28,7 @@ Report = Callable[[str, float], None]
 class RemoteService:
     """The few calls of the HTTP contract that a registration needs.
 
+    What is asked too fast is asked again when the service says so.
     What waits for a worker raises NoWorkerError once the service has had none for ``worker_timeout_s``.
     """
 
@@ -34,7 +36,7 @@ class RemoteService:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         checked_address(address)
         self.address = address.rstrip("/")
-        self._http = httpx.Client(base_url=self.address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
+        self._http = PatientClient(base_url=self.address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
         self._watch = WorkerWatch(self._worker_lives, worker_timeout_s)
 
     def __enter__(self) -> RemoteService:
@@ -77,7 +79,7 @@ class RemoteService:
         with _Told(source.file, report) as file:
             if not source.description and settings is None:
                 length = {"Content-Length": str(file.size), "Content-Type": "application/octet-stream"}
-                checked(self._http.put(f"/fields/{sha256}", content=file.blocks(), headers=length))
+                checked(self._http.put(f"/fields/{sha256}", content=_Blocks(file), headers=length))
                 return
             parts: dict[str, Any] = {"file": (source.file.name, file, "application/octet-stream")}
             if source.description:
@@ -147,9 +149,16 @@ class _Told(io.FileIO):
         self._report("uploading", self.tell() / max(self.size, 1))
         return block
 
-    def blocks(self) -> Iterator[bytes]:
-        """All of it."""
-        while block := self.read(_BLOCK):
+
+class _Blocks:
+    """All of a file, from its beginning each time that it is sent."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+
+    def __iter__(self) -> Iterator[bytes]:
+        self._file.seek(0)
+        while block := self._file.read(_BLOCK):
             yield block
 
 

@@ -12,6 +12,7 @@ from regnf_core.errors import InvalidInputError, RegnfError
 _HINTS = {
     "UNAUTHENTICATED": "Give the service's token with --token, or in the environment variable REGNF_API_TOKEN.",
     "RATE_LIMITED": "Wait a moment, and give the same command again.",
+    "TOO_MANY_WRITES": "Wait a moment, and give the same command again.",
     "QUEUE_FULL": "Give the same command again later.",
 }
 _HOST = re.compile(r"[A-Za-z0-9.-]+(:\d+)?(/.*)?")

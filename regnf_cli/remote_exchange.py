@@ -16,7 +16,7 @@ from regnf_cli.remote import RemoteService, Report
 from regnf_cli.remote_errors import ServiceError, unreachable
 from regnf_core.field_source import FieldSource
 
-_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", ServiceError.reason})
+_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
 
 
 @dataclass(frozen=True)
