@@ -55,6 +55,11 @@ REASONS: dict[str, Reason] = {
     "RATE_LIMITED": Reason(
         429, "Too many calls", "You send requests faster than the service allows. See `Retry-After`."
     ),
+    "TOO_MANY_WRITES": Reason(
+        429,
+        "Too many writes",
+        "You post, change, cancel or delete faster than the service allows. Nothing was done. See `Retry-After`.",
+    ),
     "TOO_MANY_REQUESTS_AT_ONCE": Reason(
         429, "Too many requests at once", "Wait until some of your requests have been answered, then repeat."
     ),

@@ -13,6 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIB = 1024 * 1024
 _RATE_BEYOND_LOOPBACK = 20.0
+_WRITES_OF_SEVERAL_CALLERS = 10.0
 
 
 def _default_state_dir() -> Path:
@@ -88,6 +89,10 @@ class Settings(BaseSettings):
     """Calls a second of each caller in the long run; 0: any. Unset: any on loopback, 20 elsewhere."""
     rate_limit_burst: int = Field(default=100, ge=1)
     """Calls that a caller may make at once after a pause."""
+    write_limit_per_s: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    """Requests of each caller that are no reads, a second, in one process. Unset: any on loopback without tokens, else 10."""
+    write_limit_burst: int = Field(default=200, ge=1)
+    """Such requests that a caller may send at once after a pause."""
     max_requests_per_caller: int = Field(default=512, ge=1)
     """Requests of each caller that are in progress in one process; without tokens, of each address."""
     max_uploads_per_caller: int = Field(default=64, ge=2)
@@ -179,6 +184,13 @@ class Settings(BaseSettings):
         if self.rate_limit_per_s is not None:
             return self.rate_limit_per_s
         return 0.0 if self.is_private else _RATE_BEYOND_LOOPBACK
+
+    @property
+    def writes_per_s(self) -> float:
+        """The rate of writes that holds; 0: none. Who is alone on a machine has nobody to keep waiting."""
+        if self.write_limit_per_s is not None:
+            return self.write_limit_per_s
+        return 0.0 if self.is_private and not self.needs_token else _WRITES_OF_SEVERAL_CALLERS
 
     @property
     def scratch_dir(self) -> Path:

@@ -12,6 +12,7 @@ from starlette.staticfiles import StaticFiles
 
 from regnf_core import __version__
 from regnf_service.http import problems
+from regnf_service.http.buckets import Buckets
 from regnf_service.http.connections import Connections
 from regnf_service.http.contract import build_contract
 from regnf_service.http.hosts import allowed_hosts
@@ -22,6 +23,7 @@ from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimit
 from regnf_service.http.request_gate import RequestGate
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
 from regnf_service.http.turns import TurnGate
+from regnf_service.http.write_limits import WriteGate
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics
 from regnf_service.services import Services
@@ -84,6 +86,8 @@ def _middleware(
         allow_unauthenticated=settings.allow_unauthenticated or settings.published_on_loopback,
     )
     limits = [Middleware(RequestGate, slots=services.requests)]
+    if settings.writes_per_s:
+        limits.append(Middleware(WriteGate, buckets=Buckets(settings.writes_per_s, settings.write_limit_burst)))
     if limiter is not None:
         limits.append(Middleware(RateGate, limiter=limiter))
     hosts = Middleware(OriginGate, hosts=allowed_hosts(settings))
