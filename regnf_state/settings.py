@@ -90,7 +90,10 @@ class Settings(BaseSettings):
     rate_limit_burst: int = Field(default=100, ge=1)
     """Calls that a caller may make at once after a pause."""
     write_limit_per_s: float | None = Field(default=None, ge=0, allow_inf_nan=False)
-    """Requests of each caller that are no reads, a second, in one process. Unset: any on loopback without tokens, else 10."""
+    """Requests a second of each caller that are no reads, in one process; 0: any.
+
+    Unset: any on loopback without tokens, 10 elsewhere.
+    """
     write_limit_burst: int = Field(default=200, ge=1)
     """Such requests that a caller may send at once after a pause."""
     max_requests_per_caller: int = Field(default=512, ge=1)
