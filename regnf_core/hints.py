@@ -25,6 +25,8 @@ HINTS: dict[str, str] = {
     "SURFACE_UNEXPLAINED": "Most often the object is a similar one, for example a chair without its cushion. If "
     "something lies on it, try a tighter box.",
     "FREE_SPACE_VIOLATED": "Most often it is another object, or the scene's field lacks parts of this one.",
+    "OUTSIDE_DETECTION": "Most often it is another object. Around a part of the object, increase the option "
+    "robust.box_tolerance.",
     "TOO_LITTLE_SURFACE": "Too little of the object was observed. Fit the scene's field to more views, or use a box "
     "around more of the object.",
     "LARGE_RESIDUAL": "Most often it is another object. With the preset paper, try the preset robust or more "

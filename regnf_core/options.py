@@ -120,6 +120,9 @@ class RobustOptions:
     its box."""
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
     """Maximum number of samples of the object's surface. Increase it for thin parts."""
+    box_tolerance: Annotated[float, Ge(0), Le(10)] = 1.0
+    """How far the object may reach beyond each face of the detection box, as a share of the box's edge. Increase it for
+    boxes around a part of the object only."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
     reliable and the pose less accurate."""

@@ -219,6 +219,11 @@ class SearchConstants:
         Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=10, min_distance=0.05),
     )
     """Successive halving on distance grids. The first stage only ranks the seeds. [by hand]"""
+    min_share_of_detection: float = 0.25
+    """Share of the detection box's edge. Along one of them at least, the object is that long. [by hand]"""
+    seed_tolerance: float = 2.0
+    """Seeds may reach beyond the detection this many times as far as poses: their scale and place are rough. [by
+    hand]"""
     batch: int = 512
     """Poses at once: bounds memory, and what is in use stays in the processor's cache. [by hand]"""
     grid_cells: int = 40

@@ -5,7 +5,7 @@ What each step does stands in docs/robust.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 
@@ -28,6 +28,7 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.report import result_of
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
+from regnf_core.robust.search.detection_bound import DetectionBound
 from regnf_core.robust.search.features import feature_seeds
 from regnf_core.robust.search.rotations import start_rotations
 from regnf_core.robust.search.seeds import seed_poses, seed_poses_around
@@ -92,11 +93,17 @@ def search_poses(
     model: ObjectModel,
     seeds: Sim3,
     generator: torch.Generator,
+    bound: DetectionBound,
     stages: Sequence[Stage] = SEARCH.stages,
 ) -> PoseCandidates:
-    """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated."""
+    """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated.
+
+    bound: what the detection says of a pose.
+    """
+    near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
+    seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
-    context = RefinementContext(model.extremal_points, generator)
+    context = RefinementContext(model.extremal_points, generator, admits=bound.admits)
     return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
 
 
@@ -108,7 +115,8 @@ def refine_poses(
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
     points = problem.model.extremal_points
-    context = RefinementContext(points, generator, max_offset=problem.view.max_offset, on_step=on_step)
+    bound, max_offset = problem.bound, problem.view.max_offset
+    context = RefinementContext(points, generator, max_offset=max_offset, on_step=on_step, admits=bound.admits)
     found = coarse_to_fine(problem.fit, PoseCandidates.start(T, with_offsets=True), REFINEMENT.stages, context)
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
     origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
@@ -147,28 +155,38 @@ def _best_attempt(
     T_start: Sim3 | None,
 ) -> Evaluation:
     """Around a given start, else from the shapes, else from feature matches too: slower ways where others fail."""
+    found: list[Evaluation] = []
+    for seeds in _seed_sets(problem, options, seed, generator, T_start):
+        found.append(_attempt(problem, seeds, options, run, generator))
+        if found[-1].verdict != "rejected":
+            break
+    return min(found, key=lambda one: one.rank)
+
+
+def _seed_sets(
+    problem: RegistrationProblem,
+    options: RegistrationOptions,
+    seed: int,
+    generator: torch.Generator,
+    T_start: Sim3 | None,
+) -> Iterator[Sim3]:
+    """Seeds (H,) of one attempt after another, each made when its turn comes."""
     view, model = problem.view, problem.model
     if T_start is not None:
-        seeds = seed_poses_around(problem.in_working_frames(T_start), generator)
-        found = _attempt(problem, seeds, options, run, generator)
-        if found.verdict != "rejected":
-            return found
+        yield seed_poses_around(problem.in_working_frames(T_start), generator)
     seeds = geometric_seeds(view, model, start_rotations(options))
-    found = _attempt(problem, seeds, options, run, generator)
-    if found.verdict != "rejected" or options.robust.feature_draws == 0:
-        return found
-    matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-    if len(matched) == 0:
-        return found
-    again = _attempt(problem, Sim3.cat([seeds, matched]), options, run, generator)
-    return min(found, again, key=lambda one: one.rank)
+    yield seeds
+    if options.robust.feature_draws:
+        matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
+        if len(matched):
+            yield Sim3.cat([seeds, matched])
 
 
 def _attempt(
     problem: RegistrationProblem, seeds: Sim3, options: RegistrationOptions, run: Run, generator: torch.Generator
 ) -> Evaluation:
     with run.phase("initializing"):
-        candidates = search_poses(problem.view, problem.model, seeds, generator)
+        candidates = search_poses(problem.view, problem.model, seeds, generator, problem.bound)
     with run.phase("optimizing"):
         refined = refine_poses(problem, candidates.T, generator, _progress_of_steps(run))
     with run.phase("verifying"):

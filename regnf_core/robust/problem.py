@@ -13,19 +13,22 @@ from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.samples import split
 from regnf_core.robust.scene.scene_view import SceneView
+from regnf_core.robust.search.detection_bound import DetectionBound
 
 
 @dataclass(frozen=True, eq=False)
 class RegistrationProblem:
     """A detection and an object. Poses T (H,) map the scene's working frame to the object's.
 
-    fit: what poses are refined on · held_out: the same fields with other samples, for the verdict alone.
+    fit: what poses are refined on · held_out: the same fields with other samples, for the verdict alone · bound: what
+    the detection says of a pose.
     """
 
     view: SceneView
     model: ObjectModel
     fit: SurfacePair
     held_out: SurfacePair
+    bound: DetectionBound
 
     def in_field_frames(self, T_work: Sim3) -> Sim3:
         """A single pose between the working frames as T_object_scene."""
@@ -50,4 +53,5 @@ def make_problem(
     scene_field, object_field = view.field(scene), model.field(obj)
     fit = SurfacePair(scene_field, object_field, A, B)
     held_out = SurfacePair(scene_field, object_field, A_held, B_held)
-    return RegistrationProblem(view, model, fit, held_out)
+    bound = DetectionBound.of(view.detection, model.extremal_points, options.box_tolerance)
+    return RegistrationProblem(view, model, fit, held_out, bound)

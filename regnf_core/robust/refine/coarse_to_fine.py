@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.pose_distance import distinct
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT, SEARCH
 from regnf_core.robust.refine.levenberg_marquardt import Iteration, Settings, minimize
 from regnf_core.robust.refine.loss import disagreement
@@ -23,7 +24,7 @@ class RefinementContext:
 
     extremal_points: (E, 3) of the object, by which two poses are compared · generator: draws each stage's samples ·
     fix_scale: poses keep their scale · max_offset: of the surfaces, object diameters · on_step: called once an
-    iteration.
+    iteration · admits: which poses (H,) may go on, (H,) bool; where it admits none, all may.
     """
 
     extremal_points: Tensor
@@ -31,6 +32,7 @@ class RefinementContext:
     fix_scale: bool = False
     max_offset: float = REFINEMENT.max_offset
     on_step: Callable[[], None] = lambda: None
+    admits: Callable[[Sim3], Tensor] = lambda T: torch.ones_like(T.scale, dtype=torch.bool)
 
 
 def coarse_to_fine(
@@ -41,9 +43,14 @@ def coarse_to_fine(
         few = surfaces.subsample(stage.points, context.generator)
         numbers = torch.arange(len(candidates))
         parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
-        candidates = PoseCandidates.cat(parts)
+        candidates = _admitted(PoseCandidates.cat(parts), context)
         candidates = candidates[_best(candidates, stage, context.extremal_points)]
     return candidates
+
+
+def _admitted(candidates: PoseCandidates, context: RefinementContext) -> PoseCandidates:
+    admitted = context.admits(candidates.T)
+    return candidates[admitted.nonzero().squeeze(-1)] if bool(admitted.any()) else candidates
 
 
 def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context: RefinementContext) -> PoseCandidates:

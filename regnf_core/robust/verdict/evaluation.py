@@ -17,7 +17,7 @@ from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.covariance import covariance, in_object_units
-from regnf_core.robust.verdict.criteria import SceneQuality, evaluate_pose
+from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
 from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
 from regnf_core.robust.verdict.relation import relation
 from regnf_core.robust.verdict.unexplained_surface import unexplained_share
@@ -54,6 +54,8 @@ def evaluate_candidates(
     unexplained = unexplained_share(problem.held_out, T_work, evidence.offsets[winner], options.robust)
     quality = SceneQuality(problem.view.normal_roughness, unexplained)
     found = evaluate_pose(evidence, winner, len(rivals), options.robust, quality)
+    if not bool(problem.bound.admits(candidates.T[winner : winner + 1])[0]):
+        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
     T = problem.in_field_frames(T_work)
     alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, evidence, rivals, T)
     metrics = {

@@ -1,0 +1,44 @@
+"""What a detection says of a pose: the object stands within the box, give or take, and is not far smaller than it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import SEARCH
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionBound:
+    """Bounds the extent of the posed object by the detection box. Working frames: the box's center is 0.
+
+    points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
+    box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge.
+    """
+
+    points: Tensor
+    axes: Tensor
+    edges: Tensor
+    tolerance: float
+
+    @classmethod
+    def of(cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float) -> DetectionBound:
+        """The bound for an object with these ``extremal_points`` (E, 3)."""
+        edges = detection.size / detection.diagonal
+        return cls(extremal_points.double(), detection.rotation.double(), edges.double(), tolerance)
+
+    def admits(self, T: Sim3) -> Tensor:
+        """(H,) bool: which poses T (H,), scene to object, the detection allows."""
+        placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
+        low, high = placed.amin(-2), placed.amax(-2)
+        reach = (0.5 + self.tolerance) * self.edges
+        within = (low >= -reach).all(-1) & (high <= reach).all(-1)
+        size = ((high - low) / self.edges).amax(-1)
+        return within & (size >= SEARCH.min_share_of_detection)
+
+    def loosened(self, factor: float) -> DetectionBound:
+        """The bound with ``factor`` times the tolerance."""
+        return DetectionBound(self.points, self.axes, self.edges, factor * self.tolerance)

@@ -1,0 +1,76 @@
+"""What a detection allows: by hand, for a cube of edge 1 in a box of edge 2, scaled to a diagonal of 1."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.options import RegistrationOptions
+from regnf_core.registration import register
+from regnf_core.robust.search.detection_bound import DetectionBound
+from tests.core.robust.shapes import random_pose, reframed
+
+CORNERS = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
+EDGE = 1.0 / math.sqrt(3.0)
+"""Of the box, in the scene's working frame."""
+
+
+def bound(tolerance: float, rotation: torch.Tensor | None = None) -> DetectionBound:
+    turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
+    box = OrientedBox(torch.tensor([5.0, 6.0, 7.0]), torch.tensor([2.0, 2.0, 2.0]), turn)
+    return DetectionBound.of(box, CORNERS, tolerance)
+
+
+def placed(edge: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Sim3:
+    """The pose that lays the cube with this edge, as a share of the box's, at ``center``, in shares of it too."""
+    at = Sim3(
+        torch.tensor([edge * EDGE], dtype=torch.float64),
+        torch.eye(3, dtype=torch.float64)[None],
+        torch.tensor([center], dtype=torch.float64) * EDGE,
+    )
+    return at.inverse()
+
+
+@pytest.mark.parametrize(
+    ("edge", "center", "tolerance", "admitted"),
+    [
+        (1.0, (0.0, 0.0, 0.0), 0.0, True),
+        (1.01, (0.0, 0.0, 0.0), 0.0, False),
+        (0.9, (0.04, 0.0, 0.0), 0.0, True),
+        (0.9, (0.0, 0.0, 0.06), 0.0, False),
+        (1.9, (0.0, 0.0, 0.0), 0.5, True),
+        (2.1, (0.0, 0.0, 0.0), 0.5, False),
+        (0.26, (0.0, 0.0, 0.0), 0.5, True),
+        (0.24, (0.0, 0.0, 0.0), 0.5, False),
+        (160.0, (0.0, 0.0, 0.0), 1.0, False),
+        (1 / 160.0, (0.0, 0.0, 0.0), 1.0, False),
+    ],
+)
+def test_extent_and_place(edge: float, center: tuple[float, float, float], tolerance: float, admitted: bool) -> None:
+    assert bound(tolerance).admits(placed(edge, center)).tolist() == [admitted]
+
+
+def test_the_boxs_own_axes_count() -> None:
+    """A box turned by 45 degrees about z sees the cube's diagonal, sqrt 2 edges long."""
+    half = math.sqrt(0.5)
+    turn = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    poses = Sim3.cat([placed(0.70), placed(0.71)])
+    assert bound(0.0, turn).admits(poses).tolist() == [True, False]
+
+
+def test_loosened() -> None:
+    assert not bound(0.1).admits(placed(1.3)).item()
+    assert bound(0.1).loosened(2.0).admits(placed(1.3)).item()
+
+
+@pytest.mark.parametrize(("tolerance", "verdict"), [(0.0, "OUTSIDE_DETECTION"), (1.0, "SURFACES_AGREE")])
+def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str) -> None:
+    """Every edge of the box is .7 of the chair's."""
+    scene, obj, box, _ = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
+    part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
+    options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
+    assert register(scene, obj, part, options, seed=0, clouds=False).verdict_reason == verdict
