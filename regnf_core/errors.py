@@ -16,7 +16,14 @@ This module imports nothing heavy: the HTTP front end uses it without loading to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from regnf_core.field_candidates import Candidate
 from regnf_core.hints import HINTS
+
+if TYPE_CHECKING:
+    from regnf_core.field_source import FieldSource
 
 
 class RegnfError(Exception):
@@ -67,9 +74,31 @@ class InvalidDetectionError(InvalidInputError):
 
 
 class FieldFormatError(InvalidInputError):
-    """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault."""
+    """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault.
+
+    candidates: the functions that a file may stand for, where that is why (LAYOUT_AMBIGUOUS). source: what the user
+    named, where that is known.
+    """
 
     reason = "FIELD_NOT_RECOGNIZED"
+    source: FieldSource | None = None
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        reason: str | None = None,
+        hint: str | None = None,
+        candidates: Sequence[Candidate] = (),
+    ) -> None:
+        super().__init__(message, reason=reason, hint=hint)
+        self.candidates = tuple(candidates)
+
+    def told(self, message: str, hint: str | None = None) -> FieldFormatError:
+        """The same error in other words."""
+        error = FieldFormatError(message, reason=self.reason, hint=hint or self.hint, candidates=self.candidates)
+        error.source = self.source
+        return error
 
 
 class DatasetError(InvalidInputError):

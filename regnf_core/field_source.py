@@ -68,10 +68,11 @@ class FieldSource:
             with naming(self.file):
                 yield
         except FieldFormatError as error:
+            error.source = self
             if self.run is None or not error.reason.startswith("SETTINGS_"):
                 raise
             hint = " ".join(filter(None, [error.hint, _FOUND_BESIDE]))
-            raise FieldFormatError(str(error), reason=error.reason, hint=hint) from error
+            raise error.told(str(error), hint) from error
 
     @contextmanager
     def packed_settings(self) -> Iterator[Path | None]:
@@ -125,7 +126,7 @@ def naming(path: Path) -> Iterator[None]:
     except FieldFormatError as error:
         if str(error).startswith(str(path)):
             raise
-        raise FieldFormatError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
+        raise error.told(f"{path}: {error}") from error
 
 
 def format_of(file: Path) -> str | None:

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from PIL import Image
 
 from regnf_core.fields.base import SdfField
-from regnf_core.surface.isosurface import Lattice, Surface, extract_surface
+from regnf_core.surface.isosurface import Lattice, Progress, Surface, extract_surface
 from regnf_core.viewing.splats import Floats, Surfels, render, view_from
 
+
+@dataclass(frozen=True)
+class Size:
+    """panel: pixels of each panel's edge · resolution: cells along the bounds' longest edge."""
+
+    panel: int
+    resolution: int
+
+
 PANEL = 320
-_RESOLUTION = 72
+USUAL, SMALL = Size(PANEL, 72), Size(192, 48)
 _OVERSAMPLING = 2
 _COLOR = np.array([0.72, 0.75, 0.79])
 _BACKGROUND = np.array([0.975, 0.975, 0.97])
@@ -24,51 +35,53 @@ _LINES = 20.0
 """Isolines to a diagonal."""
 
 
-def field_picture(field: SdfField, up_axis: str | None = None) -> Image.Image:
-    """Three panels of PANEL pixels side by side: two views from above, and the plane through the middle of the surface.
+def field_picture(
+    field: SdfField, up_axis: str | None = None, size: Size = USUAL, progress: Progress | None = None
+) -> Image.Image:
+    """Three square panels side by side: two views from above, and the plane through the middle of the surface.
 
     The plane is across the surface's shortest extent. Orange is inside and blue is free, lighter with distance; lines
-    are a twentieth of the bounds' diagonal apart. up_axis: "z" if not given. Takes some 250,000 evaluations.
+    are a twentieth of the bounds' diagonal apart. up_axis: "z" if not given. Takes some 250,000 evaluations
+    of the usual size; ``progress`` hears of them.
     Raises NoSurfaceError where there is none, and InvalidInputError (FIELD_NOT_FINITE).
     """
-    surface = extract_surface(field, _RESOLUTION)
-    step = Lattice.over(field, _RESOLUTION).step
-    panels = [_view(surface, side, up_axis or "z", step) for side in _SIDES]
-    sheet = Image.new("RGB", (3 * PANEL, PANEL))
-    for number, panel in enumerate([*panels, _section(field, surface)]):
-        sheet.paste(panel, (number * PANEL, 0))
+    surface = extract_surface(field, size.resolution, progress)
+    radius = _DISC * Lattice.over(field, size.resolution).step
+    panels = [_view(surface, side, up_axis or "z", radius, size.panel) for side in _SIDES]
+    sheet = Image.new("RGB", (3 * size.panel, size.panel))
+    for number, panel in enumerate([*panels, _section(field, surface, size.panel)]):
+        sheet.paste(panel, (number * size.panel, 0))
     return sheet
 
 
-def _view(surface: Surface, side: tuple[float, float, float], up_axis: str, step: float) -> Image.Image:
+def _view(surface: Surface, side: tuple[float, float, float], up_axis: str, radius: float, edge: int) -> Image.Image:
     axis = "xyz".index(up_axis[-1])
     up = np.eye(3)[axis] * (-1.0 if up_axis.startswith("-") else 1.0)
     first = np.eye(3)[(axis + 1) % 3]
     direction = side[0] * first + side[1] * np.cross(up, first) + side[2] * up
     colors = np.broadcast_to(_COLOR, surface.vertices.shape)
-    view = view_from(direction, up, surface.vertices, PANEL * _OVERSAMPLING)
-    picture = render(
-        Surfels(surface.vertices, surface.normals, colors), view, PANEL * _OVERSAMPLING, _DISC * step, _BACKGROUND
-    )
-    return _image(picture).resize((PANEL, PANEL), Image.Resampling.LANCZOS)
+    pixels = edge * _OVERSAMPLING
+    view = view_from(direction, up, surface.vertices, pixels)
+    picture = render(Surfels(surface.vertices, surface.normals, colors), view, pixels, radius, _BACKGROUND)
+    return _image(picture).resize((edge, edge), Image.Resampling.LANCZOS)
 
 
-def _section(field: SdfField, surface: Surface) -> Image.Image:
+def _section(field: SdfField, surface: Surface, pixels: int) -> Image.Image:
     low, high = field.bounds.numpy()
     across = int(np.ptp(surface.vertices, axis=0).argmin())
     right, up = [(1, 2), (0, 2), (0, 1)][across]
     edge = 1.05 * max(high[right] - low[right], high[up] - low[up])
-    pixel = edge / PANEL
-    aside = (np.arange(PANEL) + 0.5) * pixel - edge / 2
-    places = np.empty((PANEL, PANEL, 3))
+    pixel = edge / pixels
+    aside = (np.arange(pixels) + 0.5) * pixel - edge / 2
+    places = np.empty((pixels, pixels, 3))
     places[...] = (low + high) / 2
     places[..., right] += aside
     places[..., up] -= aside[:, None]
     places[..., across] = np.median(surface.vertices[:, across])
     within = ((places >= low) & (places <= high)).all(axis=-1)
-    distance = np.zeros((PANEL, PANEL))
+    distance = np.zeros((pixels, pixels))
     distance[within] = field.signed_distance(torch.from_numpy(places[within]).float()).double().cpu().numpy()
-    picture = np.broadcast_to(_BACKGROUND, (PANEL, PANEL, 3)).copy()
+    picture = np.broadcast_to(_BACKGROUND, (pixels, pixels, 3)).copy()
     picture[within] = _shades(
         distance[within] / float(np.linalg.norm(high - low)), pixel / float(np.linalg.norm(high - low))
     )

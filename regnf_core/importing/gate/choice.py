@@ -11,17 +11,19 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-from regnf_core.errors import FieldFormatError
+from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, TRIAL_POINTS
 from regnf_core.importing.families.converted import ConvertedField, Reading
+from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
 from regnf_core.importing.gate.evidence import Evidence, Trial
 from regnf_core.importing.gate.interpolation import told_interpolation
 from regnf_core.importing.gate.plausibility import without_new_code
 from regnf_core.schema.hash_grid_config import Interpolation
 
-_SHOWN = 6
+_SHOWN = MOST_CANDIDATES
 _CLEARLY, _LEAST = 0.1, 0.01
 """In the first round a reading is out that fits worse by this share of the best's misfit, and by this much at least."""
 _TELLING = 0.4
@@ -36,7 +38,7 @@ is no accident."""
 def choose_reading(converted: ConvertedField) -> ConvertedField:
     """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
 
-    Raises FieldFormatError (LAYOUT_AMBIGUOUS): readings that differ fit alike.
+    Raises AmbiguousError: readings that differ fit alike.
     """
     if not converted.readings:
         return converted
@@ -84,7 +86,7 @@ def _settled(left: Sequence[Trial]) -> Trial:
     rivals = [trial for trial in others if trial.reading.tier <= usual.reading.tier]
     scales = [trial.reading.scale for trial in left if trial.reading.scale is not None]
     if rivals or usual.reading.tier > 0 or len(scales) < len(left) or max(scales) - min(scales) > _ACCIDENT:
-        raise _ambiguous([trial.reading.say for trial in (usual, *others)])
+        raise _ambiguous([trial.reading for trial in (usual, *others)])
     return usual
 
 
@@ -97,22 +99,30 @@ def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple
     told = told_interpolation(linear, smooth)
     if told is None:
         habit = reading.description["hash"]["interpolation"]
-        raise _ambiguous([{"hash": {"interpolation": kind}} for kind in sorted(kinds, key=lambda kind: kind != habit)])
+        raise _ambiguous([_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)])
     more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
     return _with_interpolation(reading, told), [*why, more]
 
 
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:
     grid = {**reading.description["hash"], "interpolation": kind}
-    return replace(reading, description={**reading.description, "hash": grid})
+    name = f"{reading.name}, {kind}"
+    say = {"hash": {"interpolation": kind}}
+    return replace(reading, name=name, say=say, description={**reading.description, "hash": grid})
 
 
-def _ambiguous(say: Sequence[dict[str, Any]]) -> FieldFormatError:
+def _ambiguous(readings: Sequence[Reading]) -> AmbiguousError:
     """The refusal: what the description may say, the most usual first."""
-    lines = list(dict.fromkeys(json.dumps(_shortest(entry, say)) for entry in say))
+    say = [reading.say for reading in readings]
+    asked = [OpenCandidate(one.name, _shortest(one.say, say), partial(_same, one)) for one in readings]
+    lines = list(dict.fromkeys(json.dumps(one.say) for one in asked))
     more = f", or {len(lines) - _SHOWN} others" if len(lines) > _SHOWN else ""
     message = f"{len(lines)} readings fit this table alike; add one to the description: {' or '.join(lines[:_SHOWN])}"
-    return FieldFormatError(message + more, reason="LAYOUT_AMBIGUOUS")
+    return AmbiguousError(message + more, asked)
+
+
+def _same(reading: Reading) -> Reading:
+    return reading
 
 
 def _shortest(entry: dict[str, Any], say: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 ``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS]``.
 
 Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings"}; standard output
-gets one JSON line: the report, or {"reason", "detail"}. The field is written to OUT_DIR/field.safetensors, a picture
-beside it.
+gets one JSON line: the report, or {"reason", "detail"} and perhaps "candidates". The field is written to
+OUT_DIR/field.safetensors, a picture beside it; of candidates too.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
+from regnf_core.importing.gate.ambiguity import AmbiguousError
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
@@ -42,6 +43,8 @@ _SIGN_UNCERTAIN = (
 )
 _QUICK_S = 4.0
 """Processor seconds: a field that was evaluated more slowly than this is not drawn, which takes six times as long."""
+_PICTURES_S, _PICTURES_SHARE = 20.0, 0.25
+"""Seconds for the pictures of what is asked, and the most of what is left of the import's time."""
 _THREADED_FORMATS = RUN_ARCHIVES | {"ply", "pcd", "xyz", "off"}
 """May be, or hold, clouds of points; the library that reconstructs their surface cannot do without threads."""
 _OUTPUT_ERRORS = {errno.EFBIG: "IMPORT_OUTPUT_TOO_LARGE", errno.ENOSPC: "STORAGE_FULL", errno.EDQUOT: "STORAGE_FULL"}
@@ -163,6 +166,13 @@ def _settled(converted: ConvertedField) -> ConvertedField:
     return choose_reading(converted)
 
 
+def _draw_asked(error: AmbiguousError, out_dir: Path, left_s: float) -> None:
+    """A picture of each function that a person is asked about, in a part of the time that is left."""
+    from regnf_core.importing.gate.candidate_pictures import draw_candidates  # loads torch
+
+    draw_candidates(error.asked, out_dir, min(_PICTURES_S, _PICTURES_SHARE * left_s))
+
+
 def run(
     upload: Path,
     out_dir: Path,
@@ -172,8 +182,14 @@ def run(
     settings: Named | None = None,
 ) -> dict[str, Any]:
     """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
+    started = time.monotonic()
     try:
         return convert_file(upload, out_dir, description, limits, picture, settings)
+    except AmbiguousError as error:
+        if picture:
+            _draw_asked(error, out_dir, limits.wall_s - (time.monotonic() - started))
+        asked = [{"name": one.name, "description": one.say} for one in error.asked]
+        return {"reason": error.reason, "detail": str(error), "candidates": asked}
     except FieldFormatError as error:
         return {"reason": error.reason, "detail": str(error)}
     except MemoryError:

@@ -21,6 +21,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.safetensors_header import read_header
+from regnf_core.importing.gate.candidates import read_candidates
 from regnf_core.importing.gate.child import ChildOutcome, run_child
 from regnf_core.importing.gate.picture import PICTURE_NAME, is_sound_picture
 from regnf_core.importing.gate.report import ImportLimits, ImportReport
@@ -59,8 +60,9 @@ def import_field(
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
     ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
-    of the field in ``out_dir``/preview.png too, if it can be made in good time. settings: the trainer's own, one file
-    or an archive of several. The upload may be an archive of a whole run; then it brings its settings along.
+    of the field in ``out_dir``/preview.png too, and in the error one of each function that the file may stand for, if
+    they can be made in good time. settings: the trainer's own, one file or an archive of several. The upload may be an
+    archive of a whole run; then it brings its settings along.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
@@ -93,7 +95,7 @@ def _import_once(
     try:
         command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(work.resolve()), *map(str, files)]
         outcome = run_child(command, request, work, _environment(), left_s, limits.file_bytes + _PICTURE_BYTES)
-        values = _values_of(outcome)
+        values = _values_of(outcome, work)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
         if picture and is_sound_picture(work / PICTURE_NAME):
@@ -126,8 +128,8 @@ def _environment() -> dict[str, str]:
     return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, "1")}
 
 
-def _values_of(outcome: ChildOutcome) -> dict[str, Any]:
-    """The report's values, or the error that the child's end stands for."""
+def _values_of(outcome: ChildOutcome, work: Path) -> dict[str, Any]:
+    """The report's values, or the error that the child's end stands for. work: where it may have left pictures."""
     if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
         raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
     if outcome.stopped == "output":
@@ -149,7 +151,7 @@ def _values_of(outcome: ChildOutcome) -> dict[str, Any]:
     detail = "".join(c for c in str(values.get("detail"))[:_MAX_DETAIL] if c.isprintable())
     if reason == "STORAGE_FULL":
         raise OSError(errno.ENOSPC, detail)
-    raise FieldFormatError(detail, reason=reason)
+    raise FieldFormatError(detail, reason=reason, candidates=read_candidates(values.get("candidates"), work))
 
 
 def _parse(stdout: bytes) -> dict[str, Any] | None:

@@ -8,14 +8,15 @@ training ended. What none of this decides is refused with what to say.
 from __future__ import annotations
 
 import heapq
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.importing.cost.calls import Calls
 from regnf_core.importing.families.converted import ConvertedField, OpenReading
+from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
 from regnf_core.importing.gate.cost_estimate import seconds_of
 from regnf_core.importing.gate.network_trial import (
     QUICK_SAMPLES,
@@ -68,7 +69,7 @@ class _Candidate:
 def settle_form(converted: ConvertedField) -> ConvertedField:
     """``converted`` with the one reading that behaves as a distance, and in ``why`` by which evidence.
 
-    Raises FieldFormatError (LAYOUT_AMBIGUOUS): several readings that differ do, or none.
+    Raises AmbiguousError: several readings that differ do, or none.
     """
     tried = _affordable(converted)
     finalists = _finalists(tried)
@@ -160,8 +161,14 @@ def _as_candidates(readings: Sequence[OpenReading]) -> list[_Candidate]:
     return [_Candidate(one, Trial(one.make(), None, 1.0)) for one in readings[:_SHOWN]]
 
 
-def _undecided(candidates: Sequence[_Candidate], what: str) -> FieldFormatError:
+def _undecided(candidates: Sequence[_Candidate], what: str) -> AmbiguousError:
     names = " or ".join(one.open.name for one in candidates[:_SHOWN])
     more = f" (of {len(candidates)})" if len(candidates) > _SHOWN else ""
     message = f"the tensors leave open which function this is, and {what}; say {names}{more} in the description"
-    return FieldFormatError(message, reason="LAYOUT_AMBIGUOUS")
+    asked = [one.open for one in candidates if one.open.name.startswith("{")]
+    return AmbiguousError(message, [OpenCandidate(_words(one.name), json.loads(one.name), one.make) for one in asked])
+
+
+def _words(told: str) -> str:
+    """Entries of a description, as JSON, without its signs."""
+    return "".join(c for c in told if c not in '{}"')

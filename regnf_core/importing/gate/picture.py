@@ -9,6 +9,9 @@ from pathlib import Path
 PICTURE_NAME = "preview.png"
 """The name of the picture in the output folder."""
 
+CANDIDATE_BYTES = 512 << 10
+"""A small picture has no more, whatever it shows."""
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _MAX_BYTES = 4 << 20
 _MAX_EDGE = 4096
@@ -16,11 +19,16 @@ _TRUE_COLOR = b"\x08\x02\x00\x00\x00"
 """Eight bits a channel, red, green and blue, not interlaced."""
 
 
-def is_sound_picture(path: Path) -> bool:
+def candidate_name(number: int) -> str:
+    """The name of the picture of the ``number``-th function that a file may stand for, counted from 1."""
+    return f"candidate-{number}.png"
+
+
+def is_sound_picture(path: Path, most_bytes: int = _MAX_BYTES) -> bool:
     """Whether ``path`` is a plain file of its own (no link) that holds a PNG of a header and pixels, nothing else."""
     try:
         found = path.lstat()
-        if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= _MAX_BYTES:
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink != 1 or not 0 < found.st_size <= most_bytes:
             return False
         return _holds_pixels_alone(path.read_bytes())
     except OSError:

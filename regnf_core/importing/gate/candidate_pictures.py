@@ -1,0 +1,58 @@
+"""Pictures of the functions that a file may stand for, made in the gate's process while there is time for it."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from regnf_core.errors import RegnfError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.build import build_field
+from regnf_core.importing.cost.calls import Calls
+from regnf_core.importing.families.converted import Reading
+from regnf_core.importing.gate.ambiguity import OpenCandidate
+from regnf_core.importing.gate.cost_estimate import seconds_of
+from regnf_core.importing.gate.picture import candidate_name
+from regnf_core.importing.gate.plausibility import without_new_code
+from regnf_core.schema.parsing import parse_description
+from regnf_core.viewing.field_picture import SMALL, field_picture
+
+_WORK = Calls((40_000, 37_000), (12_000,))
+"""About as many points as a small picture takes."""
+
+
+class _OutOfTimeError(RegnfError):
+    reason = "PICTURE_OUT_OF_TIME"
+
+
+def draw_candidates(candidates: Sequence[OpenCandidate], folder: Path, seconds: float) -> None:
+    """Draw each to ``folder``/candidate-N.png, N from 1, as many as can be drawn in so many seconds."""
+    deadline = time.monotonic() + seconds
+    for number, one in enumerate(candidates, 1):
+        _draw(one, folder / candidate_name(number), deadline)
+
+
+def _draw(candidate: OpenCandidate, path: Path, deadline: float) -> None:
+    """A picture, if one can be made: the refusal does without. torch lacks memory with a RuntimeError."""
+
+    def look(_: int) -> None:
+        if time.monotonic() > deadline:
+            raise _OutOfTimeError("no time is left for the picture")
+
+    with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():
+        reading = candidate.make()
+        if seconds_of(reading.description, reading.tensors, _WORK) < deadline - time.monotonic():
+            field_picture(_field(reading), reading.description.get("up_axis"), SMALL, look).save(path)
+
+
+def _field(reading: Reading) -> SdfField:
+    with warnings.catch_warnings():
+        # the map of the upload is only read
+        warnings.filterwarnings("ignore", "The given NumPy array is not writable")
+        tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
+    return build_field(parse_description(reading.description), tensors)
