@@ -28,6 +28,5 @@ def _merged(said: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
     whole = dict(said)
     for name, value in more.items():
         held = whole.get(name)
-        nested = isinstance(held, Mapping) and isinstance(value, Mapping)
-        whole[name] = _merged(held, value) if nested else value
+        whole[name] = _merged(held, value) if isinstance(held, Mapping) and isinstance(value, Mapping) else value
     return whole

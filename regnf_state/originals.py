@@ -44,6 +44,16 @@ def settings_key(reference: str, sha256: str) -> str:
     return f"fields/{reference}/settings-{sha256}"
 
 
+def candidates_prefix(reference: str) -> str:
+    """Where the pictures lie of what a rejected field may be; they go with its upload."""
+    return f"fields/{reference}/candidates"
+
+
+def candidate_key(reference: str, number: int) -> str:
+    """The picture of the ``number``-th candidate, counted from 1."""
+    return f"{candidates_prefix(reference)}/{number}.png"
+
+
 def delete_upload(blobs: BlobStore, field: FieldRecord) -> None:
     """Delete what was uploaded, but nothing that was made of it."""
     blobs.delete(original_key(field.sha256))
@@ -113,5 +123,6 @@ class Originals:
         now = self._records.get_field(field.sha256)
         if now is None or (now.attempt == field.attempt and now.state != "validating"):
             delete_upload(self._blobs, field)
+            self._blobs.delete_prefix(candidates_prefix(field.sha256))
             logger.info("the upload of field %s is no longer kept", field.sha256)
         return True

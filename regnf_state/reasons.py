@@ -107,7 +107,10 @@ REASONS: dict[str, Reason] = {
     # fields
     "FIELD_NOT_FOUND": Reason(404, "No such field", "Upload it with `PUT /fields/{sha256}` first."),
     "FIELD_PREVIEW_NOT_FOUND": Reason(
-        404, "No picture", "Only fields that are `ready` have a picture, and not all of them do."
+        404,
+        "No picture",
+        "Only fields that are `ready` have a picture, and not all of them do. Of a rejected field, candidates have one "
+        "while its upload is kept.",
     ),
     "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
     "FIELD_DESCRIPTION_DIFFERS": Reason(

@@ -119,6 +119,9 @@ class JobRecord:
 
 ORIGINAL_UNTIL = "original_until"
 """In a rejected field's error or a ready field's report: until when the upload itself is kept."""
+CANDIDATES = "candidates"
+"""In a rejected field's error: what its upload may be, each with its name, the entries of a description that choose it,
+and whether its picture is stored for as long as the upload is kept."""
 WARNINGS = "warnings"
 """In a job's inputs: what the imports of its fields have warned of."""
 SETTINGS = "settings"
@@ -183,6 +186,11 @@ class FieldRecord:
             return None
         until = ((self.error if self.state == "rejected" else self.report) or {}).get(ORIGINAL_UNTIL)
         return float(until) if isinstance(until, int | float) else None
+
+    def has_candidate_picture(self, number: int) -> bool:
+        """Whether the ``number``-th candidate, counted from 1, has a picture."""
+        asked = (self.error or {}).get(CANDIDATES, ()) if self.original_until is not None else ()
+        return 0 < number <= len(asked) and asked[number - 1].get("picture") is True
 
     @property
     def upload_bytes(self) -> int:

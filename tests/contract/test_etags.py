@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from regnf_service.http.etags import parse_if_none_match
+from regnf_state.records import FieldRecord
 from tests.contract.world import World, field_bytes
 
 ETAG = '"abc.1"'
@@ -49,7 +50,16 @@ def preview_of(world: World) -> str:
     return f"/fields/{known}/preview.png"
 
 
+def candidate_of(world: World) -> str:
+    now = world.records.now()
+    error = {"reason": "LAYOUT_AMBIGUOUS", "candidates": [{"picture": True}], "original_until": now + 60.0}
+    world.records.create_field(FieldRecord("a" * 64, "rejected", 1, now, now, error=error))
+    world.blobs.put(f"fields/{'a' * 64}/candidates/1.png", b"a picture")
+    return f"/fields/{'a' * 64}/candidates/1.png"
+
+
 ADDRESSES = {
+    "candidate": candidate_of,
     "job": lambda world: f"/jobs/{world.submit()}",
     "field": lambda world: f"/fields/{world.ready_field('scene')}",
     "preview": preview_of,

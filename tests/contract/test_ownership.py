@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,8 @@ FIELD_ROUTES = [
     ("GET", "/fields/{field}?wait=1"),
     ("GET", "/fields/{field}/preview.png"),
     ("HEAD", "/fields/{field}/preview.png"),
+    ("GET", "/fields/{field}/candidates/1.png"),
+    ("HEAD", "/fields/{field}/candidates/1.png"),
     ("PATCH", "/fields/{field}"),
     ("DELETE", "/fields/{field}"),
 ]
@@ -83,8 +86,9 @@ JOB_ROUTES = [
 def test_the_tables_name_every_route_with_an_id(shared: World) -> None:
     named = {(method, path.split("?")[0]) for method, path in FIELD_ROUTES + JOB_ROUTES}
     named |= {("PUT", "/fields/{field}"), ("GET", "/jobs/{job}/view"), ("HEAD", "/jobs/{job}/view")}
+    ids = {"{sha256}": "{field}", "{id}": "{job}", "{name}": "trace.json", "{number}": "1"}
     spelled = {
-        (method.upper(), path.replace("{sha256}", "{field}").replace("{id}", "{job}").replace("{name}", "trace.json"))
+        (method.upper(), re.sub(r"\{\w+\}", lambda found: ids[found[0]], path))
         for path, operations in shared.app.openapi()["paths"].items()
         for method in operations
         if path.startswith(("/fields/", "/jobs/", "/register"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,13 +14,14 @@ from typing import Any
 from redis.exceptions import RedisError
 from rq.timeouts import JobTimeoutException
 
-from regnf_core.errors import RegnfError
+from regnf_core.errors import FieldFormatError, RegnfError
+from regnf_core.field_candidates import Candidate
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_state.blobs.base import StorageUnavailableError
-from regnf_state.originals import delete_all_but_upload, delete_upload, original_key, settings_key
+from regnf_state.originals import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
 from regnf_state.problems import problem_document
-from regnf_state.records import ORIGINAL_UNTIL, FieldRecord, StaleAttemptError
+from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
 from regnf_worker.problems import are_files_away, fault, new_incident
@@ -58,7 +59,8 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
     except (RedisError, StorageUnavailableError):
         raise
     except RegnfError as error:
-        _refuse(context, sha256, attempt, problem_document(error.reason, str(error), hint=error.hint))
+        asked = error.candidates if isinstance(error, FieldFormatError) else ()
+        _refuse(context, sha256, attempt, problem_document(error.reason, str(error), hint=error.hint), asked)
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
     except JobTimeoutException:
@@ -78,24 +80,38 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         )
 
 
-def _refuse(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
-    retry_until_available(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error))
+def _refuse(
+    context: Context, sha256: str, attempt: int, error: dict[str, Any], asked: Sequence[Candidate] = ()
+) -> None:
+    retry_until_available(f"the record of import {sha256}", lambda: reject(context, sha256, attempt, error, asked))
 
 
-def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any]) -> None:
+def reject(context: Context, sha256: str, attempt: int, error: dict[str, Any], asked: Sequence[Candidate] = ()) -> None:
     """Drop everything the upload left and say why; an upload that another description may mend stays for a while.
 
-    Does nothing to a field that has moved on.
+    asked: what the upload may be; the pictures of it stay for as long. Does nothing to a field that has moved on.
     """
     field = context.records.get_field(sha256)
     if field is not None and field.attempt == attempt and field.state == "validating":
+        if asked:
+            error = error | {CANDIDATES: [{"name": one.name, "description": dict(one.description)} for one in asked]}
         context.records.remember_rejection(field, error)
         ended = context.originals.keep_with(error, rejected=True)
         if ORIGINAL_UNTIL in ended:
             delete_all_but_upload(context.blobs, field)
+            ended |= _with_pictures(context, sha256, ended, asked)
         else:
             context.blobs.delete_prefix(f"fields/{sha256}")
         _end(context, sha256, attempt, state="rejected", error=ended)
+
+
+def _with_pictures(context: Context, sha256: str, error: dict[str, Any], asked: Sequence[Candidate]) -> dict[str, Any]:
+    """The candidates of ``error``, saying which have a picture, once these are stored."""
+    for number, one in enumerate(asked, 1):
+        if one.picture is not None:
+            context.blobs.put(candidate_key(sha256, number), one.picture)
+    told = zip(error.get(CANDIDATES, ()), asked, strict=True)
+    return {CANDIDATES: [words | {"picture": one.picture is not None} for words, one in told]} if asked else {}
 
 
 def _end(context: Context, sha256: str, attempt: int, **changes: Any) -> None:

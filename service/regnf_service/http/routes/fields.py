@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
+from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import redescribe
@@ -38,6 +39,7 @@ from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")
+_NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
 
 
@@ -98,15 +100,47 @@ async def get_field(
 def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
     """The surface from two sides, and its section with lines of equal distance: orange is inside."""
     record = _require(services, caller, sha256)
-    if record.state != "ready":
+    name = PICTURE_NAME if record.state == "ready" else None
+    return held.apply(_picture(services, record, name, "private, max-age=3600"))
+
+
+@get_and_head(
+    router,
+    "/fields/{sha256}/candidates/{number}.png",
+    summary="A picture of what a rejected field may be",
+    response_class=Response,
+    responses={
+        200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
+        304: NOT_MODIFIED,
+        **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
+    },
+)
+@blocking
+def get_candidate_picture(
+    sha256: str,
+    number: Annotated[str, Path(description="Which candidate of the field's error, from 1.")],
+    services: ServicesDep,
+    caller: CallerDep,
+    held: IfNoneMatchDep,
+) -> Response:
+    """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
+    record = _require(services, caller, sha256)
+    shown = number in _NUMBERS and record.has_candidate_picture(int(number))
+    name = f"candidates/{number}.png" if shown else None
+    return held.apply(_picture(services, record, name, "private, no-cache"))
+
+
+def _picture(services: Services, record: FieldRecord, name: str | None, caching: str) -> Response:
+    """What is stored of the field under ``name``. Raises Problem FIELD_PREVIEW_NOT_FOUND, also without a name."""
+    if name is None:
         raise Problem("FIELD_PREVIEW_NOT_FOUND")
     try:
-        with services.blobs.open(f"fields/{record.sha256}/{PICTURE_NAME}") as file:
+        with services.blobs.open(f"fields/{record.sha256}/{name}") as file:
             data = file.read()
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
-    headers = {"ETag": field_etag(record), "Cache-Control": "private, max-age=3600"}
-    return held.apply(Response(data, media_type="image/png", headers=headers))
+    headers = {"ETag": field_etag(record), "Cache-Control": caching}
+    return Response(data, media_type="image/png", headers=headers)
 
 
 @router.get(

@@ -35,6 +35,14 @@ class ProblemEntry(Outgoing):
     detail: str
 
 
+class CandidateDocument(Outgoing):
+    """One of several functions that an upload may be."""
+
+    name: str
+    description: dict[str, Any] = Field(description="The entries that choose it: send them with PATCH.")
+    picture: str | None = Field(None, description="Its picture, for as long as the upload is kept.")
+
+
 class ProblemDocument(Outgoing):
     """RFC 9457 problem details. Programs switch on `reason`, never on text."""
 
@@ -47,6 +55,9 @@ class ProblemDocument(Outgoing):
     instance: str | None = None
     request_id: str | None = None
     errors: list[ProblemEntry] = []
+    candidates: list[CandidateDocument] = Field(
+        [], description="With a field's `LAYOUT_AMBIGUOUS`: what it may be, the likeliest first."
+    )
     error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the job's own problem.")
 
 

@@ -22,7 +22,7 @@ from regnf_service.http.schemas.common import (
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
-from regnf_state.records import ORIGINAL_UNTIL, FieldRecord
+from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord
 
 
 class SettingsDocument(Outgoing):
@@ -89,6 +89,7 @@ class FieldPage(Outgoing):
 
 def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
     """The field as it travels; ``prefix`` is what the API's paths begin with."""
+    address = f"{prefix}/fields/{sha256_of(record.sha256)}"
     return {
         "sha256": sha256_of(record.sha256),
         "state": record.state,
@@ -98,16 +99,30 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "settings": None if record.settings is None else record.settings._asdict(),
         "report": _without_time(record.report),
         "symmetry": record.symmetry,
-        "error": None if record.error is None else outgoing_problem(_without_time(record.error)),
+        "error": None if record.error is None else outgoing_problem(_error(record, address)),
         "kept_until": rfc3339(record.original_until),
         "created_at": rfc3339(record.created),
         "updated_at": rfc3339(record.updated),
-        "links": _links(record, f"{prefix}/fields/{sha256_of(record.sha256)}"),
+        "links": _links(record, address),
     }
 
 
 def _without_time(said: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in said.items() if name != ORIGINAL_UNTIL}
+
+
+def _error(record: FieldRecord, address: str) -> dict[str, Any]:
+    """Why the field was rejected; pictures of candidates by their addresses."""
+    error = _without_time(record.error or {})
+    if CANDIDATES not in error:
+        return error
+    pictures = [
+        f"{address}/candidates/{number}.png" if record.has_candidate_picture(number) else None
+        for number in range(1, len(error[CANDIDATES]) + 1)
+    ]
+    return error | {
+        CANDIDATES: [one | {"picture": picture} for one, picture in zip(error[CANDIDATES], pictures, strict=True)]
+    }
 
 
 def _links(record: FieldRecord, address: str) -> Links:
