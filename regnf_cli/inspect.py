@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from regnf_cli.candidates import keep_pictures
 from regnf_cli.console import out
 from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
 from regnf_cli.paths import FIELD
-from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
 
 
 def inspect(
@@ -30,11 +33,21 @@ def inspect(
     picture: Annotated[
         Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
     ] = None,
+    candidates: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where to write pictures of what the file may be, if nothing in it tells.",
+            file_okay=False,
+            metavar="FOLDER",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
 
     Example: **regnf inspect step-000030000.ckpt --picture chair.png**
+
+    A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
     """
     require("engine")
     import tempfile
@@ -45,10 +58,14 @@ def inspect(
     if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
         message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
         raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
+    if candidates is not None and not candidates.parent.is_dir():
+        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
+        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
     source = source_of(field, description, choice_of(config, no_config))
+    drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:
-        with source.naming(), source.packed_settings() as settings:
-            made = import_field(source.file, Path(folder), description, ImportLimits(), picture is not None, settings)
+        with _asked(candidates), source.naming(), source.packed_settings() as settings:
+            made = import_field(source.file, Path(folder), description, ImportLimits(), drawn, settings)
             report = made.to_dict()
         if picture is not None:
             _keep(Path(folder) / PICTURE_NAME, picture)
@@ -56,6 +73,17 @@ def inspect(
         out.print_json(json.dumps(report))
     else:
         _show(report)
+
+
+@contextmanager
+def _asked(folder: Path | None) -> Iterator[None]:
+    """Pictures of what a refused file may be are kept in the folder."""
+    try:
+        yield
+    except FieldFormatError as error:
+        if folder is not None and error.candidates:
+            keep_pictures(error.candidates, folder)
+        raise
 
 
 def _keep(made: Path, picture: Path) -> None:

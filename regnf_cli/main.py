@@ -12,6 +12,7 @@ from typing import Annotated, cast
 
 import typer
 
+from regnf_cli.candidates import show_candidates
 from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNAVAILABLE, fail
 from regnf_cli.convert import convert
 from regnf_cli.demo import demo
@@ -70,7 +71,9 @@ def _run() -> int:
         return EXIT_INTERRUPTED
     except RegnfError as error:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
-        return fail(error.reason, str(error), code, error.hint)
+        fail(error.reason, str(error), code, error.hint)
+        show_candidates(error)
+        return code
     except FileNotFoundError as error:
         return fail("FILE_NOT_FOUND", f"{error.filename}: no such file", hint="Check the path.")
     except OSError as error:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import httpx
 
 from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.field_candidates import Candidate
+from regnf_core.field_source import FieldSource
 
 _HINTS = {
     "UNAUTHENTICATED": "Give the service's token with --token, or in the environment variable REGNF_API_TOKEN.",
@@ -24,6 +27,10 @@ class ServiceError(RegnfError):
     reason = "SERVICE_ERROR"
     unavailable = False
     """Whether asking again later may help: the service is up but cannot take work now."""
+    candidates: tuple[Candidate, ...] = ()
+    """What a refused field may be."""
+    source: FieldSource | None = None
+    """What was sent as that field."""
 
 
 class UnreachableError(RegnfError):
@@ -78,7 +85,16 @@ def service_error(problem: dict[str, Any]) -> ServiceError:
     if named and faults[0].get("detail") != detail:
         detail = f"{detail} {'; '.join(named)}"
     hint = problem.get("hint") or _HINTS.get(reason)
-    return ServiceError(detail, reason=reason, hint=None if hint is None else str(hint))
+    error = ServiceError(detail, reason=reason, hint=None if hint is None else str(hint))
+    error.candidates = tuple(_candidates(problem.get("candidates")))
+    return error
+
+
+def _candidates(values: Any) -> Iterator[Candidate]:
+    for value in values if isinstance(values, list) else []:
+        match value:
+            case {"name": str() as name, "description": dict() as said}:
+                yield Candidate(name, said)
 
 
 def _no_regnf(response: httpx.Response) -> ServiceError:

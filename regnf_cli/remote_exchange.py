@@ -49,38 +49,40 @@ def search_remotely(
     delivery: Delivery,
 ) -> dict[str, Any]:
     """The same for a search among ``objects``, which the document then names by their files."""
-    files: dict[str, Path] = {}
+    files: dict[str, FieldSource] = {}
 
     def upload(report: Report) -> dict[str, Any]:
         sent = {"scene": _sent(service, scene, report)}
         for one in objects:
-            with _named(one.named):
-                files.setdefault(service.send(one, report), one.named)
-        for sha256, path in files.items():
-            with _named(path):
+            with _named(one):
+                files.setdefault(service.send(one, report), one)
+        for sha256, source in files.items():
+            with _named(source):
                 service.wait_until_ready(sha256)
         return {**sent, "candidates": list(files)}
 
     document = _exchange(service, upload, request, delivery)
     for place in (document, *document["candidates"]):
-        place["object"] = str(files[place["object"]])
+        place["object"] = str(files[place["object"]].named)
     return document
 
 
 def _sent(service: RemoteService, source: FieldSource, report: Report) -> str:
-    with _named(source.named):
+    with _named(source):
         return service.upload_field(source, report)
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
+def _named(source: FieldSource) -> Iterator[None]:
     """Refusals of a field name its file."""
     try:
         yield
     except ServiceError as error:
         if error.unavailable or error.reason in _NOT_OF_A_FILE:
             raise
-        raise ServiceError(f"{path}: {error}", reason=error.reason, hint=error.hint) from error
+        named = ServiceError(f"{source.named}: {error}", reason=error.reason, hint=error.hint)
+        named.candidates, named.source = error.candidates, source
+        raise named from error
 
 
 def _exchange(

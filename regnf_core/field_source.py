@@ -30,7 +30,7 @@ _WITHOUT_ROLE = frozenset({"torch-zip", "torch-legacy", "safetensors", "npz", "s
 class FieldSource:
     """named: the path as the user gave it · file: what the gate reads · run: the settings found beside it · config: the
     file of settings that the user named · said: what the user says of it, see UploadDescription · role: what it will be
-    used as, where that decides something and the user has not said it."""
+    used as, where that decides something and the user has not said it · use: the same, whatever it decides."""
 
     named: Path
     file: Path
@@ -38,6 +38,7 @@ class FieldSource:
     config: Path | None = None
     said: Mapping[str, Any] = field(default_factory=dict)
     role: Role | None = None
+    use: Role | None = None
 
     @property
     def description(self) -> dict[str, Any]:
@@ -110,7 +111,7 @@ def find_source(
         with naming(path):
             run = Run(file.resolve(), settings_beside(file))
     said = dict(description or {})
-    return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"))
+    return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"), role)
 
 
 def assumed_role(said: Mapping[str, Any], format_: str | None, role: Role | None) -> dict[str, Role]:

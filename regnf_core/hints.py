@@ -40,6 +40,8 @@ HINTS: dict[str, str] = {
     "was made from.",
     "FIELD_IMPLAUSIBLE": "Look at it: regnf inspect FILE --picture field.png --description "
     "'{\"accept_implausible\": true}'",
+    "LAYOUT_AMBIGUOUS": "Settings beside the checkpoint decide it. Without them, look at each: `regnf inspect FILE "
+    "--candidates FOLDER` draws them; over HTTP, the field's error has their pictures.",
     "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
     "files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",

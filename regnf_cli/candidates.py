@@ -1,0 +1,34 @@
+"""What a file may be, where nothing in it tells: each with what to add to the command, and pictures on demand."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from regnf_cli.console import err
+from regnf_core.errors import RegnfError
+from regnf_core.field_candidates import Candidate
+from regnf_core.field_source import FieldSource
+
+
+def show_candidates(error: RegnfError) -> None:
+    """Say on stderr what to add to the command for each function that a refused file may be, if that is why."""
+    asked: Sequence[Candidate] = getattr(error, "candidates", ())
+    source: FieldSource | None = getattr(error, "source", None)
+    use = source.use if source is not None else None
+    option = "--description" if use is None else f"--{use}-description"
+    for number, one in enumerate(asked, 1):
+        whole = one.added_to(source.said if source is not None else {})
+        err.print(f"{number}  {one.name}", markup=False, soft_wrap=True)
+        err.print(f"   {option} {shlex.quote(json.dumps(whole))}", markup=False, soft_wrap=True)
+
+
+def keep_pictures(asked: Sequence[Candidate], folder: Path) -> None:
+    """Write the candidates' pictures, 1.png and so on as they are numbered; the folder is made if need be."""
+    folder.mkdir(exist_ok=True)
+    for number, one in enumerate(asked, 1):
+        if one.picture is not None:
+            (folder / f"{number}.png").write_bytes(one.picture)
+            err.print(f"wrote {folder / f'{number}.png'}", markup=False, soft_wrap=True)
