@@ -3,8 +3,8 @@
     python -m tests.ui.fixture_server        then open the printed addresses
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
-(live without an event stream), locked (wants a token), bare (a result with little in it), roomy (with the scene round
-the detection), broken (damaged clouds), searched (the best of a library) or tipped (y is up).
+(live without an event stream), asked (the scene's file may be two functions), locked (wants a token), bare (a result
+with little in it), roomy (with the scene round the detection), broken (damaged clouds), searched (the best of a library) or tipped (y is up).
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ STORIES = (
     "queued",
     "failed",
     "dismissed",
+    "asked",
     "live",
     "polled",
     "locked",
@@ -103,6 +104,8 @@ class Stage:
             document |= {"status": "accepted", "phase": None, "progress": 0.0, "queue_position": 4, **still}
         elif story == "failed":
             document |= {"status": "failed", "phase": "sampling", "progress": 0.2, "error": FAILURE}
+        elif story == "asked":
+            document |= {"status": "failed", "phase": "loading", "progress": 0.0, "error": FAILURE | REJECTED}
         elif story == "dismissed":
             document |= {"status": "dismissed"}
         elif story in ("live", "polled"):
@@ -133,6 +136,19 @@ FAILURE = {
     "request_id": "req-7f3a",
 }
 
+REJECTED = {"title": "Field rejected", "reason": "FIELD_REJECTED", "detail": "the field was rejected: LAYOUT_AMBIGUOUS"}
+CANDIDATES = [
+    {"name": "<i>smooth</i>", "description": {"hash": {"interpolation": "smoothstep"}}, "picture": "/1.png"},
+    {"name": "linear", "description": {"hash": {"interpolation": "linear"}}, "picture": None},
+]
+
+
+def field_document(sha256: str) -> dict[str, Any]:
+    """The scene was asked about, the object is ready."""
+    if not sha256.startswith("a3"):
+        return {"sha256": sha256, "state": "ready", "error": None}
+    return {"sha256": sha256, "state": "rejected", "error": {"reason": "LAYOUT_AMBIGUOUS", "candidates": CANDIDATES}}
+
 
 def field_picture(sha256: str) -> bytes:
     """A PNG in a color of its own, by which a test tells it from another field's."""
@@ -151,7 +167,10 @@ class Handler(BaseHTTPRequestHandler):
         path = self.path.split("?")[0]
         if path.startswith("/static/"):
             return self._file(WEB / path.removeprefix("/static/"))
-        picture = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})/preview\.png", path)
+        field = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})", path)
+        if field:
+            return self._json(200, field_document(field[1]))
+        picture = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})/(?:preview|candidates/1)\.png", path)
         if picture:
             if "/locked/" in self.headers.get("Referer", "") and self.headers.get("Authorization") != f"Bearer {TOKEN}":
                 return self._problem(401, "UNAUTHENTICATED")

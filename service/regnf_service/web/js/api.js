@@ -55,7 +55,21 @@ export class JobApi {
 
   /** The picture of a field, a PNG. */
   async fieldPicture(sha256) {
-    return (await this.request(`${this.base.replace(/\/jobs\/[^/]*$/, '')}/fields/${sha256}/preview.png`)).blob();
+    return (await this.request(`${this.fieldUrl(sha256)}/preview.png`)).blob();
+  }
+
+  /** The field's document. */
+  async field(sha256) {
+    return (await this.request(this.fieldUrl(sha256))).json();
+  }
+
+  /** The picture of what a refused field may be, a PNG; numbers begin with 1. */
+  async candidatePicture(sha256, number) {
+    return (await this.request(`${this.fieldUrl(sha256)}/candidates/${number}.png`)).blob();
+  }
+
+  fieldUrl(sha256) {
+    return `${this.base.replace(/\/jobs\/[^/]*$/, '')}/fields/${sha256}`;
   }
 
   async cancel() {

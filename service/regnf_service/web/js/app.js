@@ -1,6 +1,7 @@
 // The page of one job: reads it, follows it while it runs, then shows the result.
 
 import { JobApi, jobBase } from './api.js';
+import { showCandidates } from './candidates.js';
 import { showCertainty } from './certainty.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
 import { announce, byId, copyText, show } from './dom.js';
@@ -41,8 +42,10 @@ async function main() {
 }
 
 async function showFinished(job) {
-  if (job.status === 'failed') showFailed(job);
-  else if (job.status === 'dismissed') showDismissed(job);
+  if (job.status === 'failed') {
+    showFailed(job);
+    await showCandidates(api, job);
+  } else if (job.status === 'dismissed') showDismissed(job);
   else await showResult(job, await api.result());
 }
 

@@ -1,6 +1,7 @@
 // What the registered fields look like by themselves: the pictures that their imports left, where they did.
 
 import { byId, el, show } from './dom.js';
+import { canvasOf } from './pictures.js';
 
 let asked = '';
 
@@ -17,13 +18,10 @@ export async function showFields(api, job, result) {
   show(byId('fields'), pictures.some(Boolean));
 }
 
-// Drawn on a canvas: an <img> could neither carry the token nor, under the page's policy, show fetched bytes.
 async function figureOf(api, name, sha256) {
   try {
-    const picture = await createImageBitmap(await api.fieldPicture(sha256));
     const label = `${name}: the field's surface from two sides, and a section`;
-    const canvas = el('canvas', { width: picture.width, height: picture.height, role: 'img', 'aria-label': label });
-    canvas.getContext('2d').drawImage(picture, 0, 0);
+    const canvas = await canvasOf(await api.fieldPicture(sha256), label);
     return el('figure', {}, canvas, el('figcaption', { className: 'note' }, name));
   } catch {
     return null; // not every field has one
