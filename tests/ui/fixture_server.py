@@ -4,7 +4,8 @@
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
 (live without an event stream), asked (the scene's file may be two functions), locked (wants a token), bare (a result
-with little in it), roomy (with the scene round the detection), broken (damaged clouds), searched (the best of a library) or tipped (y is up).
+with little in it), roomy (with the scene round the detection), broken (damaged clouds), searched (the best of a
+library) or tipped (y is up).
 """
 
 from __future__ import annotations
