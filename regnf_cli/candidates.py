@@ -9,18 +9,16 @@ from pathlib import Path
 
 from regnf_cli.console import err
 from regnf_core.errors import RegnfError
-from regnf_core.field_candidates import Candidate
-from regnf_core.field_source import FieldSource
+from regnf_core.field_candidates import Candidate, Said
 
 
 def show_candidates(error: RegnfError) -> None:
     """Say on stderr what to add to the command for each function that a refused file may be, if that is why."""
     asked: Sequence[Candidate] = getattr(error, "candidates", ())
-    source: FieldSource | None = getattr(error, "source", None)
-    use = source.use if source is not None else None
-    option = "--description" if use is None else f"--{use}-description"
+    said: Said = getattr(error, "said", None) or Said(None, {})
+    option = "--description" if said.use is None else f"--{said.use}-description"
     for number, one in enumerate(asked, 1):
-        whole = one.added_to(source.said if source is not None else {})
+        whole = one.added_to(said.description)
         err.print(f"{number}  {one.name}", markup=False, soft_wrap=True)
         err.print(f"   {option} {shlex.quote(json.dumps(whole))}", markup=False, soft_wrap=True)
 

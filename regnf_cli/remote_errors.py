@@ -9,8 +9,7 @@ from typing import Any
 import httpx
 
 from regnf_core.errors import InvalidInputError, RegnfError
-from regnf_core.field_candidates import Candidate
-from regnf_core.field_source import FieldSource
+from regnf_core.field_candidates import Candidate, Said
 
 _HINTS = {
     "UNAUTHENTICATED": "Give the service's token with --token, or in the environment variable REGNF_API_TOKEN.",
@@ -29,8 +28,8 @@ class ServiceError(RegnfError):
     """Whether asking again later may help: the service is up but cannot take work now."""
     candidates: tuple[Candidate, ...] = ()
     """What a refused field may be."""
-    source: FieldSource | None = None
-    """What was sent as that field."""
+    said: Said | None = None
+    """What the user said of that field."""
 
 
 class UnreachableError(RegnfError):

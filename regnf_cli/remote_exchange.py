@@ -14,6 +14,7 @@ from rich.progress import Progress
 from regnf_cli.console import err, phase_progress
 from regnf_cli.remote import RemoteService, Report
 from regnf_cli.remote_errors import ServiceError, unreachable
+from regnf_core.field_candidates import Said
 from regnf_core.field_source import FieldSource
 
 _NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
@@ -81,7 +82,7 @@ def _named(source: FieldSource) -> Iterator[None]:
         if error.unavailable or error.reason in _NOT_OF_A_FILE:
             raise
         named = ServiceError(f"{source.named}: {error}", reason=error.reason, hint=error.hint)
-        named.candidates, named.source = error.candidates, source
+        named.candidates, named.said = error.candidates, Said(source.use, source.said)
         raise named from error
 
 

@@ -17,13 +17,9 @@ This module imports nothing heavy: the HTTP front end uses it without loading to
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
-from regnf_core.field_candidates import Candidate
+from regnf_core.field_candidates import Candidate, Said
 from regnf_core.hints import HINTS
-
-if TYPE_CHECKING:
-    from regnf_core.field_source import FieldSource
 
 
 class RegnfError(Exception):
@@ -76,12 +72,12 @@ class InvalidDetectionError(InvalidInputError):
 class FieldFormatError(InvalidInputError):
     """The bytes do not hold a field that regnf can take. ``reason`` tells the stage and the fault.
 
-    candidates: the functions that a file may stand for, where that is why (LAYOUT_AMBIGUOUS). source: what the user
-    named, where that is known.
+    candidates: the functions that a file may stand for, where that is why (LAYOUT_AMBIGUOUS). said: what the user
+    said of the field, where that is known.
     """
 
     reason = "FIELD_NOT_RECOGNIZED"
-    source: FieldSource | None = None
+    said: Said | None = None
 
     def __init__(
         self,
@@ -97,7 +93,7 @@ class FieldFormatError(InvalidInputError):
     def told(self, message: str, hint: str | None = None) -> FieldFormatError:
         """The same error in other words."""
         error = FieldFormatError(message, reason=self.reason, hint=hint or self.hint, candidates=self.candidates)
-        error.source = self.source
+        error.said = self.said
         return error
 
 

@@ -24,6 +24,15 @@ class Candidate:
         return _merged(said, self.description)
 
 
+@dataclass(frozen=True)
+class Said:
+    """What a user said of a field. use: what it was named as on a command line, scene or object, where that is known ·
+    description: its entries, see UploadDescription."""
+
+    use: str | None
+    description: Mapping[str, Any]
+
+
 def _merged(said: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
     whole = dict(said)
     for name, value in more.items():

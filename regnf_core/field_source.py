@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.field_candidates import Said
 from regnf_core.field_files import require_field_file, require_file
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
@@ -69,7 +70,7 @@ class FieldSource:
             with naming(self.file):
                 yield
         except FieldFormatError as error:
-            error.source = self
+            error.said = Said(self.use, self.said)
             if self.run is None or not error.reason.startswith("SETTINGS_"):
                 raise
             hint = " ".join(filter(None, [error.hint, _FOUND_BESIDE]))
