@@ -26,6 +26,8 @@ from regnf_core.importing.upload_description import UploadDescription
 FAMILY, IGR = "deepsdf", "igr"
 _PREFIXES = ("module.lin", "lin")
 _CODES = "latent_codes"
+_CLAMP = 0.1
+"""Where published configurations cut distances off."""
 
 
 def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField | None:
@@ -71,7 +73,12 @@ def _forms(overrides: UploadDescription, own: bool) -> list[OpenForm]:
     """DeepSDF's, with one tanh at the end, or with ``use_tanh`` two; IGR's where the names leave it open."""
     tanhs = (1, 2) if overrides.output_tanh is None else (overrides.output_tanh,)
     forms = [
-        OpenForm(told(output_tanh=n), Form("relu", output_tanh=n).said(replace(overrides, output_tanh=n)), FAMILY)
+        OpenForm(
+            told(output_tanh=n),
+            Form("relu", output_tanh=n).said(replace(overrides, output_tanh=n)),
+            FAMILY,
+            known_to=_CLAMP,
+        )
         for n in tanhs
     ]
     igr = Form("softplus", skip_factor=math.sqrt(0.5)).said(overrides)

@@ -23,6 +23,7 @@ from regnf_core.schema.kinds.mlp import LEAKY_SLOPE
 OMEGA, BETA = 30.0, 100.0
 """The usual factors of a sine's argument and of softplus's."""
 _USUAL_SCALES = {"softplus": BETA, "sine": OMEGA, "leaky_relu": LEAKY_SLOPE}
+_A_LITTLE = (0.97, 1.03)
 FORM_ENTRIES = (
     "activation",
     "activation_scale",
@@ -148,6 +149,10 @@ class OpenForm:
     """Where its layers are other ones than the network's own."""
     ends_at: float | None = None
     """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
+    published: bool = True
+    """Whether a published configuration has it."""
+    known_to: float | None = None
+    """The distance beyond which the trainer leaves values to themselves, where it is known."""
     scale_is_open: bool = False
     """Whether the activation's factor is a guess at a number that might be any."""
 
@@ -171,14 +176,21 @@ def network_field(
 
 def _open_reading(one: OpenForm, make: Callable[[OpenForm], Reading]) -> OpenReading:
     nearby = [partial(make, replace(one, form=form)) for form in _nearby(one.form)] if one.scale_is_open else []
-    return OpenReading(one.name, one.family, partial(make, one), one.ends_at, tuple(nearby))
+    return OpenReading(
+        one.name, one.family, partial(make, one), one.ends_at, one.published, one.known_to, tuple(nearby)
+    )
 
 
 def _nearby(form: Form) -> list[Form]:
-    """With the activation's factor a little smaller and larger."""
+    """With one of the activation's factors a little smaller or larger, the other as it is."""
     if form.activation not in _USUAL_SCALES:
         return []
-    return [replace(form, activation_scale=form.scale * factor) for factor in (0.93, 1.07)]
+    first = form.first_activation_scale or form.scale if form.activation == "sine" else None
+    near = [replace(form, activation_scale=form.scale * by, first_activation_scale=first) for by in _A_LITTLE]
+    if first is not None:
+        near += [replace(form, first_activation_scale=first * by) for by in _A_LITTLE]
+        near += [replace(form, activation_scale=form.scale * by, first_activation_scale=first * by) for by in _A_LITTLE]
+    return near
 
 
 def _folded(network: Network, form: Form) -> dict[str, Float32Array]:

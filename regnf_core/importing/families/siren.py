@@ -15,7 +15,6 @@ from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "siren"
 OMEGAS = (30.0, 1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 25.0, 35.0, 40.0, 45.0, 50.0, 60.0, 100.0)
-_FIRSTOMEGAS = (10.0, 20.0, 30.0, 60.0)
 _FIRST_OMEGAS = (10.0, 20.0, 30.0, 60.0)
 _PREFIX = "net.net."
 

@@ -1,4 +1,8 @@
-"""How much a network, read in one of several ways, behaves like a signed distance: measured at few points."""
+"""How much a network, read in one of several ways, behaves like a signed distance: measured at few points.
+
+A step from a point along the gradient, as long as the distance there says, ends on the surface. Where it does not, the
+reading is another one than the network was trained with, or the network was never trained there.
+"""
 
 from __future__ import annotations
 
@@ -17,99 +21,55 @@ from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.gate.plausibility import without_new_code
 from regnf_core.schema.parsing import parse_description
 from regnf_core.schema.safe_format import tensor_specs
-from regnf_core.surface.projection import newton_step
 
-QUICK_SAMPLES, SAMPLES, COMPARED = 512, 2048, 1024
-_NEAREST_SHARE = 8
-_STEPS = 6
-_BAND = 0.02
-"""How far from the surface the gradient is looked at, of the bounds' diagonal."""
-_REACHES = (0.03, 0.06, 0.12, 0.2, 0.35)
-"""Half widths of the bands in which values are compared with distances, of the bounds' diagonal."""
-_ARRIVED = 1e-4
-_FEWEST = 24
+QUICK_SAMPLES, SAMPLES, COMPARED = 256, 2048, 1024
+_PARTS = (1, 2, 8)
+"""Of all points those nearest to the surface: all of them, a half, an eighth."""
+_FEWEST = 12
 _CONE = 0.9
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A reading, built. misfit: how far the gradient's length is from 1 near the surface, mean, at most 1; infinite
-    where there is no surface or no sound number."""
+    """A reading, built; ``field`` is None if it cannot be.
+
+    misses: by how much of their length steps to the surface miss it, mean, from 0 to 1: of all points, then of those
+    ever nearer to the surface. Infinite where too few steps stay within the bounds.
+    """
 
     reading: Reading
     field: SdfField | None
-    misfit: float
+    misses: tuple[float, ...]
+
+    @property
+    def overall(self) -> float:
+        """One number to sort by: the geometric mean."""
+        return math.prod(self.misses) ** (1.0 / len(self.misses))
 
 
 @without_new_code()
-def quick_trial(reading: Reading) -> Trial:
-    """Of the points that are nearest to the surface of a few hundred."""
+def tried(reading: Reading, samples: int, known_to: float | None) -> Trial:
+    """known_to: distances beyond which the trainer leaves values to themselves, if there are such."""
     field = _built(reading)
     if field is None:
-        return Trial(reading, None, math.inf)
-    points = _in_bounds(field, QUICK_SAMPLES)
-    distance = field.signed_distance(points)
-    nearest = points[distance.abs().argsort()[: QUICK_SAMPLES // _NEAREST_SHARE]]
-    return Trial(reading, field, _misfit(field.signed_distance_and_gradient(nearest)[1]))
-
-
-@without_new_code()
-def full_trial(trial: Trial) -> Trial:
-    """On the surface and in a narrow band round it."""
-    if trial.field is None:
-        return trial
-    surface, normal = surface_points(trial.field)
-    if len(surface) < _FEWEST:
-        return Trial(trial.reading, trial.field, math.inf)
-    reach = _BAND * _diagonal(trial.field)
-    offset = reach * (2.0 * torch.rand(len(surface), 1, generator=torch.Generator().manual_seed(2)) - 1.0)
-    gradient = trial.field.signed_distance_and_gradient(surface + offset * normal)[1]
-    return Trial(trial.reading, trial.field, _misfit(gradient))
-
-
-@without_new_code()
-def surface_points(field: SdfField) -> tuple[Tensor, Tensor]:
-    """Points (M, 3) of the surface within the bounds, with unit normals; none where all values have one sign."""
-    points = _in_bounds(field, SAMPLES)
-    distance = field.signed_distance(points)
-    nearest = points[distance.abs().argsort()[: SAMPLES // _NEAREST_SHARE]]
+        return Trial(reading, None, (math.inf,) * len(_PARTS))
+    points = _in_bounds(field, samples)
+    distance, gradient = field.signed_distance_and_gradient(points)
+    length = gradient.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    ends = points - distance[:, None] * gradient / length
     low, high = field.bounds[0].float(), field.bounds[1].float()
-    longest = _diagonal(field) / 20.0
-    for _ in range(_STEPS):
-        value, gradient = field.signed_distance_and_gradient(nearest)
-        step = newton_step(value, gradient, 1e-6)
-        step = step / (step.norm(dim=-1, keepdim=True) / longest).clamp_min(1.0)
-        nearest = torch.minimum(torch.maximum(nearest - step, low), high)
-    value, gradient = field.signed_distance_and_gradient(nearest)
-    length = gradient.norm(dim=-1)
-    arrived = (value.abs() < _ARRIVED * _diagonal(field) * length) & (length > 1e-6) & length.isfinite()
-    return nearest[arrived], gradient[arrived] / length[arrived, None]
+    within = ((ends >= low) & (ends <= high)).all(dim=-1)
+    missed = field.signed_distance(ends).abs() / distance.abs().clamp_min(1e-9)
+    missed = missed.nan_to_num(1.0).clamp_max(1.0)
+    if known_to is not None:
+        within &= distance.abs() < known_to
+    order = distance.abs().argsort()
+    return Trial(reading, field, tuple(_mean(missed, order[: samples // part], within) for part in _PARTS))
 
 
-@without_new_code()
-def distance_errors(field: SdfField) -> list[float]:
-    """By how much values differ from the distance to the zero level, median, of it, in shells of growing reach.
-
-    The distance is that to the tangent planes of points of the zero level.
-    """
-    surface, normal = surface_points(field)
-    points = _in_bounds(field, COMPARED)
-    if len(surface) < _FEWEST:
-        return [math.inf] * len(_REACHES)
-    diagonal = _diagonal(field)
-    near = torch.cat([surface + h * diagonal * normal for h in (-0.1, -0.05, -0.025, 0.025, 0.05, 0.1)])
-    points = torch.cat((points, near))
-    nearest = torch.cdist(points, surface).argmin(dim=1)
-    distance = ((points - surface[nearest]) * normal[nearest]).sum(dim=-1)
-    value = field.signed_distance(points)
-    errors = []
-    for reach in _REACHES:
-        far = reach * diagonal
-        shell = (distance.abs() > far / 2.0) & (distance.abs() < far)
-        few = int(shell.sum()) < _FEWEST
-        relative = (value - distance)[shell] / distance[shell]
-        errors.append(math.inf if few else float(relative.abs().median()))
-    return errors
+def _mean(missed: Tensor, part: Tensor, counted: Tensor) -> float:
+    kept = missed[part][counted[part]]
+    return float(kept.mean()) if len(kept) >= _FEWEST else math.inf
 
 
 @without_new_code()
@@ -161,12 +121,3 @@ def _built(reading: Reading) -> SdfField | None:
 def _in_bounds(field: SdfField, count: int) -> Tensor:
     low, high = field.bounds[0].float(), field.bounds[1].float()
     return low + (high - low) * torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
-
-
-def _diagonal(field: SdfField) -> float:
-    return float((field.bounds[1] - field.bounds[0]).norm())
-
-
-def _misfit(gradient: Tensor) -> float:
-    lengths = gradient.norm(dim=-1)
-    return float((lengths - 1.0).abs().nan_to_num(1.0).clamp_max(1.0).mean())

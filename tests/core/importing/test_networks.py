@@ -144,3 +144,11 @@ def test_a_trained_network_is_never_silently_wrong(family: str, number: int, tmp
     found = judged(case, case.beside, tmp_path)
     assert found.refused in (None, "LAYOUT_AMBIGUOUS"), found.detail
     assert found.value < 1e-3
+
+
+@pytest.mark.slow
+def test_a_siren_tells_its_factor(tmp_path: Path) -> None:
+    case = case_of("siren", 5, steps=250)
+    found = judged(case, {}, tmp_path)
+    assert found.refused is None, found.detail
+    assert found.value < 1e-5
