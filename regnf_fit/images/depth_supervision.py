@@ -69,6 +69,9 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     # depths are distinguished from the surface by their noise, or by the width of a pixel there
     bands = torch.maximum(options.band_deviations * rays.deviations, prepared.pixel * rays.depths)
     before, behind = bands.clamp_max(options.band * size), (0.5 * bands).clamp_max(options.band_behind * size)
+    # within so many deviations the images contradict each other: a narrower band would be torn between them
+    least = options.band_spreads * torch.from_numpy(prepared.spread.at(rays.depths.numpy()))
+    before, behind = before.maximum(least), behind.maximum(0.5 * least)
     seen = (rays.depths > 0.0) & ~rays.background
     inside = seen & (rays.depths >= rays.near) & (rays.depths <= rays.far)
     surface = rays.take(inside)

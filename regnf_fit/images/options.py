@@ -53,9 +53,12 @@ class ReconstructionOptions(NetworkOptions):
     """How far before a measured surface the distance along the ray is believed, in standard deviations of the depth's
     noise, or a pixel's width there if that is more; half as far behind it."""
     band: float = 0.012
-    """At most so far before it."""
+    """At most so far before it, but for ``band_spreads``."""
     band_behind: float = 0.006
-    """At most so far behind it: half of the thinnest part worth having."""
+    """At most so far behind it, but for ``band_spreads``: half of the thinnest part worth having."""
+    band_spreads: float = 3.0
+    """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
+    the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
     """The share of rays and free points that are drawn from within the boxes of the dataset's instances, if any."""
     weights: LossWeights = field(default_factory=LossWeights)

@@ -11,6 +11,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_images, check_seen
 from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread, depth_spread
 from regnf_fit.images.options import Start
 from regnf_fit.images.rays import PixelRays, rays_of_pixels
 from regnf_fit.network import StartShape
@@ -25,7 +26,7 @@ _START_RADIUS = 0.2
 @dataclass(frozen=True)
 class PreparedImages:
     """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
-    instances that the dataset names · pixel: a pixel's width at depth 1."""
+    instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of the depths, from image to image."""
 
     training: PixelRays
     held_out: PixelRays
@@ -35,6 +36,7 @@ class PreparedImages:
     has_depth: bool
     boxes: tuple[OrientedBox, ...]
     pixel: float
+    spread: DepthSpread
 
 
 def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
@@ -58,6 +60,7 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
         has_depth=has_depth,
         boxes=tuple(instance.box for instance in images.instances),
         pixel=float(1.0 / np.median(images.intrinsics[:, 0, 0])),
+        spread=NO_SPREAD if planes is None else depth_spread(images, planes.cosines),
     )
 
 

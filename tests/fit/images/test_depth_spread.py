@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.depth_spread import depth_spread
+from tests.fit.images import scenes
+
+COUNT = 60
+
+
+def measured(images):
+    return depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
+
+
+def along_camera(images, errors):
+    """The images with depths that err, by (N, H, W) or (N, 1, 1), where there are any."""
+    return replace(images, depths=np.where(images.depths > 0.0, images.depths + errors, 0.0).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """Cameras before a wall, which is at depth 2 of all of them."""
+    images = scenes.images(count=COUNT)
+    poses = np.tile(np.eye(4), (COUNT, 1, 1))
+    poses[:, :2, 3] = np.random.default_rng(1).uniform(-0.3, 0.3, (COUNT, 2))
+    depths = np.full(images.depths.shape, 2.0, np.float32)
+    return replace(images, T_world_camera=poses, depths=depths, masks=None)
+
+
+def test_noise_of_pixels_is_found(wall):
+    rng = np.random.default_rng(2)
+    found = measured(along_camera(wall, 0.01 * rng.normal(size=wall.depths.shape)))
+    np.testing.assert_allclose(found.at(np.array([2.0], np.float32)), 0.01, rtol=0.1)
+
+
+def test_errors_that_an_image_shares_are_found_too(wall):
+    rng = np.random.default_rng(3)
+    shared = 0.012 * rng.normal(size=(COUNT, 1, 1))
+    images = along_camera(wall, shared + 0.004 * rng.normal(size=wall.depths.shape))
+    expected = np.hypot(shared.std(ddof=1), 0.004)
+    np.testing.assert_allclose(measured(images).at(np.array([2.0], np.float32)), expected, rtol=0.25)
+    within = local_planes(images.depths, images.intrinsics).deviations
+    assert np.median(within) < 0.4 * expected  # neighboring pixels do not show them
+
+
+def test_exact_depths_have_only_the_pixels_width():
+    images = scenes.images(count=20)
+    found = measured(images)
+    widths = found.depths / images.intrinsics[0, 0, 0]
+    assert (found.deviations < widths / np.sqrt(12.0)).all()  # a place in a pixel is known to no more than that
+
+
+def test_noise_that_grows_with_the_depth(wall):
+    rng = np.random.default_rng(4)
+    images = replace(wall, depths=wall.depths.copy(), T_world_camera=wall.T_world_camera.copy())
+    # the cameras step back, and the wall stays where it is
+    for number, back in enumerate(np.linspace(0.0, 2.0, COUNT)):
+        images.T_world_camera[number, 2, 3] = -back
+        images.depths[number] += back
+    found = measured(along_camera(images, 0.002 * images.depths**2 * rng.normal(size=images.depths.shape)))
+    assert found.at(np.array([3.8], np.float32))[0] > 1.5 * found.at(np.array([2.2], np.float32))[0]
+
+
+@pytest.mark.parametrize("count", [1, 0])
+def test_without_overlap_nothing_is_known(wall, count):
+    images = replace(
+        wall,
+        colors=wall.colors[:count],
+        depths=wall.depths[:count],
+        intrinsics=wall.intrinsics[:count],
+        T_world_camera=wall.T_world_camera[:count],
+    )
+    found = depth_spread(images, np.ones(images.depths.shape, np.float32))
+    assert (found.at(np.array([1.0, 2.0], np.float32)) == 0.0).all()
+
+
+def test_cameras_that_see_different_things_tell_nothing(wall):
+    poses = wall.T_world_camera.copy()
+    poses[:, 0, 3] = 100.0 * np.arange(COUNT)
+    assert len(measured(replace(wall, T_world_camera=poses)).depths) == 0
