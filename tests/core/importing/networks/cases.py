@@ -36,12 +36,17 @@ def _numbers(state: State) -> State:
 
 
 def _trained(
-    network: torch.nn.Module, rng: np.random.Generator, steps: int, ball: bool, clamp: float | None = None
+    network: torch.nn.Module,
+    rng: np.random.Generator,
+    steps: int,
+    ball: bool,
+    clamp: float | None = None,
+    rate: float = 2e-3,
 ) -> None:
     """Trained for so many steps; or, for none, at random with about as much of the cube inside as outside."""
     if steps:
         sampler, seed = in_ball(1.0) if ball else in_cube(1.0), int(rng.integers(1 << 30))
-        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, 2e-3, clamp)
+        train(network, list(network.parameters()), random_shape(rng), sampler, seed, steps, rate, clamp)
         return
     generator = torch.Generator().manual_seed(int(rng.integers(1 << 30)))
     with torch.no_grad():
@@ -152,7 +157,7 @@ def isdf(rng: np.random.Generator, steps: int) -> Case:
     usual = rng.random() < 0.6
     scales = (0.05937489, 0.14) if usual else (float(rng.uniform(0.04, 1.0)), float(rng.uniform(0.1, 0.5)))
     network = OffAxis(rng, degree, blocks, 40, scales)
-    _trained(network, rng, steps, ball=False)
+    _trained(network, rng, steps, ball=False, rate=2e-2)  # small factors: it has far to go
     state = _numbers(network.state_dict())
     bounds = [[-1.0] * 3, [1.0] * 3]
     return Case(
@@ -172,7 +177,8 @@ def plain(rng: np.random.Generator, steps: int) -> Case:
     skip = int(rng.integers(1, layers)) if rng.random() < 0.3 else None
     factor = float(rng.choice([1.0, math.sqrt(0.5)]))
     network = Plain(rng, (name, scale, tanh), degree, 40, layers, (skip, factor))
-    _trained(network, rng, steps, ball=False)
+    rate = 2e-3 if name == "sine" else 1e-2  # no initialization of its own: it begins far from any distance
+    _trained(network, rng, 2 * steps, ball=False, rate=rate)
     state = _numbers(network.state_dict())
     said: dict[str, Any] = {
         "activation": name,
