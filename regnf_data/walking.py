@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,6 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from regnf_core.errors import DatasetError
-from regnf_data.mesh_scene import MeshScene
 
 Array = NDArray[np.float64]
 
@@ -22,6 +21,14 @@ _MIN_CELLS = 100
 _NEIGHBORS = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
+class Distances(Protocol):
+    """What tells how far points are from matter."""
+
+    def signed_distance(self, points: Array, /) -> Array:
+        """(N,): distance of points (N, 3) to the nearest matter, negative inside."""
+        ...
+
+
 class WalkingGround:
     """Cells of 10 cm that are free from 30 cm to 1.7 m above the floor, all connected.
 
@@ -29,7 +36,7 @@ class WalkingGround:
     than a square meter is free.
     """
 
-    def __init__(self, scene: MeshScene, floor: Array) -> None:
+    def __init__(self, scene: Distances, floor: Array) -> None:
         axes = [np.arange(floor[0, axis] + _CELL_M, floor[1, axis], _CELL_M) for axis in (0, 1)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (X, Y, 2)
         clearance = np.min([_clearance(scene, grid, floor[1, 2] + height) for height in _BODY_M], axis=0)
@@ -91,6 +98,6 @@ class WalkingGround:
         return one_way + one_way.T
 
 
-def _clearance(scene: MeshScene, grid: Array, height: float) -> Array:
+def _clearance(scene: Distances, grid: Array, height: float) -> Array:
     points = np.concatenate([grid.reshape(-1, 2), np.full((grid[..., 0].size, 1), height)], axis=1)
     return scene.signed_distance(points).reshape(grid.shape[:2])

@@ -1,0 +1,130 @@
+"""Random worlds: make them, register their objects, and print what was found and where the truth was lost.
+
+    python -m benchmarks.worlds make FOLDER --meshes DIR [DIR ...] --part train --count 20
+    python -m benchmarks.worlds register FOLDER --part train --output runs.jsonl
+    python -m benchmarks.worlds report runs.jsonl [--output report.md]
+
+One seed is one world; a world is made once and kept. The part `test` is for reporting: choose nothing on it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
+from pathlib import Path
+
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
+
+from benchmarks.worlds import tables  # noqa: E402
+from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
+from benchmarks.worlds.recipe import SCENES  # noqa: E402
+from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
+from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
+from regnf_data.worlds.walks import LENGTHS  # noqa: E402
+
+
+def main() -> None:
+    arguments = _parser().parse_args()
+    commands: dict[str, Callable[[argparse.Namespace], None]] = {
+        "make": _make,
+        "register": _register,
+        "report": _report,
+    }
+    commands[arguments.command](arguments)
+
+
+def _make(arguments: argparse.Namespace) -> None:
+    absent = [folder for folder in arguments.meshes if not folder.is_dir()]
+    if absent:
+        sys.exit(f"no folder of meshes: {', '.join(map(str, absent))}; say where they are with --meshes")
+    seeds = arguments.seeds or list(
+        itertools.islice(seeds_of(arguments.part), arguments.start, arguments.start + arguments.count)
+    )
+    meshes = tuple(arguments.meshes)
+    tasks = [
+        Task(seed, length, arguments.scene, meshes, arguments.folder) for seed in seeds for length in arguments.lengths
+    ]
+    for line in _in_parallel(make, tasks, arguments.workers):
+        _say(line)
+
+
+def _register(arguments: argparse.Namespace) -> None:
+    homes = sorted(path.parent for path in arguments.folder.glob(f"{arguments.scene}-*/{WORLD}"))
+    homes = [home for home in homes if part_of_world(int(home.name.split("-")[1])) == arguments.part]
+    homes = [home for home in homes if home.name.split("-")[2] in arguments.lengths]
+    if arguments.seeds:
+        homes = [home for home in homes if int(home.name.split("-")[1]) in arguments.seeds]
+    way = Way(arguments.registration_seed, not arguments.without_observation, not arguments.quick)
+    done = 0
+    with arguments.output.open("a") as file:
+        for runs in _in_parallel(partial(_runs_of, way), homes, arguments.workers):
+            for run in runs:
+                file.write(json.dumps(run) + "\n")
+            file.flush()
+            done += 1
+            _say(f"{done}/{len(homes)} {tables.summary(runs)}")
+
+
+def _runs_of(way: Way, home: Path) -> list[Run]:
+    return register_world(home, way)
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    runs = [json.loads(line) for path in arguments.runs for line in path.read_text().splitlines()]
+    text = tables.markdown(runs)
+    if arguments.output is None:
+        sys.stdout.write(text)
+    else:
+        arguments.output.write_text(text)
+
+
+def _in_parallel(work, tasks, workers) -> Iterator:  # type: ignore[no-untyped-def, type-arg]
+    if workers <= 1:
+        yield from map(work, tasks)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        for done in as_completed([pool.submit(work, task) for task in tasks]):
+            yield done.result()
+
+
+def _say(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    making = commands.add_parser("make", help="make worlds")
+    making.add_argument("--meshes", type=Path, nargs="+", required=True)
+    making.add_argument("--count", type=int, default=10)
+    making.add_argument("--start", type=int, default=0, help="leave out so many of the part's worlds")
+    registering = commands.add_parser("register", help="register every object of the worlds in a folder")
+    registering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
+    registering.add_argument("--registration-seed", type=int, default=0)
+    registering.add_argument("--without-observation", action="store_true")
+    registering.add_argument("--quick", action="store_true", help="do not look into the stages")
+    for command in (making, registering):
+        command.add_argument("folder", type=Path)
+        command.add_argument("--part", choices=PARTS, default="train")
+        command.add_argument("--scene", choices=SCENES, default="tsdf")
+        command.add_argument("--lengths", nargs="+", choices=LENGTHS, default=list(LENGTHS))
+        command.add_argument("--seeds", type=int, nargs="*", help="these worlds alone")
+        command.add_argument("--workers", type=int, default=1)
+    reporting = commands.add_parser("report", help="tables of runs")
+    reporting.add_argument("runs", type=Path, nargs="+")
+    reporting.add_argument("--output", type=Path)
+    return parser
+
+
+if __name__ == "__main__":
+    main()

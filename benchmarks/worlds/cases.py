@@ -1,0 +1,118 @@
+"""Registrations to run, from the folders that ``making`` wrote."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.robust.bent_field import BentField
+from benchmarks.robust.cases import Case
+from benchmarks.robust.symmetries import in_frame
+from benchmarks.worlds.making import WORLD, read_observation_grid
+from regnf_core import OrientedBox, SdfField, Sim3
+from regnf_core.fields.build import open_field
+from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.observation import ObservedField, stored_observation
+from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.symmetry import Symmetries
+
+
+@dataclass(frozen=True, eq=False)
+class WorldCase:
+    """A registration with what is known of it. facts: what tables group by · points: (N, 3) of the object's
+
+    true surface, its frame · near: symmetries, with those that nearly hold.
+    """
+
+    case: Case
+    facts: dict[str, Any]
+    points: Tensor
+    near: Symmetries
+
+
+def cases_of(home: Path, observed: bool = True) -> Iterator[WorldCase]:
+    """All cases of a world's folder; observed: whether the scene's field says what was seen of it."""
+    world = json.loads((home / WORLD).read_text())
+    scene = TransformedField(_scene(home, world, observed), Sim3.from_matrix(world["T_scene_room"]).inverse())
+    T_scene_room = Sim3.from_matrix(world["T_scene_room"])
+    for number, known in enumerate(world["cases"]):
+        yield _case(home, number, (world, known), scene, T_scene_room)
+
+
+def _case(
+    home: Path, number: int, said: tuple[dict[str, Any], dict[str, Any]], scene: SdfField, T_scene_room: Sim3
+) -> WorldCase:
+    world, known = said
+    T_object_model = Sim3.from_matrix(known["T_object_model"])
+    with np.load(home / f"object-{number}.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    exact, near = (
+        in_frame(Symmetries.from_dict(json.loads(str(text))), T_object_model) for text in arrays["symmetries"]
+    )
+    box = known["detection"]
+    in_room = OrientedBox(*(torch.tensor(box[name], dtype=torch.float64) for name in ("center", "size", "rotation")))
+    detection = OrientedBox(
+        T_scene_room.apply(in_room.center[None])[0],
+        in_room.size * T_scene_room.scale,
+        T_scene_room.rotation @ in_room.rotation,
+    )
+    case = Case(
+        f"{home.name} {number} {known['name']}",
+        scene,
+        _object(home, number, known["field"], arrays, T_object_model),
+        detection,
+        Sim3.from_matrix(known["T_object_scene"]),
+        exact,
+    )
+    points = T_object_model.apply(torch.from_numpy(arrays["surface"]))
+    return WorldCase(case, _facts(home, number, world, known), points, near)
+
+
+def _object(home: Path, number: int, kind: str, arrays: dict[str, Any], T_object_model: Sim3) -> SdfField:
+    if kind == "mesh":
+        return MeshField(arrays["vertices"], arrays["faces"]).transformed(T_object_model.matrix().numpy())
+    T_field_model = Sim3.from_matrix(arrays["T_field_model"]) if kind == "cut" else Sim3.identity()
+    return TransformedField(open_field(home / f"object-{number}.safetensors"), T_field_model @ T_object_model.inverse())
+
+
+def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
+    field: SdfField
+    told = world["scene"]
+    if told["kind"] == "tsdf":
+        field = open_field(home / "scene.safetensors")
+    else:
+        with np.load(home / "scene.npz") as file:
+            field = MeshField(file["vertices"], file["faces"])
+        if told["kind"] == "bent":
+            field = BentField(field, told["amplitude"], told["wavelength"], told["bend_seed"])
+    if not observed:
+        return field
+    grid, words = read_observation_grid(home)
+    return ObservedField(field, stored_observation(grid, torch.from_numpy(words)))
+
+
+def _facts(home: Path, number: int, world: dict[str, Any], known: dict[str, Any]) -> dict[str, Any]:
+    sensor, fusion = world["sensor"], world["fusion"]
+    return {
+        "world": home.name,
+        "part": world["part"],
+        "kind": world["kind"],
+        "length": world["length"],
+        "walk": world["walk"],
+        "scene": world["scene"]["kind"],
+        "volume": fusion["volume"],
+        "sensor": sensor["principle"],
+        "pixels": f"{sensor['size'][1]}x{sensor['size'][0]}",
+        "drift": world["drift"],
+        "case": number,
+        "object": known["name"],
+        "field": known["field"],
+        **{name: known[name] for name in ("seen", "diameter_m", "voxels_across", "drift_spread")},
+    }

@@ -1,0 +1,181 @@
+"""Worlds as files: a folder each with the scene's field, the objects' fields and the truth in ``world.json``."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.robust.library_objects import GIVEN
+from benchmarks.worlds.objects import ObjectMaker
+from benchmarks.worlds.observing import observation_of_walk
+from benchmarks.worlds.recipe import Scene, Seen, see
+from regnf_core.errors import RegnfError
+from regnf_core.schema.observation_grid import ObservationGrid
+from regnf_data.worlds.detections import draw_box
+from regnf_data.worlds.fusing import fuse
+from regnf_data.worlds.mesh import Array, together
+from regnf_data.worlds.models import read_catalog
+from regnf_data.worlds.placing import Placed
+from regnf_data.worlds.rooms import World, make_world
+from regnf_data.worlds.split import part_of_world
+from regnf_data.worlds.walks import LENGTHS, Length
+
+WORLD = "world.json"
+MAX_CASES = 8
+LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
+"""Of an object's surface, measured in some image: what was seen less is no case."""
+LEAST_VOXELS = 16.0
+"""Across an object: what is smaller is no case."""
+_SCALES = (0.05, 20.0)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A world to make. meshes: folders of meshes · folder: where worlds are kept."""
+
+    seed: int
+    length: Length
+    scene: Scene
+    meshes: tuple[Path, ...]
+    folder: Path
+
+    @property
+    def home(self) -> Path:
+        """The world's own folder."""
+        return self.folder / f"{self.scene}-{self.seed}-{self.length}"
+
+
+def make(task: Task) -> str:
+    """Make the world unless it is there. Returns a line to follow the progress by."""
+    if (task.home / WORLD).exists():
+        return f"{task.home.name}: there"
+    part = part_of_world(task.seed)
+    world = make_world(task.seed, read_catalog(task.meshes, part, GIVEN))
+    try:
+        seen = see(world, task.length)
+    except RegnfError as error:
+        return f"{task.home.name}: none, {error}"
+    rough = task.home.with_name(f"{task.home.name}.part")
+    shutil.rmtree(rough, ignore_errors=True)
+    rough.mkdir(parents=True)
+    written = _write(task, world, seen, rough)
+    (rough / WORLD).write_text(json.dumps({"part": part, **written}, indent=1))
+    rough.rename(task.home)
+    return f"{task.home.name}: {world.kind}, {seen.name}, {len(written['cases'])} cases"
+
+
+def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
+    rng = np.random.default_rng([task.seed, 17, LENGTHS.index(task.length)])
+    scene = _write_scene(task.scene, world, seen, home, rng)
+    _write_observation(seen, home)
+    # As many scenes stay in their own frame as do not.
+    T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
+    maker = ObjectMaker(world, seen, task.length, home)
+    cases = []
+    chosen = _chosen(world, seen, task.length, rng)
+    for number in chosen:
+        placed = world.things[number]
+        assert placed.model is not None
+        T_object_model = similarity(rng, _SCALES)
+        kind = maker.make(number, len(cases), rng)
+        T_fused_room, spread = np.eye(4), 0.0
+        if task.scene == "tsdf":
+            points = _in_room(placed)
+            T_fused_room, spread = seen.taken.carried(number, points)
+        T_fused_model = T_fused_room @ placed.T_room_model
+        box = draw_box(placed.model.surface @ T_fused_model[:3, :3].T + T_fused_model[:3, 3], T_fused_model, rng)
+        cases.append(
+            {
+                "name": placed.model.name,
+                "field": kind,
+                "seen": float((seen.taken.seen[number] > 0).mean()),
+                "diameter_m": placed.model.diameter,
+                "voxels_across": placed.model.diameter / seen.fusion.voxel_m,
+                "drift_spread": spread / placed.model.diameter,
+                "T_object_scene": (T_object_model @ np.linalg.inv(T_scene_room @ T_fused_model)).tolist(),
+                "T_object_model": T_object_model.tolist(),
+                "detection": {
+                    "center": box.center.tolist(),
+                    "size": box.size.tolist(),
+                    "rotation": box.rotation.tolist(),
+                },
+            }
+        )
+    return {
+        "seed": world.seed,
+        "kind": world.kind,
+        "length": task.length,
+        "walk": seen.name,
+        "scene": scene,
+        "drift": seen.drift,
+        "sensor": asdict(seen.taken.sensor),
+        "fusion": asdict(seen.fusion),
+        "T_scene_room": T_scene_room.tolist(),
+        "things": [placed.model.name for placed in world.things if placed.model is not None],
+        "cases": cases,
+    }
+
+
+def similarity(rng: np.random.Generator, scales: Sequence[float]) -> Array:
+    """(4, 4): any turn, a scale between two (small ones as often as large ones), a shift of a few units."""
+    scale = float(np.exp(rng.uniform(*np.log(scales))))
+    T = np.eye(4)
+    T[:3, :3] = scale * Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    T[:3, 3] = scale * rng.normal(scale=1.0, size=3)
+    return T
+
+
+def _chosen(world: World, seen: Seen, length: Length, rng: np.random.Generator) -> list[int]:
+    """Numbers of the things to register: those seen well enough, not too small for the voxels."""
+    fit = [
+        number
+        for number, placed in enumerate(world.things)
+        if placed.model is not None
+        and (seen.taken.seen[number] > 0).mean() >= LEAST_SEEN[length]
+        and placed.model.diameter >= LEAST_VOXELS * seen.fusion.voxel_m
+    ]
+    return sorted(rng.permutation(fit)[:MAX_CASES].tolist())
+
+
+def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.random.Generator) -> dict[str, Any]:
+    if scene == "tsdf":
+        fuse(seen.taken, seen.fusion, seen.bounds, home / "scene.safetensors")
+        return {"kind": scene}
+    mesh = together(*(placed.mesh for placed in world.all))
+    np.savez(home / "scene.npz", vertices=mesh.vertices, faces=mesh.faces)
+    if scene == "mesh":
+        return {"kind": scene}
+    return {
+        "kind": scene,
+        "amplitude": float(rng.uniform(0.001, 0.006)),
+        "wavelength": float(rng.uniform(0.1, 0.6)),
+        "bend_seed": int(rng.integers(2**31)),
+    }
+
+
+def _write_observation(seen: Seen, home: Path) -> None:
+    observation = observation_of_walk(seen.taken, seen.bounds)
+    grid, words = observation.stored()
+    np.savez(home / "observation.npz", words=words, **{name: np.asarray(value) for name, value in asdict(grid).items()})
+
+
+def read_observation_grid(home: Path) -> tuple[ObservationGrid, Any]:
+    """What :func:`make` has written of the observation: the grid, and its words."""
+    with np.load(home / "observation.npz") as file:
+        low, counts = file["low"].tolist(), file["counts"].tolist()
+        grid = ObservationGrid((low[0], low[1], low[2]), float(file["voxel"]), (counts[0], counts[1], counts[2]))
+        return grid, file["words"]
+
+
+def _in_room(placed: Placed) -> Array:
+    assert placed.model is not None
+    T = placed.T_room_model
+    points: Array = placed.model.surface @ T[:3, :3].T + T[:3, 3]
+    return points

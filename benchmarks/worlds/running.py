@@ -1,0 +1,82 @@
+"""Every case of a world registered: one plain dictionary a registration."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.robust.judging import SUCCESS, judge_error
+from benchmarks.worlds.cases import WorldCase, cases_of
+from benchmarks.worlds.stages import from_truth, recorded, stage_errors
+from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, register
+from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.symmetry import Symmetries
+
+Run = dict[str, Any]
+_POINTS = 600
+_ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale_error_share")
+
+
+@dataclass(frozen=True)
+class Way:
+    """How to register. observed: with what was seen of the scene · probe: look into the stages as well."""
+
+    seed: int = 0
+    observed: bool = True
+    probe: bool = True
+
+
+def register_world(home: Path, way: Way) -> list[Run]:
+    """The runs of all cases of a world's folder."""
+    return [_run(case, way) for case in cases_of(home, way.observed)]
+
+
+def _run(world_case: WorldCase, way: Way) -> Run:
+    case = world_case.case
+    assert case.truth is not None
+    options = RegistrationOptions(preset="robust")
+    facts: Run = {**world_case.facts, "observed": way.observed, "seed": way.seed}
+    with recorded() as kept:
+        begun = time.process_time()
+        try:
+            result = register(case.scene, case.obj, case.detection, options, way.seed, clouds=False)
+        except RegnfError as error:
+            return {**facts, "seconds": time.process_time() - begun, **judge_error(error)}
+        seconds = time.process_time() - begun
+    found = {**facts, "seconds": seconds, **judged(result, world_case)}
+    if way.probe:
+        points = world_case.points
+        found |= stage_errors(kept, case.truth, points, case.symmetries)
+        found |= from_truth(kept, case.truth, points, case.symmetries)
+    return found
+
+
+def judged(result: RegistrationResult, world_case: WorldCase) -> Run:
+    """Verdict, errors of the pose and of the best of those listed, and the evidence. Errors are over the true surface.
+
+    near_mssd: the least over symmetries that nearly hold as well.
+    """
+    best, listed = _errors(result, world_case, world_case.case.symmetries)
+    near = best if best["mssd_share"] <= SUCCESS else _errors(result, world_case, world_case.near)[0]
+    return {
+        "verdict": result.verdict,
+        "reason": result.verdict_reason,
+        "poses": 1 + len(result.alternatives),
+        **best,
+        "listed_mssd": listed,
+        "near_mssd": near["mssd_share"],
+        "metrics": result.metrics,
+    }
+
+
+def _errors(
+    result: RegistrationResult, world_case: WorldCase, symmetries: Symmetries
+) -> tuple[dict[str, float], float]:
+    truth = world_case.case.truth
+    assert truth is not None
+    points = world_case.points[:: max(1, len(world_case.points) // _POINTS)]
+    poses = [result.T_object_scene, *(other.T_object_scene for other in result.alternatives)]
+    errors = [errors_against_truth(pose, truth, points, symmetries) for pose in poses]
+    return {name: errors[0][name] for name in _ERRORS}, min(one["mssd_share"] for one in errors)

@@ -1,0 +1,107 @@
+"""Depth images of a world along a walk, and what they show of each thing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_data.posed_images import PosedImages
+from regnf_data.worlds.drift import mean_motion
+from regnf_data.worlds.exact import ExactScene
+from regnf_data.worlds.mesh import Array
+from regnf_data.worlds.sensors import RandomSensor
+
+_DEPTH_SHARE, _DEPTH_M = 0.01, 0.004
+"""How far from a reading's exact depth a point may lie that counts as the one seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """depths: (N, H, W) float32 meters, 0 where nothing is read · poses: (N, 4, 4) true · errors: (N, 4, 4): the poses
+
+    that a map is made with are E T · seen: for each group of points, (P,) in how many images each was measured ·
+    shows: for each group, (N,) how many of its points each image shows.
+    """
+
+    sensor: RandomSensor
+    depths: NDArray[np.float32]
+    poses: Array
+    errors: Array
+    seen: tuple[NDArray[np.int64], ...]
+    shows: tuple[NDArray[np.int64], ...]
+
+    @property
+    def estimated(self) -> Array:
+        """(N, 4, 4)."""
+        return self.errors @ self.poses
+
+    def images(self, bounds: Array, every: int = 1) -> PosedImages:
+        """The images as a dataset's, with depths alone; bounds: (2, 3) of the world."""
+        depths = self.depths[::every]
+        poses = self.estimated[::every]
+        return PosedImages(
+            colors=np.zeros((*depths.shape, 3), np.uint8),
+            intrinsics=np.tile(self.sensor.intrinsics, (len(poses), 1, 1)),
+            T_world_camera=poses,
+            bounds=bounds,
+            depths=depths,
+        )
+
+    def carried(self, group: int, points: Array) -> tuple[Array, float]:
+        """Where the drift carries a group's points, on the mean over the images that show it: see ``mean_motion``."""
+        weights = self.shows[group].astype(np.float64)
+        if weights.sum() == 0.0:
+            return np.eye(4), 0.0
+        return mean_motion(self.errors, weights, points)
+
+
+def capture(
+    scene: ExactScene,
+    sensor: RandomSensor,
+    poses: Array,
+    errors: Array,
+    groups: Sequence[tuple[int, Array]],
+    matter: NDArray[np.int64],
+    rng: np.random.Generator,
+) -> Capture:
+    """Images from the true poses. groups: a thing's number and points (P, 3) of its surface · matter: of each thing."""
+    ends = np.cumsum([0, *(len(points) for _, points in groups)])
+    points = np.concatenate([np.zeros((0, 3)), *(points for _, points in groups)])
+    owners = np.repeat([thing for thing, _ in groups], np.diff(ends)).astype(np.int64)
+    depths = np.zeros((len(poses), *sensor.size), np.float32)
+    seen = np.zeros(len(points), np.int64)
+    shows = np.zeros((len(groups), len(poses)), np.int64)
+    for number, pose in enumerate(poses):
+        view = scene.view(sensor.size, sensor.intrinsics, pose)
+        depths[number] = sensor.measure(view, matter, rng)
+        now = _measured(points, owners, pose, sensor, (view.depth, view.thing, depths[number]))
+        seen += now
+        shows[:, number] = [now[a:b].sum() for a, b in pairwise(ends)]
+    parts = tuple(seen[a:b] for a, b in pairwise(ends))
+    return Capture(sensor, depths, poses, errors, parts, tuple(shows))
+
+
+def _measured(
+    points: Array,
+    owners: NDArray[np.int64],
+    pose: Array,
+    sensor: RandomSensor,
+    images: tuple[Array, NDArray[np.int64], NDArray[np.float32]],
+) -> NDArray[np.bool_]:
+    """(P,): which points one image has readings of. images: exact depths, things, readings."""
+    depth, thing, reading = images
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    z = np.maximum(local[:, 2], 1e-6)
+    K, (height, width) = sensor.intrinsics, sensor.size
+    column = np.floor(K[0, 0] * local[:, 0] / z + K[0, 2])
+    row = np.floor(K[1, 1] * local[:, 1] / z + K[1, 2])
+    found: NDArray[np.bool_] = (local[:, 2] > 0.05) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.flatnonzero(found)
+    places = row[at].astype(np.int64), column[at].astype(np.int64)
+    same = (thing[places] == owners[at]) & (np.abs(depth[places] - z[at]) < _DEPTH_SHARE * z[at] + _DEPTH_M)
+    found[at] = same & (reading[places] > 0.0)
+    return found
