@@ -1,7 +1,7 @@
 """Random configurations of the families of plain networks, with what their settings say and without.
 
     python -m benchmarks.checkpoint_networks --count 25 --seed S --output benchmarks/results/checkpoint_networks.md
-        [--families neus siren ...] [--steps 250]
+        [--families neus siren ...] [--steps 250] [--jobs 1]
 
 With the settings the networks are random. Without them the same configurations are trained for ``--steps`` steps of
 Adam towards the distance of a random solid. Their functions are evaluated slowly in float64, by code of the tests.
@@ -11,10 +11,12 @@ Ends with status 1 where a field is silently wrong, or not as its settings say.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import tempfile
 import warnings
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +28,17 @@ from tests.core.importing.networks.judging import WRONG, Judged, judged
 VALUE_BAR, GRADIENT_BAR = 1e-5, 1e-3
 
 
-def run(family: str, seed: int, number: int, steps: int, folder: Path) -> tuple[Judged, str]:
+def run(family: str, seed: int, number: int, steps: int) -> Judged:
     """One configuration. steps 0: at random, with its settings; else trained, and without them."""
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(1)
     case = FAMILIES[family](np.random.default_rng([seed, number]), steps)
     said = case.beside | ({} if steps else case.said)
-    return judged(case, said, folder), case.told
+    with tempfile.TemporaryDirectory(prefix="regnf-networks-") as folder:
+        found = judged(case, said, Path(folder))
+    line = f"{family} {number} ({case.told}), {steps} steps: {found.refused} {found.value:.1e} {found.gradient:.1e}"
+    sys.stderr.write(f"{line} {found.detail[:160]}\n")
+    return found
 
 
 def row(family: str, said: list[Judged], unsaid: list[Judged]) -> str:
@@ -55,25 +63,23 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--steps", type=int, default=250)
     parser.add_argument("--families", nargs="*", default=list(FAMILIES))
+    parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
     rows, failed = [], False
+    pool = ProcessPoolExecutor(arguments.jobs, multiprocessing.get_context("spawn"))
+    # all families at once, so that no process waits for the last of a family
+    results = {
+        (family, steps): [pool.submit(run, family, arguments.seed, number, steps) for number in range(arguments.count)]
+        for family in arguments.families
+        for steps in (0, arguments.steps)
+    }
     for family in arguments.families:
-        with tempfile.TemporaryDirectory(prefix="regnf-networks-") as folder:
-            results: dict[int, list[Judged]] = {0: [], arguments.steps: []}
-            for steps, found in results.items():
-                for number in range(arguments.count):
-                    one, told = run(family, arguments.seed, number, steps, Path(folder))
-                    found.append(one)
-                    line = (
-                        f"{family} {number} ({told}), {steps} steps: {one.refused} {one.value:.1e} {one.gradient:.1e}"
-                    )
-                    sys.stderr.write(f"{line} {one.detail[:160]}\n")
-        rows.append(row(family, results[0], results[arguments.steps]))
+        said, unsaid = ([one.result() for one in results[family, steps]] for steps in (0, arguments.steps))
+        rows.append(row(family, said, unsaid))
         sys.stderr.write(rows[-1] + "\n")
         failed |= not rows[-1].endswith("| 0 |") or f"{arguments.count} of {arguments.count}" not in rows[-1][:60]
+    pool.shutdown()
     text = "\n".join(
         [
             f"Command: `python -m benchmarks.checkpoint_networks --count {arguments.count} --seed {arguments.seed} "
