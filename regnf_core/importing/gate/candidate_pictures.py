@@ -27,7 +27,7 @@ _WORK = Calls((40_000, 37_000), (12_000,))
 
 
 class _OutOfTimeError(RegnfError):
-    reason = "PICTURE_OUT_OF_TIME"
+    """Ends a drawing; nobody hears of it."""
 
 
 def draw_candidates(candidates: Sequence[OpenCandidate], folder: Path, seconds: float) -> None:

@@ -15,6 +15,7 @@ import os
 import re
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -77,10 +78,11 @@ def convert_file(
     family, why, warnings = converted.family, converted.why, converted.warnings
     kind = str(converted.description["kind"])
     bounds, label = converted.description["bounds"], converted.description["label"]
+    guessed = _Guess(None if _sign_is_said(converted, said) else int(converted.description["sign"]))
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
     drawn_to = out_dir / PICTURE_NAME if picture else None
-    measured, more = _evaluated(target, up_axis, drawn_to, bool((description or {}).get("accept_implausible")))
+    measured, more = _evaluated(target, up_axis, drawn_to, None if said.accept_implausible else guessed)
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     return {
@@ -109,12 +111,26 @@ def _read(
         remove_unpacked(out_dir)
 
 
+def _sign_is_said(converted: ConvertedField, said: UploadDescription) -> bool:
+    """By the description, by a mesh's faces, or by a safe field, which was imported before."""
+    from regnf_core.importing.families.safe_field import FAMILY
+
+    return bool(said.sign or said.as_) or converted.description["kind"] == "mesh" or converted.family == FAMILY
+
+
+@dataclass(frozen=True)
+class _Guess:
+    """sign: the one that the values are read with, where nothing says it."""
+
+    sign: int | None
+
+
 def _evaluated(
-    path: Path, up_axis: str | None, picture: Path | None, accepted: bool
+    path: Path, up_axis: str | None, picture: Path | None, judged: _Guess | None
 ) -> tuple[dict[str, float], list[str]]:
     """What was measured of the field in the file ``path``, and warnings; it is drawn if that is quick.
 
-    accepted: even if it does not behave like a signed distance. Raises FieldFormatError.
+    judged: None takes it even if it does not behave like a signed distance. Raises FieldFormatError.
     """
     # These load torch, which takes seconds and which a file that is refused before never needs.
     from regnf_core.fields.build import open_field
@@ -122,8 +138,8 @@ def _evaluated(
 
     field, started = open_field(path), time.process_time()
     measured, warnings = check_plausibility(field)
-    if not accepted:
-        require_plausible(measured)
+    if judged is not None:
+        require_plausible(measured, judged.sign)
     if picture is not None and time.process_time() - started < _QUICK_S:
         _draw(field, up_axis, picture)
     return measured, warnings

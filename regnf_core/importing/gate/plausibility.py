@@ -11,6 +11,7 @@ from torch import Tensor
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.importing.cost.calls import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
+from regnf_core.importing.gate.enclosure import INSIST, Box, measured_enclosure, require_sound_enclosure
 from regnf_core.surface.projection import newton_step
 
 _SAME = 1e-3
@@ -38,7 +39,7 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
     """Measurements of the field, and warnings.
 
     Measured: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
-    gradient_p10, gradient_median and gradient_p90 (the gradient's norm there).
+    gradient_p10, gradient_median and gradient_p90 (the gradient's norm there), and what ``measured_enclosure`` does.
 
     ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
     along the gradient.
@@ -52,11 +53,11 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
     _require_finite(distance)
     _require_function(field, points, distance)
     nearest = points[distance.abs().argsort()[: samples // NEAREST_SHARE]]
-    norms, signs = _walk_to_surface(field, nearest, (lower, upper))
+    surface, norms, signs = _walk_to_surface(field, nearest, (lower, upper))
     inside = distance < 0
     both_sides = bool(inside.any() or (signs < 0).any()) and bool((~inside).any() or (signs > 0).any())
     if not both_sides or norms.numel() == 0:
-        raise FieldFormatError("the field has no surface within its bounds", reason="NO_ZERO_LEVEL")
+        raise _no_surface(distance)
     low, median, high = torch.quantile(norms, torch.tensor([0.1, 0.5, 0.9])).tolist()
     measured = {
         "share_inside": float(inside.float().mean()),
@@ -65,19 +66,34 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
         "gradient_p10": low,
         "gradient_median": median,
         "gradient_p90": high,
+        **measured_enclosure(points, distance, surface, median, Box(lower, upper)),
     }
     return measured, _warnings(measured)
 
 
-def require_plausible(measured: dict[str, float]) -> None:
-    """Raise FieldFormatError (FIELD_IMPLAUSIBLE) if what was measured is no signed distance's, not even a bad one's."""
+def _no_surface(distance: Tensor) -> FieldFormatError:
+    low, high = float(distance.min()), float(distance.max())
+    where = "free" if low > 0 else "inside matter" if high < 0 else "without a sound gradient"
+    message = (
+        f"the field has no surface within its bounds: all is {where}, with values from {low:.3g} to {high:.3g}; say the"
+        " bounds of the region that was trained, if they are others"
+    )
+    return FieldFormatError(message, reason="NO_ZERO_LEVEL")
+
+
+def require_plausible(measured: dict[str, float], sign: int | None = None) -> None:
+    """Raise FieldFormatError (FIELD_IMPLAUSIBLE) if what was measured is no signed distance's, not even a bad one's.
+
+    sign: the one that the values are read with, where nobody has said it.
+    """
     slope = measured["gradient_median"]
     if not _PLAUSIBLE[0] <= slope <= _PLAUSIBLE[1]:
         message = (
             f"the gradient's norm at the surface is {slope:.3g}, where a signed distance has 1: the settings may be of"
-            " another file, or the values no distances; with accept_implausible: true in the description it is taken"
+            f" another file, or the values no distances; {INSIST}"
         )
         raise FieldFormatError(message, reason="FIELD_IMPLAUSIBLE")
+    require_sound_enclosure(measured, sign)
 
 
 def _require_function(field: SdfField, points: Tensor, distance: Tensor) -> None:
@@ -102,8 +118,8 @@ def _share_inside_at_bounds(
     return float((distance < 0).float().mean())
 
 
-def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Gradient norms (M,) where the walk ended on the surface, and the signs (K,) that the walk met on its way.
+def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Where (M, 3) the walk ended on the surface, gradient norms (M,) there, and the signs (K,) met on the way.
 
     Newton steps of at most a twentieth of the diagonal, kept within the bounds.
     """
@@ -121,7 +137,7 @@ def _walk_to_surface(field: SdfField, points: Tensor, box: tuple[Tensor, Tensor]
     _require_finite(norms)  # its parts may be finite and their squares not
     # Where the gradient vanishes |distance| says nothing about how near the surface is.
     on_surface = (distance.abs() < _SURFACE_SHARE * diagonal * norms.clamp_max(1.0)) & (norms > 1e-6)
-    return norms[on_surface], torch.cat(signs)
+    return points[on_surface], norms[on_surface], torch.cat(signs)
 
 
 def _evaluate(field: SdfField, points: Tensor) -> tuple[Tensor, Tensor]:

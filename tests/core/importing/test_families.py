@@ -141,10 +141,11 @@ def test_a_level_mask_may_be_said(tmp_path: Path) -> None:
     assert_is(tmp_path, sample.function)
 
 
-def round_siren(sign: float) -> dict[str, torch.Tensor]:
-    """sign (2.8 - cos 1.2 x - cos 1.2 y - cos 1.2 z): a ball's worth round the origin, the other sign all about it."""
+def round_siren(sign: float, size: float = 0.6) -> dict[str, torch.Tensor]:
+    """sign (3 - size - cos 1.2 x - cos 1.2 y - cos 1.2 z): a ball's worth round the origin, the other sign all about
+    it."""
     first = {"net.net.0.0.weight": 1.2 / 30 * torch.eye(3), "net.net.0.0.bias": torch.full((3,), torch.pi / 60)}
-    last = {"net.net.1.0.weight": -sign * torch.ones(1, 3), "net.net.1.0.bias": torch.tensor([2.8 * sign])}
+    last = {"net.net.1.0.weight": -sign * torch.ones(1, 3), "net.net.1.0.bias": torch.tensor([(3.0 - size) * sign])}
     return first | last
 
 
@@ -155,8 +156,16 @@ def round_siren(sign: float) -> dict[str, torch.Tensor]:
 def test_a_siren_that_is_negative_all_round_may_be_turned_round(
     sign: float, description: dict[str, Any], uncertain: bool, tmp_path: Path
 ) -> None:
-    report = imported(tmp_path, round_siren(sign), **SIREN_SAID, **description)
+    report = imported(tmp_path, round_siren(sign), **SIREN_SAID, **description)  # half of the cube
     assert ("SIGN_UNCERTAIN" in [warning.split(":")[0] for warning in report["warnings"]]) == uncertain
+
+
+def test_a_small_thing_turned_inside_out_is_refused_unless_its_sign_is_said(tmp_path: Path) -> None:
+    values = round_siren(-1.0, size=0.2)
+    assert_refused(lambda: imported(tmp_path, values, **SIREN_SAID), "FIELD_IMPLAUSIBLE")
+    for said in ({"sign": -1}, {"sign": 1}, {"as": "scene"}, {"accept_implausible": True}):
+        imported(tmp_path, values, **SIREN_SAID, **said)
+    imported(tmp_path, round_siren(1.0, size=0.2), **SIREN_SAID)
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,8 @@ def translate(keys: Keys, said: Said) -> None:
     if network.flag("use_grid_feature"):
         said.refuse(network, "use_grid_feature")
     said.put("positional_encoding.degree", network.whole("multires"), network, "multires")
+    if network.flag("inside_outside"):  # begun as a room: positive in the free space that it encloses
+        said.put("sign", 1, network, "inside_outside")
     dims, prefix = network.wholes("dims"), "implicit_network.lin"
     layers = said.facts.count(prefix, ".bias")
     if dims is not None and layers:

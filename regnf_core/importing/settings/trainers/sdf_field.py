@@ -50,6 +50,8 @@ def translate(keys: Keys, said: Said) -> None:
         "smoothstep" if theirs else "hash_smoothstep",
     )
     _encoding(field, said, theirs)
+    if field.flag("inside_outside"):  # begun as a room: positive in the free space that it encloses
+        said.put("sign", 1, field, "inside_outside")
     said.values["contraction"] = "linf_grid" if theirs else "none"
     _schedule(keys, field, said)
     _frame(keys, said)

@@ -50,6 +50,8 @@ def test_implicit_networks(name: str, values: dict[str, Any]) -> None:
     expected: dict[str, Any] = {"positional_encoding": {"degree": network["multires"]}}
     if sphere is not None:
         expected["bounds"] = [[-sphere] * 3, [sphere] * 3]
+    if network.get("inside_outside"):
+        expected["sign"] = 1  # a room, as it should be
     assert translated({name: text}).values == expected
 
 
