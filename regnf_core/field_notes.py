@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+WARNINGS = "warnings"
+"""The entry of a safe field's ``source`` that has the warnings of its import."""
+_WARNING = re.compile(r"[A-Z][A-Z0-9_]{2,63}: ")
+_MOST, _LONGEST = 16, 400
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,11 @@ class FieldNotes:
         texts = tuple(map(str, warnings)) if isinstance(warnings, list | tuple) else ()
         return cls(str(family) if family else None, settings if isinstance(settings, Mapping) else None, texts)
 
+    @classmethod
+    def of_source(cls, source: Mapping[str, Any]) -> FieldNotes:
+        """From what a safe field says of its origin: the warnings of its import."""
+        return cls(warnings=kept_warnings(source.get(WARNINGS)))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain (JSON) values."""
         settings = None if self.settings is None else dict(self.settings)
@@ -34,5 +45,14 @@ class FieldNotes:
         return [warning.partition(":")[0] for warning in self.warnings]
 
 
+def kept_warnings(values: object) -> tuple[str, ...]:
+    """Of what a file may hold as an import's warnings, those that are: a word, a colon and a short printable text."""
+    listed = values if isinstance(values, list) else []
+    sound = [
+        text[:_LONGEST] for text in listed if isinstance(text, str) and _WARNING.match(text) and text.isprintable()
+    ]
+    return tuple(sound[:_MOST])
+
+
 NO_NOTES = FieldNotes()
-"""Of a safe field that was given as it is: its import was another time."""
+"""Of a field of which nothing is known."""

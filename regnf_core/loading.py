@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.engine_revision import ENGINE_REVISION
-from regnf_core.field_notes import NO_NOTES, FieldNotes
+from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import FieldSource, SettingsChoice, find_source
 from regnf_core.files import atomic_path
 from regnf_core.version import __version__
@@ -80,8 +80,8 @@ def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
     Raises FieldFormatError and InvalidInputError naming the file.
     """
     with source.naming():
-        if _is_safe_field(source):
-            return SafeField(source.file, NO_NOTES)
+        if (notes := _safe_field_notes(source)) is not None:
+            return SafeField(source.file, notes)
         return _imported(source, cache_dir or default_cache_dir())
 
 
@@ -91,14 +91,13 @@ def default_cache_dir() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "regnf" / "fields"
 
 
-def _is_safe_field(source: FieldSource) -> bool:
-    """Whether the file can be opened as it is. Raises FieldFormatError: it only looks like a safe field."""
+def _safe_field_notes(source: FieldSource) -> FieldNotes | None:
+    """The notes of a file that can be opened as it is. Raises FieldFormatError: it only looks like a safe field."""
     from regnf_core.schema.safe_format import read_description
 
     if source.file.suffix.lower() != ".safetensors" or source.description or source.settings:
-        return False
-    read_description(source.file)
-    return True
+        return None
+    return FieldNotes.of_source(read_description(source.file)["source"])
 
 
 def _imported(source: FieldSource, cache_dir: Path) -> SafeField:

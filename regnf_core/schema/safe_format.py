@@ -32,13 +32,13 @@ _MAX_DESCRIPTION = 1 << 20
 
 
 def write_safe_field(
-    path: str | os.PathLike[str], description: dict[str, Any], tensors: Mapping[str, NDArray[Any]]
+    path: str | os.PathLike[str], description: dict[str, Any], tensors: Mapping[str, NDArray[Any]], room: int = 0
 ) -> None:
     """Write a field file atomically: a temporary file beside ``path`` is renamed once it is on the disk.
 
     The same description and tensors give the same bytes. description: see docs/safe-format.md · tensors: float32,
-    float16 or int32 arrays by name. Raises FieldFormatError: SAFE_FORMAT_INVALID, FIELD_KIND_UNKNOWN,
-    FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
+    float16 or int32 arrays by name · room: bytes that ``add_to_source`` may need. Raises FieldFormatError:
+    SAFE_FORMAT_INVALID, FIELD_KIND_UNKNOWN, FIELD_SHAPES_MISMATCH or FIELD_NOT_FINITE.
     """
     parsed = parse_description(description)
     specs = tensor_specs(tensors)
@@ -48,13 +48,31 @@ def write_safe_field(
             raise FieldFormatError(f"{name} holds a number that is not finite", reason="FIELD_NOT_FINITE")
     # The table first: its rows are read as wide elements, which needs an aligned start.
     order = sorted(tensors, key=lambda name: (-tensors[name].itemsize, name != "hash_table", name))
-    header = _header(description_to_dict(parsed), specs, order, tensors)
+    header = _header(description_to_dict(parsed), specs, order, tensors, room)
     with atomic_path(path, durable=True) as temporary, temporary.open("xb") as file:
         file.write(len(header).to_bytes(8, "little") + header)
         for name in order:
             file.write(
                 np.ascontiguousarray(tensors[name]).astype(tensors[name].dtype.newbyteorder("<"), copy=False).data
             )
+
+
+def add_to_source(path: str | os.PathLike[str], notes: Mapping[str, Any]) -> None:
+    """Add ``notes`` to the entry ``source`` of a field file that was written with room for it, in place.
+
+    Raises FieldFormatError (SAFE_FORMAT_INVALID) where there is not enough room.
+    """
+    with open(path, "r+b") as file:
+        length = int.from_bytes(file.read(8), "little")
+        entries = json.loads(file.read(length))
+        field = json.loads(entries["__metadata__"]["field"])
+        field["source"] = {**field.get("source", {}), **notes}
+        entries["__metadata__"]["field"] = json.dumps(field, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) > length:
+            raise FieldFormatError("the field file has no room for more notes", reason="SAFE_FORMAT_INVALID")
+        file.seek(8)
+        file.write(text.ljust(length))
 
 
 def tensor_specs(tensors: Mapping[str, NDArray[Any]]) -> dict[str, TensorSpec]:
@@ -102,9 +120,13 @@ def _parse_metadata(metadata: Mapping[str, str]) -> FieldDescription:
 
 
 def _header(
-    description: dict[str, Any], specs: dict[str, TensorSpec], order: list[str], tensors: Mapping[str, NDArray[Any]]
+    description: dict[str, Any],
+    specs: dict[str, TensorSpec],
+    order: list[str],
+    tensors: Mapping[str, NDArray[Any]],
+    room: int,
 ) -> bytes:
-    """The safetensors header, padded so that the data starts aligned."""
+    """The safetensors header, padded by ``room`` and so that the data starts aligned."""
     field = json.dumps(description, allow_nan=False, ensure_ascii=False)
     if len(field) > _MAX_DESCRIPTION:
         raise FieldFormatError("the field's description is too long", reason="SAFE_FORMAT_INVALID")
@@ -115,7 +137,7 @@ def _header(
         entries[name] = {"dtype": specs[name].dtype, "shape": list(specs[name].shape), "data_offsets": [start, end]}
         start = end
     text = json.dumps(entries, separators=(",", ":"), ensure_ascii=False).encode()
-    return text + b" " * (-(len(text) + 8) % _ALIGNMENT)
+    return text + b" " * (room + -(len(text) + room + 8) % _ALIGNMENT)
 
 
 def _type_name(name: str, array: NDArray[Any]) -> str:

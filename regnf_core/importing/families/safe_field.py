@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.containers.safetensors_header import StoredTensor, read_header
 from regnf_core.importing.families.converted import ConvertedField
@@ -34,7 +35,7 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, override
     description = _overruled(read_description(path), overrides)
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
     why = ("a regnf field file",)
-    return ConvertedField(FAMILY, why, description, tensors)
+    return ConvertedField(FAMILY, why, description, tensors, kept_warnings(description["source"].get(WARNINGS)))
 
 
 def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dict[str, Any]:

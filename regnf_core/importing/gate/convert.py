@@ -15,11 +15,13 @@ import os
 import re
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import FieldFormatError, RegnfError
+from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.gate.ambiguity import AmbiguousError
 from regnf_core.importing.gate.picture import PICTURE_NAME
@@ -35,6 +37,8 @@ if TYPE_CHECKING:
     from regnf_core.importing.upload_description import UploadDescription
 
 FIELD_NAME = "field.safetensors"
+_ROOM = 32 << 10
+"""Bytes in the field file for the warnings, which are known once it is evaluated."""
 _SEEN = (OBSERVATION, WEIGHTS)
 """Tensors that say how much was seen; they are no parameters of the function."""
 _ALL_ROUND = 0.95
@@ -66,14 +70,14 @@ def convert_file(
     """
     from regnf_core.importing.gate.cost_estimate import require_affordable
     from regnf_core.importing.gate.placement import placed
-    from regnf_core.schema.safe_format import write_safe_field
+    from regnf_core.schema.safe_format import add_to_source, write_safe_field
 
     converted, said, used = _read(upload, out_dir, description, limits, settings)
     _require_text(converted.description)
     require_affordable(converted, limits)
     converted = placed(_settled(converted), said)
     target = out_dir / FIELD_NAME
-    write_safe_field(target, converted.description, converted.tensors)
+    write_safe_field(target, converted.description, converted.tensors, _ROOM)
     parameters = sum(array.size for name, array in converted.tensors.items() if name not in _SEEN)
     family, why, warnings = converted.family, converted.why, converted.warnings
     kind = str(converted.description["kind"])
@@ -85,6 +89,8 @@ def convert_file(
     measured, more = _evaluated(target, up_axis, drawn_to, None if said.accept_implausible else guessed)
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
+    warned = kept_warnings(_latest([*warnings, *more]))
+    add_to_source(target, {WARNINGS: warned} if warned else {})
     return {
         "family": family,
         "kind": kind,
@@ -92,7 +98,7 @@ def convert_file(
         "bounds": bounds,
         "parameters": parameters,
         "plausibility": measured,
-        "warnings": [*warnings, *more],
+        "warnings": warned,
         "label": label,
         "settings": used,
     }
@@ -109,6 +115,11 @@ def _read(
         return read_upload(upload, out_dir, description, limits, settings)
     finally:
         remove_unpacked(out_dir)
+
+
+def _latest(warnings: Sequence[str]) -> list[str]:
+    """Of warnings with the same word the last: a safe field brings those of its first import."""
+    return list({warning.partition(":")[0]: warning for warning in warnings}.values())
 
 
 def _sign_is_said(converted: ConvertedField, said: UploadDescription) -> bool:
