@@ -62,8 +62,14 @@ def _register_one(case: Case, thing: Thing, common: Overlap, seed: int, with_sta
 
     def more(case: Case, result: RegistrationResult) -> Run:
         assert case.truth is not None
-        ratio = float(result.T_object_scene.scale / case.truth.scale)
-        return {"scale_ratio": ratio, "diameter_m": result.metrics["object_diameter"] / float(case.truth.scale)}
+        found, size = result.T_object_scene, result.metrics["object_diameter"]
+        center = result.object_samples.points.double().mean(0, keepdim=True)
+        apart = found.inverse().apply(center) - case.truth.inverse().apply(center)
+        return {
+            "scale_ratio": float(found.scale / case.truth.scale),
+            "center_error_share": float(apart.norm() * case.truth.scale) / size,
+            "diameter_m": size / float(case.truth.scale),
+        }
 
     run = run_one(Job(lambda: case, thing.name, seed), more)
     diameter = run.get("diameter_m", math.nan)

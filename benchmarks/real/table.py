@@ -22,11 +22,11 @@ def line(run: Run) -> str:
 
 
 def errors(run: Run) -> str:
-    """Rotation, translation in shares of the diameter, and scale."""
+    """Of the rotation, of the place of the object's center (share of its diameter), of the scale, and MSSD."""
     if "mssd_share" not in run:
         return "none"
     return (
-        f"{degrees(run['rotation_error_rad']):.1f} deg, {100.0 * run['translation_error_share']:.1f} %, "
+        f"{degrees(run['rotation_error_rad']):.1f} deg, {100.0 * run['center_error_share']:.1f} %, "
         f"scale {100.0 * (run['scale_ratio'] - 1.0):+.1f} %, MSSD {100.0 * run['mssd_share']:.1f} %"
     )
 

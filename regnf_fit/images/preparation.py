@@ -26,7 +26,7 @@ _START_RADIUS = 0.2
 @dataclass(frozen=True)
 class PreparedImages:
     """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
-    instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of the depths, from image to image."""
+    instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of depths, from image to image."""
 
     training: PixelRays
     held_out: PixelRays
