@@ -57,6 +57,24 @@ def row(family: str, said: list[Judged], unsaid: list[Judged]) -> str:
     )
 
 
+def table(arguments: argparse.Namespace, rows: list[str]) -> str:
+    """The command, what is right, and the rows of the families so far."""
+    return "\n".join(
+        [
+            f"Command: `python -m benchmarks.checkpoint_networks --count {arguments.count} --seed {arguments.seed} "
+            f"--steps {arguments.steps}`, torch {torch.__version__}",
+            "",
+            f"With settings: values within {VALUE_BAR:g} of their range, gradients within {GRADIENT_BAR:g}. Without: "
+            f"wrong is beyond {WRONG:g} of the range; whoever is refused is told what to say.",
+            "",
+            "| family | with settings | largest value error | largest gradient error | without: right | off by less "
+            "than 1e-3 | refused | silently wrong |",
+            "|---|---|---|---|---|---|---|---|",
+            *rows,
+        ]
+    )
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=25)
@@ -77,26 +95,11 @@ def main() -> int:
     for family in arguments.families:
         said, unsaid = ([one.result() for one in results[family, steps]] for steps in (0, arguments.steps))
         rows.append(row(family, said, unsaid))
-        sys.stderr.write(rows[-1] + "\n")
         failed |= not rows[-1].endswith("| 0 |") or f"{arguments.count} of {arguments.count}" not in rows[-1][:60]
+        if arguments.output:
+            arguments.output.write_text(f"# Networks of plain layers\n\n{table(arguments, rows)}\n")
     pool.shutdown()
-    text = "\n".join(
-        [
-            f"Command: `python -m benchmarks.checkpoint_networks --count {arguments.count} --seed {arguments.seed} "
-            f"--steps {arguments.steps}`, torch {torch.__version__}",
-            "",
-            f"With settings: values within {VALUE_BAR:g} of their range, gradients within {GRADIENT_BAR:g}. Without: "
-            f"wrong is beyond {WRONG:g} of the range; whoever is refused is told what to say.",
-            "",
-            "| family | with settings | largest value error | largest gradient error | without: right | off by less "
-            "than 1e-3 | refused | silently wrong |",
-            "|---|---|---|---|---|---|---|---|",
-            *rows,
-        ]
-    )
-    sys.stdout.write(text + "\n")
-    if arguments.output:
-        arguments.output.write_text(f"# Networks of plain layers\n\n{text}\n")
+    sys.stdout.write(table(arguments, rows) + "\n")
     return int(failed)
 
 

@@ -37,8 +37,6 @@ class OpenReading:
     make: Callable[[], Reading]
     ends_at: float | None = None
     """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
-    published: bool = True
-    """Whether a published configuration has it."""
     known_to: float | None = None
     """The distance beyond which the trainer leaves values to themselves, where it is known."""
     nearby: tuple[Callable[[], Reading], ...] = ()

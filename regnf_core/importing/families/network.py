@@ -149,8 +149,6 @@ class OpenForm:
     """Where its layers are other ones than the network's own."""
     ends_at: float | None = None
     """The radius beyond which the trainer never looks, in the field's own coordinates, where it is known."""
-    published: bool = True
-    """Whether a published configuration has it."""
     known_to: float | None = None
     """The distance beyond which the trainer leaves values to themselves, where it is known."""
     scale_is_open: bool = False
@@ -176,9 +174,7 @@ def network_field(
 
 def _open_reading(one: OpenForm, make: Callable[[OpenForm], Reading]) -> OpenReading:
     nearby = [partial(make, replace(one, form=form)) for form in _nearby(one.form)] if one.scale_is_open else []
-    return OpenReading(
-        one.name, one.family, partial(make, one), one.ends_at, one.published, one.known_to, tuple(nearby)
-    )
+    return OpenReading(one.name, one.family, partial(make, one), one.ends_at, one.known_to, tuple(nearby))
 
 
 def _nearby(form: Form) -> list[Form]:

@@ -137,22 +137,17 @@ def _much_better(one: _Candidate, other: _Candidate) -> bool:
 
 
 def _by_end(candidates: list[_Candidate]) -> tuple[_Candidate, str]:
-    """By where training ended. Nothing else tells a network from itself at another scale.
-
-    What is published is taken before what somebody may have set.
-    """
-    fitting: dict[bool, list[tuple[_Candidate, str]]] = {True: [], False: []}
+    """By where training ended. Nothing else tells a network from itself at another scale."""
+    fitting = []
     for one in candidates:
         radius, contrast = end_of_training(one.field)
         ratio = radius / (one.open.ends_at or math.inf)
         trained = min(one.trial.misses) < _DISTANCE_LIKE
         if trained and contrast >= _SHARP_END and _END[0] <= ratio <= _END[1]:
-            how = f"the gradient's length is 1 up to a radius of {radius:.2f} and not beyond"
-            fitting[one.open.published].append((one, how))
-    chosen = fitting[True] or fitting[False]
-    if len(chosen) != 1:
+            fitting.append((one, f"the gradient's length is 1 up to a radius of {radius:.2f} and not beyond"))
+    if len(fitting) != 1:
         raise _undecided(candidates, "where training ended does not show")
-    return chosen[0]
+    return fitting[0]
 
 
 def _as_candidates(readings: Sequence[OpenReading]) -> list[_Candidate]:
