@@ -73,7 +73,8 @@ def deepsdf(specs: Path, model: Path) -> Function:
                 x = x.tanh()
             if i < layers - 1:
                 x = x.relu()
-        return x[:, 0].tanh()
+        distance: Tensor = x[:, 0].tanh()
+        return distance
 
     return evaluate
 
@@ -93,7 +94,8 @@ def blocks(weights: Path) -> Function:
                 x = torch.cat((x, given), dim=1)
             x = (x @ _weight(state, f"net.{i}.0").T + state[f"net.{i}.0.bias"]).relu()
         x = x @ _weight(state, "final_layer.0").T + state["final_layer.0.bias"]
-        return x[:, 0].tanh()
+        distance: Tensor = x[:, 0].tanh()
+        return distance
 
     return evaluate
 
