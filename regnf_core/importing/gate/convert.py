@@ -89,7 +89,7 @@ def convert_file(
     measured, more = _evaluated(target, up_axis, drawn_to, None if said.accept_implausible else guessed)
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    warned = kept_warnings(_latest([*warnings, *more]))
+    warned = list(kept_warnings(_latest([*warnings, *more])))
     add_to_source(target, {WARNINGS: warned} if warned else {})
     return {
         "family": family,
