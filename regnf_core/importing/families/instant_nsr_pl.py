@@ -25,6 +25,7 @@ _PREFIX = "model.geometry."
 _TABLE = "encoding.encoding.params"
 _PROGRESSIVE_TABLE = "encoding.encoding.encoding.params"
 _HABITS = GridHabits((2, 4, 8, 1), "linear", writes_growth=True)
+_SHARPER = 1e4
 _FIRST_LEVELS, _STEPS_A_LEVEL = 4, 1000
 
 
@@ -38,8 +39,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     if not state:
         return None
     require_family(overrides, FAMILY)
-    refuse_other_entries(overrides, FAMILY, ("level_mask", "hash"))
-    layers = _layers(state, source)
+    refuse_other_entries(overrides, FAMILY, ("level_mask", "hash", "activation", "output_scale", "output_bias"))
+    layers = _said(_layers(state, source), overrides)
     bounds, radius = _scene_cube(checkpoint["state_dict"], source)
     if overrides.hash.radius not in (None, radius):
         raise contradiction("hash.radius", overrides.hash.radius, f"{radius:g} (scene_aabb)")
@@ -75,6 +76,20 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     if len(names) > 4:
         raise FieldFormatError(f"a geometry network of {len(names)} layers", reason="FAMILY_NOT_SUPPORTED")
     return layers
+
+
+def _said(layers: Layers, overrides: UploadDescription) -> Layers:
+    """The layers with what the settings say of them: ReLU instead of softplus (``sphere_init: false``), and
+    (result + output_bias) output_scale. ReLU is softplus of numbers a ten thousand times as large, but for 1e-6."""
+    if overrides.activation not in (None, "softplus", "relu"):
+        message = f"description.activation: {overrides.activation} means nothing for {FAMILY}: softplus or relu"
+        raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
+    sharp = np.float32(_SHARPER if overrides.activation == "relu" else 1.0)
+    scale = np.float32(overrides.output_scale or 1.0)
+    (*weights, last), (*biases, last_bias) = layers.weights, layers.biases
+    weights[0] = weights[0] * sharp
+    bias = (last_bias + np.float32(overrides.output_bias or 0.0)) * scale
+    return Layers((*weights, last * (scale / sharp)), (*(one * sharp for one in biases), bias))
 
 
 def _scene_cube(state: dict[Any, Any], source: TensorSource) -> tuple[list[list[float]], float]:

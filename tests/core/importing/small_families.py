@@ -155,7 +155,7 @@ def deepsdf(
 
 
 def _gridded(
-    grid: HashGridConfig, active: int, radius: float, per_radius: bool
+    grid: HashGridConfig, active: int, radius: float, per_radius: bool, relu: bool = False
 ) -> tuple[Function, Array, list[tuple[Array, Array]]]:
     """[x (or x / radius), features of the grid over [-radius, radius]^3, finer levels zero] -> softplus -> distance."""
     rng = _rng(8)
@@ -168,20 +168,21 @@ def _gridded(
         features = encode_slowly(grid, table, (x + radius) / (2.0 * radius))
         features[active * grid.features_per_level :] = 0.0
         h = np.concatenate((x / radius if per_radius else x, features))
-        h = softplus(layers[0][0] @ h + layers[0][1])
+        a = layers[0][0] @ h + layers[0][1]
+        h = np.maximum(a, 0.0) if relu else softplus(a)
         return float((layers[1][0] @ h + layers[1][1])[0])
 
     centered(function, layers[1][1])
     return function, table, layers
 
 
-def instant_nsr_pl(step: int = 20_000, progressive: bool = False) -> Sample:
+def instant_nsr_pl(step: int = 20_000, progressive: bool = False, relu: bool = False) -> Sample:
     """VolumeSDF with a VanillaMLP, six levels; the progressive grid opens one every 1000 steps, from four on."""
     grid = HashGridConfig.from_top_resolution(
         2048, levels=6, base_resolution=16, log2_table_size=9, interpolation="linear"
     )
     active = min(6, 4 + step // 1000) if progressive else 6
-    function, table, layers = _gridded(grid, active, 1.5, per_radius=True)
+    function, table, layers = _gridded(grid, active, 1.5, per_radius=True, relu=relu)
     name = "model.geometry.encoding.encoding." + ("encoding.params" if progressive else "params")
     state = OrderedDict({name: torch.from_numpy(table).float().flatten()})
     state["model.scene_aabb"] = torch.tensor([-1.5] * 3 + [1.5] * 3)

@@ -141,6 +141,23 @@ def test_a_level_mask_may_be_said(tmp_path: Path) -> None:
     assert_is(tmp_path, sample.function)
 
 
+def test_instant_nsr_pl_without_its_sphere_has_relu(tmp_path: Path) -> None:
+    sample = small.instant_nsr_pl(relu=True)
+    imported(tmp_path, sample.checkpoint, activation="relu", **INSTANT_GRID)
+    assert_is(tmp_path, sample.function)
+
+
+def test_instant_nsr_pl_may_add_to_its_result_and_scale_it(tmp_path: Path) -> None:
+    sample = small.instant_nsr_pl()
+    imported(tmp_path, sample.checkpoint, output_bias=0.05, output_scale=0.5, **INSTANT_GRID)
+    assert_is(tmp_path, lambda x: (sample.function(x) + 0.05) * 0.5)
+
+
+def test_instant_nsr_pl_has_no_other_activations(tmp_path: Path) -> None:
+    values = small.instant_nsr_pl().checkpoint
+    assert_refused(lambda: imported(tmp_path, values, activation="sine"), "INVALID_DESCRIPTION")
+
+
 def round_siren(sign: float, size: float = 0.6) -> dict[str, torch.Tensor]:
     """sign (3 - size - cos 1.2 x - cos 1.2 y - cos 1.2 z): a ball's worth round the origin, the other sign all about
     it."""

@@ -82,7 +82,7 @@ def _output(geometry: Keys, said: Said) -> None:
     kind, rest = (found[1], found[2]) if found is not None else (None, "?")
     if kind in ("mul", "+", "-") and re.fullmatch(r"[0-9.]{1,12}", rest) and rest.count(".") < 2:
         number = float(rest)
-        factor, bias = (number, bias * number) if kind == "mul" else (1.0, bias + (number if kind == "+" else -number))
+        factor, bias = (number, bias) if kind == "mul" else (1.0, bias + (number if kind == "+" else -number))
     elif name.lower() not in ("none", ""):
         said.refuse(geometry, "sdf_activation")
     if factor != 1.0:

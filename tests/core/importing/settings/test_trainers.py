@@ -157,7 +157,7 @@ def test_instant_nsr_pl_s_open_levels(step: int, opened: int) -> None:
 def test_instant_nsr_pl_s_other_functions() -> None:
     assert translated({"p.yaml": nsr("HashGrid", network="sphere_init: false")}).values["activation"] == "relu"
     biased = translated({"p.yaml": nsr("HashGrid", "    sdf_bias: 0.5\n    sdf_activation: mul2")}).values
-    assert (biased["output_scale"], biased["output_bias"]) == (2.0, 1.0)
+    assert (biased["output_scale"], biased["output_bias"]) == (2.0, 0.5)  # (result + 0.5) 2
     for text in (
         nsr("VanillaFrequency"),
         nsr("HashGrid", "    sdf_activation: sigmoid"),
