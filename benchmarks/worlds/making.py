@@ -139,6 +139,8 @@ def _chosen(world: World, seen: Seen, length: Length, rng: np.random.Generator) 
         for number, placed in enumerate(world.things)
         if placed.model is not None
         and (seen.taken.seen[number] > 0).mean() >= LEAST_SEEN[length]
+        and (placed.mesh.bounds[0] >= seen.bounds[0]).all()
+        and (placed.mesh.bounds[1] <= seen.bounds[1]).all()
         and placed.model.diameter >= LEAST_VOXELS * seen.fusion.voxel_m
     ]
     return sorted(rng.permutation(fit)[:MAX_CASES].tolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ _FRAMES: dict[Length, dict[int, int]] = {
 _VOXELS_M = {"room": (0.008, 0.014), "table": (0.004, 0.008), "shelf": (0.004, 0.009)}
 _ABOUT_M = {"room": 0.05, "table": 0.2, "shelf": 0.15}
 _FARTHEST_M = {"room": (3.0, 5.0), "table": (1.6, 2.2), "shelf": (2.0, 2.6)}
-"""Depths beyond are not fused, as one does whose interest is the table."""
+"""Depths beyond are dropped, as one does whose interest is the table."""
 _TRIES = 4
 _FEWER = 3
 """Times fewer images of another walk, from which objects are cut."""
@@ -54,6 +54,8 @@ def see(world: World, length: Length, again: int = 0) -> Seen:
     rng = np.random.default_rng([world.seed, 16, LENGTHS.index(length), again])
     scene = ExactScene([placed.mesh for placed in world.all])
     sensor = draw_sensor(rng)
+    farthest = min(sensor.farthest_m, rng.uniform(*_FARTHEST_M[world.kind]))
+    sensor = replace(sensor, farthest_m=farthest)
     frames = _FRAMES[length][sensor.size[0]] // (1 if again == 0 else _FEWER)
     name, poses = _some_walk(world, scene, (length, frames), rng)
     drift = draw_drift(rng) if length != "single" else 0.0
