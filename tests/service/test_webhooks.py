@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import ipaddress
 import json
 import threading
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from regnf_service.tokens import TokensError
 from regnf_service.webhooks.deliverer import Deliverer
 from regnf_service.webhooks.sender import HttpSender
 from regnf_service.webhooks.signing import read_secrets, signed_headers
-from regnf_service.webhooks.targets import AllowList, is_public
+from regnf_service.webhooks.targets import AllowList
 from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
 from regnf_state.redis.client import connect
@@ -128,80 +127,6 @@ def test_secrets_that_are_none_are_refused_without_repeating_them(entry: str) ->
 
 
 # where to
-
-
-@pytest.mark.parametrize(
-    ("url", "allowed"),
-    [
-        ("https://hooks.example.org/a?b=c", True),
-        ("https://HOOKS.example.org.:443/", True),
-        ("http://hooks.example.org/", False),
-        ("https://hooks.example.org:8443/", False),
-        ("https://evil.example.org/", False),
-        ("https://hooks.example.org.evil.org/", False),
-        ("https://hooks.example.org@evil.org/", False),
-        ("https://user@hooks.example.org/", False),
-        ("https://hooks.example.org/#part", False),
-        ("https://evil.org\\@hooks.example.org/", False),
-        ("https://hooks.example.org/\r\nX: y", False),
-        ("https://hooks.example.org:99999/", False),
-        ("https://hooks.example.org/" + "a" * 2000, False),
-        ("ftp://hooks.example.org/", False),
-        ("//hooks.example.org/", False),
-        ("http://127.0.0.1:9000/x", True),
-        ("http://127.1:9000/x", False),
-        ("http://[::ffff:127.0.0.1]:9000/x", True),
-        ("https://127.0.0.1:9000/x", False),
-        ("https://[::1", False),
-    ],
-)
-def test_only_hosts_on_the_list(url: str, allowed: bool) -> None:
-    assert AllowList(["hooks.example.org", "http://127.0.0.1:9000"]).allows(url) is allowed
-
-
-@pytest.mark.parametrize("entry", ["", "a b", "ftp://x", "https://x/path", "user@x", "x:notaport"])
-def test_entries_that_are_no_hosts(entry: str) -> None:
-    with pytest.raises(TokensError):
-        AllowList([entry])
-
-
-PRIVATE = ["127.0.0.1", "10.1.2.3", "172.16.0.1", "192.168.0.1", "169.254.169.254", "0.0.0.0", "100.64.0.1",
-           "224.0.0.1", "255.255.255.255", "::1", "::", "fe80::1%eth0", "fc00::1", "::ffff:10.0.0.1", "64:ff9b::a00:1",
-           "2002:a00:1::1", "ff02::1", "64:ff9b:1::a00:1", "fec0::1", "::127.0.0.1", "::a00:1", "5f00::1", "3fff::1",
-           "2001::1", "2001:db8::1", "100::1", "4000::1", "::ffff:0:7f00:1", "240.0.0.1", "198.18.0.1"]  # fmt: skip
-
-
-SPECIAL_V4 = ["0.0.0.0/8", "10.0.0.0/8", "100.64.0.0/10", "127.0.0.0/8", "169.254.0.0/16", "172.16.0.0/12",
-              "192.0.0.0/24", "192.0.2.0/24", "192.31.196.0/24", "192.52.193.0/24", "192.88.99.0/24", "192.168.0.0/16",
-              "192.175.48.0/24", "198.18.0.0/15", "198.51.100.0/24", "203.0.113.0/24", "224.0.0.0/4",
-              "240.0.0.0/4"]  # fmt: skip
-SPECIAL_V6 = ["::/96", "::ffff:0:0:0/96", "64:ff9b::/96", "64:ff9b:1::/48", "100::/64", "100:0:0:1::/64", "2001::/23",
-              "2001:db8::/32", "2002::/16", "2620:4f:8000::/48", "3fff::/20", "5f00::/16", "fc00::/7", "fe80::/10",
-              "fec0::/10", "ff00::/8"]  # fmt: skip
-PUBLIC = ["1.1.1.1", "9.255.255.255", "11.0.0.1", "93.184.215.14", "100.63.255.255", "100.128.0.1", "192.0.1.1",
-          "192.88.98.255", "192.88.100.1", "198.17.255.255", "223.255.255.255", "2001:200::1",
-          "2606:2800:21f:cb07:6820:80da:af6b:8b2c", "2001:4860:4860::8888", "2003::1", "::ffff:1.1.1.1"]  # fmt: skip
-
-
-@pytest.mark.parametrize("address", PRIVATE)
-def test_addresses_that_are_not_public(address: str) -> None:
-    assert not is_public(address)
-
-
-@pytest.mark.parametrize("address", PUBLIC)
-def test_addresses_that_are_public(address: str) -> None:
-    assert is_public(address)
-
-
-@pytest.mark.parametrize("network", SPECIAL_V4 + SPECIAL_V6)
-def test_networks_for_special_purposes_are_not_public(network: str) -> None:
-    """The registries of IANA, multicast and what nobody has been given; first, last and others of each."""
-    held = ipaddress.ip_network(network)
-    step = max(1, held.num_addresses // 97)
-    for place in {*range(0, held.num_addresses, step), held.num_addresses - 1, 8 % held.num_addresses}:
-        assert not is_public(str(held[place]))
-        if held.version == 4:
-            assert not is_public(f"::ffff:{held[place]}"), "nor as an IPv4 address within IPv6"
 
 
 def test_a_name_that_resolves_to_a_private_address_is_not_followed(redis: Redis, receiver: Receiver) -> None:

@@ -1,5 +1,12 @@
 """Records of jobs and fields for tests of record stores."""
 
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from redis import Redis
+
 from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord
 
@@ -28,3 +35,9 @@ def started(store: RecordStore, name: str = "j1") -> JobRecord:
 def finished(store: RecordStore, status: str, name: str = "j1") -> JobRecord:
     started(store, name)
     return store.update_job(name, 1, status=status, error={"reason": "WORKER_LOST"} if status == "failed" else None)
+
+
+def change(redis: Redis, key: str, **members: Any) -> None:
+    """Another release, or a fault, writes into a document."""
+    document = json.loads(redis.hget(key, "document") or "{}")  # type: ignore[arg-type]
+    redis.hset(key, "document", json.dumps(document | members))
