@@ -108,7 +108,8 @@ def _save_dense(taken: Capture, fusion: Fusion, bounds: Array, path: Path) -> No
     )
     height, width = taken.sensor.size
     K = taken.sensor.intrinsics
-    camera = o3d.camera.PinholeCameraIntrinsic(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    # Of this volume's images, whole numbers are the middles of pixels.
+    camera = o3d.camera.PinholeCameraIntrinsic(width, height, K[0, 0], K[1, 1], K[0, 2] - 0.5, K[1, 2] - 0.5)
     color = o3d.geometry.Image(np.zeros((height, width, 3), np.uint8))
     for depth, pose in zip(taken.depths[::every], taken.estimated[::every], strict=True):
         image = o3d.geometry.Image(np.ascontiguousarray(depth))
