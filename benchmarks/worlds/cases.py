@@ -15,7 +15,7 @@ from torch import Tensor
 from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.cases import Case
 from benchmarks.robust.symmetries import in_frame
-from benchmarks.worlds.making import WORLD, read_observation_grid
+from benchmarks.worlds.making import SCENE, WORLD, read_observation_grid
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
@@ -85,8 +85,8 @@ def _object(home: Path, number: int, kind: str, arrays: dict[str, Any], T_object
 def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
     field: SdfField
     told = world["scene"]
-    if told["kind"] == "tsdf":
-        field = open_field(home / "scene.safetensors")
+    if (home / SCENE).exists():
+        field = open_field(home / SCENE)
     else:
         with np.load(home / "scene.npz") as file:
             field = MeshField(file["vertices"], file["faces"])

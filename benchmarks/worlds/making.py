@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robust.library_objects import GIVEN
 from benchmarks.worlds.objects import ObjectMaker
 from benchmarks.worlds.observing import observation_of_walk
-from benchmarks.worlds.recipe import Scene, Seen, see
+from benchmarks.worlds.recipe import FROM_IMAGES, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.schema.observation_grid import ObservationGrid
 from regnf_data.worlds.detections import draw_box
@@ -26,14 +26,18 @@ from regnf_data.worlds.placing import Placed
 from regnf_data.worlds.rooms import World, make_world
 from regnf_data.worlds.split import part_of_world
 from regnf_data.worlds.walks import LENGTHS, Length
+from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.options import ReconstructionOptions
 
-WORLD = "world.json"
+WORLD, SCENE = "world.json", "scene.safetensors"
 MAX_CASES = 8
 LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
 """Of an object's surface, measured in some image: what was seen less is no case."""
 LEAST_VOXELS = 16.0
 """Across an object: what is smaller is no case."""
 _SCALES = (0.05, 20.0)
+_TRAINED = (0.03, 0.15)
+"""Shares of the iterations that an under-trained field is given."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
         T_object_model = similarity(rng, _SCALES)
         kind = maker.make(number, len(cases), rng)
         T_fused_room, spread = np.eye(4), 0.0
-        if task.scene == "tsdf":
+        if task.scene in FROM_IMAGES:
             points = _in_room(placed)
             T_fused_room, spread = seen.taken.carried(number, points)
         T_fused_model = T_fused_room @ placed.T_room_model
@@ -148,8 +152,14 @@ def _chosen(world: World, seen: Seen, length: Length, rng: np.random.Generator) 
 
 def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.random.Generator) -> dict[str, Any]:
     if scene == "tsdf":
-        fuse(seen.taken, seen.fusion, seen.bounds, home / "scene.safetensors")
+        fuse(seen.taken, seen.fusion, seen.bounds, home / SCENE)
         return {"kind": scene}
+    if scene in FROM_IMAGES:
+        options = ReconstructionOptions(observation_voxels=0)
+        if scene == "under-trained":
+            options = replace(options, iterations=int(options.iterations * rng.uniform(*_TRAINED)))
+        reconstruct(seen.taken.images(seen.bounds), FitFiles(home / SCENE), options, world.seed)
+        return {"kind": scene, "iterations": options.iterations}
     mesh = together(*(placed.mesh for placed in world.all))
     np.savez(home / "scene.npz", vertices=mesh.vertices, faces=mesh.faces)
     if scene == "mesh":

@@ -19,8 +19,10 @@ from regnf_data.worlds.rooms import World
 from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor
 from regnf_data.worlds.walks import LENGTHS, Length, walk
 
-Scene = Literal["tsdf", "mesh", "bent"]
-SCENES: tuple[Scene, ...] = ("tsdf", "mesh", "bent")
+Scene = Literal["tsdf", "fit", "under-trained", "mesh", "bent"]
+SCENES: tuple[Scene, ...] = ("tsdf", "fit", "under-trained", "mesh", "bent")
+FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "fit", "under-trained")
+"""Scenes that the poses' drift bends; the others are exact, or bent in another way."""
 _FRAMES: dict[Length, dict[int, int]] = {
     "long": {120: 150, 240: 90, 480: 40},
     "short": {120: 48, 240: 32, 480: 16},

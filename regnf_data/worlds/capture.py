@@ -15,20 +15,24 @@ from regnf_data.worlds.exact import ExactScene
 from regnf_data.worlds.mesh import Array
 from regnf_data.worlds.sensors import RandomSensor
 
+_GOLDEN = 0.618034
 _DEPTH_SHARE, _DEPTH_M = 0.01, 0.004
 """How far from a reading's exact depth a point may lie that counts as the one seen."""
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """depths: (N, H, W) float32 meters, 0 where nothing is read · poses: (N, 4, 4) true · errors: (N, 4, 4): the poses
+    """What N images show.
 
-    that a map is made with are E T · seen: for each group of points, (P,) in how many images each was measured ·
-    shows: for each group, (N,) how many of its points each image shows.
+    depths: (N, H, W) float32 meters, 0 where nothing is read · shades: (N, H, W) uint8, a gray a thing, lit from the
+    camera · poses: (N, 4, 4) true · errors: (N, 4, 4): the poses that a map is made with are E T · seen: for each group
+    of points, (P,) in how many images each was measured · shows: for each group, (N,) how many of its points each image
+    shows.
     """
 
     sensor: RandomSensor
     depths: NDArray[np.float32]
+    shades: NDArray[np.uint8]
     poses: Array
     errors: Array
     seen: tuple[NDArray[np.int64], ...]
@@ -40,11 +44,11 @@ class Capture:
         return self.errors @ self.poses
 
     def images(self, bounds: Array, every: int = 1) -> PosedImages:
-        """The images as a dataset's, with depths alone; bounds: (2, 3) of the world."""
+        """The images as a dataset's; bounds: (2, 3) of the world."""
         depths = self.depths[::every]
         poses = self.estimated[::every]
         return PosedImages(
-            colors=np.zeros((*depths.shape, 3), np.uint8),
+            colors=np.repeat(self.shades[::every, ..., None], 3, axis=-1),
             intrinsics=np.tile(self.sensor.intrinsics, (len(poses), 1, 1)),
             T_world_camera=poses,
             bounds=bounds,
@@ -73,16 +77,20 @@ def capture(
     points = np.concatenate([np.zeros((0, 3)), *(points for _, points in groups)])
     owners = np.repeat([thing for thing, _ in groups], np.diff(ends)).astype(np.int64)
     depths = np.zeros((len(poses), *sensor.size), np.float32)
+    shades = np.zeros(depths.shape, np.uint8)
     seen = np.zeros(len(points), np.int64)
     shows = np.zeros((len(groups), len(poses)), np.int64)
     for number, pose in enumerate(poses):
         view = scene.view(sensor.size, sensor.intrinsics, pose)
         depths[number] = sensor.measure(view, matter, rng)
+        shades[number] = np.where(
+            view.thing >= 0, 250.0 * view.cosine * (0.4 + 0.6 * (view.thing * _GOLDEN % 1.0)), 0.0
+        )
         now = _measured(points, owners, pose, sensor, (view.depth, view.thing, depths[number]))
         seen += now
         shows[:, number] = [now[a:b].sum() for a, b in pairwise(ends)]
     parts = tuple(seen[a:b] for a, b in pairwise(ends))
-    return Capture(sensor, depths, poses, errors, parts, tuple(shows))
+    return Capture(sensor, depths, shades, poses, errors, parts, tuple(shows))
 
 
 def _measured(
