@@ -17,7 +17,7 @@ from regnf_data.worlds.mesh import Array
 Principle = Literal["structured light", "time of flight", "stereo"]
 PRINCIPLES: tuple[Principle, ...] = ("structured light", "time of flight", "stereo")
 SIZES: tuple[Size, ...] = ((120, 160), (240, 320), (480, 640))
-_SIZE_SHARES = (0.55, 0.33, 0.12)
+_SIZE_SHARES = (0.3, 0.55, 0.15)
 PLAIN, BLACK, GLOSSY = 0, 1, 2
 _MATTER_SHARES = (0.82, 0.1, 0.08)
 _EDGE_M = 0.04
@@ -69,9 +69,9 @@ class RandomSensor:
         glossy = (patches > 0.0) | (view.cosine > 0.97)
         loss = np.maximum(loss, np.where((of_pixel == GLOSSY) & glossy, self.glossy_loss, 0.0))
         lost = (rng.random(shape) < loss) | (view.cosine < np.cos(np.radians(self.grazing_deg))) | (exact <= 0.0)
-        between = edge & (rng.random(shape) < self.mixed)
-        blurred = ndimage.uniform_filter(exact, 3)
-        seen = np.where(between & (blurred > 0.0), blurred, exact)
+        # Only where both sides are: nothing lies between a surface and no reading.
+        between = edge & (ndimage.minimum_filter(exact, 3) > 0.0) & (rng.random(shape) < self.mixed)
+        seen = np.where(between, ndimage.uniform_filter(exact, 3), exact)
         read = seen + self.deviation_m(seen) * self._grainy(shape, rng)
         read = self._rounded(read)
         lost |= (read < self.nearest_m) | (read > self.farthest_m)
@@ -109,7 +109,7 @@ def draw_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSen
         angles, reach, step, grain, mixed = (55.0, 62.0), (0.35, 5.0), rng.uniform(0.0008, 0.003), 1.2, 0.0
     elif principle == "time of flight":
         noise = (rng.uniform(0.001, 0.003), rng.uniform(0.0005, 0.002), rng.uniform(0.0, 0.0008))
-        angles, reach, step, grain, mixed = (62.0, 76.0), (0.2, 5.0), 0.001, 0.5, rng.uniform(0.2, 0.7)
+        angles, reach, step, grain, mixed = (62.0, 76.0), (0.2, 5.0), 0.001, 0.5, rng.uniform(0.03, 0.25)
     else:
         noise = (rng.uniform(0.0003, 0.001), 0.0, rng.uniform(0.001, 0.004))
         angles, reach, step, grain, mixed = (
