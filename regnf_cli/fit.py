@@ -67,6 +67,9 @@ def fit(
         bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")
     ] = False,
     start: Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")] = StartChoice.auto,
+    refine_poses: Annotated[
+        bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
+    ] = False,
     device: Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")] = DeviceChoice.auto,
 ) -> None:
     """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
@@ -83,9 +86,11 @@ def fit(
             or sdfstudio is not None
             or pictures
             or start is not StartChoice.auto
+            or refine_poses
             or device is not DeviceChoice.auto
         ):
-            raise InvalidOptionsError("--snapshots, --sdfstudio, --pictures, --start and --device are for images")
+            named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses and --device"
+            raise InvalidOptionsError(f"{named} are for images")
         settings = {"iterations": iterations} | ({} if hidden_width is None else {"hidden_width": hidden_width})
         _fit_mesh(source, output, settings, table_log2, extent, {"seed": seed, "label": label})
         return
@@ -93,7 +98,12 @@ def fit(
         raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
     from regnf_cli.fit_images import fit_images
 
-    choices: dict[str, Any] = {"iterations": iterations, "table_log2": table_log2, "start": start.value}
+    choices: dict[str, Any] = {
+        "iterations": iterations,
+        "table_log2": table_log2,
+        "start": start.value,
+        "refine_poses": refine_poses,
+    }
     choices |= {} if hidden_width is None else {"hidden_width": hidden_width}
     files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures}
     fit_images(source, output, choices, files, {"seed": seed, "label": label, "device": device.value})

@@ -48,8 +48,10 @@ def _cut(work: Work, things: tuple[Thing, ...]) -> None:
         cut_grid(fused, thing, work.object_file(thing, "grid"))
 
 
-def _fit(recording: Recording, work: Work, things: tuple[Thing, ...], only: list[str]) -> None:
-    options = ReconstructionOptions()
+def _fit(
+    recording: Recording, work: Work, things: tuple[Thing, ...], only: list[str], options: ReconstructionOptions
+) -> None:
+    """The things, and then the room unless things are named."""
     first, second = work.halves.frames(len(recording))
     for thing in things:
         if (not only or thing.name in only) and not work.object_file(thing, "fit").exists():
@@ -77,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--objects", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--only", nargs="+", default=[], help="names of things")
+    parser.add_argument("--iterations", type=int, default=ReconstructionOptions.iterations, help="of a fit")
+    parser.add_argument("--refine-poses", action="store_true", help="of a fit")
     parser.add_argument("--stages", action="store_true", help="find out which stage loses the truth")
     return parser
 
@@ -97,7 +101,8 @@ def main() -> None:
         elif given.command == "cut":
             _cut(work, things)
         elif given.command == "fit":
-            _fit(recording, work, things, given.only)
+            options = ReconstructionOptions(iterations=given.iterations, refine_poses=given.refine_poses)
+            _fit(recording, work, things, given.only, options)
         else:
             _register(work, things, wanted, runs)
     if runs:

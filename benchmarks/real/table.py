@@ -34,6 +34,10 @@ def errors(run: Run) -> str:
 def _stages(run: Run) -> str:
     names = ("truth_moves_to", "nearest_seed", "nearest_feature", "nearest_searched", "nearest_refined", "chosen")
     told = ", ".join(f"{name} {run[name]:.3f}" for name in names if name in run)
+    if "after_search_stages" in run:
+        pairs = zip(run["search_scores_truth"], run["search_scores_best"], strict=True)
+        told += ", search stages " + " ".join(f"{nearest:.2f}" for nearest in run["after_search_stages"])
+        told += ", truth's score against the best " + " ".join(f"{truth:.2f}/{best:.2f}" for truth, best in pairs)
     if "truth_reason" in run:
         scores = f"score {run['truth_score']:.3f} against {run['chosen_score']:.3f}"
         told += f", from the truth: {run['truth_verdict']} ({run['truth_reason']}), {scores}"

@@ -8,12 +8,15 @@ the nearest measured surface (as Ortiz et al. 2022, "iSDF") in place of the trun
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
 from regnf_core.fields.neus_facto import NeusFactoFunction
 from regnf_fit.images.depth_supervision import DepthSupervision
 from regnf_fit.images.options import ReconstructionOptions
+from regnf_fit.images.rays import PixelRays
 
 _MORE_MATTER = 0.3
 """What an error counts behind a surface, when a point is less deep than the ray says: the part may be thin."""
@@ -22,11 +25,18 @@ _PLACES_BEHIND = 0.25
 
 
 def depth_terms(
-    function: NeusFactoFunction, data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator
+    function: NeusFactoFunction,
+    data: DepthSupervision,
+    options: ReconstructionOptions,
+    generator: torch.Generator,
+    correct: Callable[[PixelRays], PixelRays] = lambda rays: rays,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The surface's term and that of free space, in diagonals, and the points (N, 3) on and near the surface."""
+    """The surface's term and that of free space, in diagonals, and the points (N, 3) on and near the surface.
+
+    correct: the rays by corrected poses, which the surface's term is differentiable by.
+    """
     chosen = _draw_rays(data, options, generator)
-    rays = data.rays.take(chosen)
+    rays = correct(data.rays.take(chosen))
     offsets = _offsets(data.before[chosen], data.behind[chosen], options.band_samples, generator)
     cosines = torch.where(rays.cosines > 0.0, rays.cosines, 1.0)
     depths = rays.depths[:, None] - offsets / rays.directions.norm(dim=1, keepdim=True)
@@ -40,7 +50,7 @@ def depth_terms(
     weight = torch.where((rays.cosines[:, None] <= 0.0) & (offsets != 0.0), 0.0, weight)
     surface = (weight * error.abs()).mean() / data.size
     free_space = (beyond - data.clearances[free]).abs().sum() / max(len(free), 1) / data.size
-    return surface, free_space, near.flatten(0, 1)
+    return surface, free_space, near.detach().flatten(0, 1)
 
 
 def _draw_rays(data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator) -> Tensor:

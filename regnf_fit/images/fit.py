@@ -6,7 +6,7 @@ import contextlib
 import hashlib
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,13 @@ def reconstruct(
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
+    held_out = prepared.held_out.to(torch_device)
+    pose_shift = None
+    if trainer.poses is not None:
+        write = replace(write, observation=observe(trainer.poses.corrected(images), options.observation_voxels))
+        with torch.no_grad():
+            held_out = trainer.poses.correct(held_out)
+        pose_shift = trainer.poses.median_shift()
     write(trainer.averaged, files.output)
     if files.pictures:
         _draw(trainer.averaged, prepared.bounds, files.output.with_suffix(".png"))
@@ -82,9 +89,13 @@ def reconstruct(
         write_sdfstudio(trainer.averaged, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
-    errors = evaluate(trainer.averaged, prepared.held_out.to(torch_device), prepared.size)
+    errors = evaluate(trainer.averaged, held_out, prepared.size)
     return ReconstructionReport(
-        loss=loss, iterations=options.iterations, seconds=time.monotonic() - started, **asdict(errors)
+        loss=loss,
+        pose_shift=pose_shift,
+        iterations=options.iterations,
+        seconds=time.monotonic() - started,
+        **asdict(errors),
     )
 
 

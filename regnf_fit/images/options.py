@@ -29,6 +29,8 @@ class LossWeights:
     rendered_depth: float = 2.0
     opacity: float = 0.1
     """Rays of the mask's background let through, the others not; without depth alone."""
+    poses: float = 0.001
+    """Mean square of the poses' corrections, in the deviations that are expected of them."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,12 @@ class ReconstructionOptions(NetworkOptions):
     averaging: float = 0.99
     """Decay of the moving average of the parameters, which is what is written; 0 for none."""
     start: Start = "auto"
+    refine_poses: bool = False
+    """Correct the cameras' poses with the field, where there are depths: by a rotation and a shift an image."""
+    pose_rate: float = 0.1
+    """Learning rate of the corrections, in the deviations that are expected of the poses."""
+    poses_from: float = 0.15
+    """The share of the iterations from which on poses are corrected: before it, the shape is too coarse."""
     observation_voxels: int = 160
     """Voxels along the longest side of the grid of what was observed, where there are depths; 0: none is kept."""
 
@@ -95,5 +103,7 @@ class ReconstructionReport:
     depth_error_median: float | None
     eikonal_error: float
     """Mean ||gradient| - 1| near the surface."""
+    pose_shift: float | None
+    """Median shift of the corrected cameras, field units; None: poses were not corrected."""
     iterations: int
     seconds: float

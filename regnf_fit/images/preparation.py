@@ -26,7 +26,8 @@ _START_RADIUS = 0.2
 @dataclass(frozen=True)
 class PreparedImages:
     """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
-    instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of depths, from image to image."""
+    instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of depths, from image to image ·
+    images: how many."""
 
     training: PixelRays
     held_out: PixelRays
@@ -37,6 +38,7 @@ class PreparedImages:
     boxes: tuple[OrientedBox, ...]
     pixel: float
     spread: DepthSpread
+    images: int
 
 
 def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> PreparedImages:
@@ -61,6 +63,7 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
         boxes=tuple(instance.box for instance in images.instances),
         pixel=float(1.0 / np.median(images.intrinsics[:, 0, 0])),
         spread=NO_SPREAD if planes is None else depth_spread(images, planes.cosines),
+        images=len(images),
     )
 
 

@@ -21,7 +21,8 @@ class PixelRays:
     A point at depth z lies at origins + z directions: directions (R, 3) are not of unit length, their part along the
     camera's axis is 1. near, far: (R,) depths between which the ray is inside the bounds · colors: (R, 3) in [0, 1] ·
     depths: (R,), 0 where none was measured · background: (R,) true where a mask says so · cosines: (R,) between ray
-    and surface normal, 0 where unknown · deviations: (R,) of the depths' noise, 0 where unknown.
+    and surface normal, 0 where unknown · deviations: (R,) of the depths' noise, 0 where unknown · images: (R,) the
+    number of each one's image.
     """
 
     origins: Tensor
@@ -33,6 +34,7 @@ class PixelRays:
     background: Tensor
     cosines: Tensor
     deviations: Tensor
+    images: Tensor
 
     def __len__(self) -> int:
         return self.origins.shape[0]
@@ -78,4 +80,5 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
         background=picked(None if images.masks is None else ~images.masks) > 0.5,
         cosines=picked(None if planes is None else planes.cosines),
         deviations=picked(None if planes is None else planes.deviations),
+        images=torch.from_numpy(image),
     )

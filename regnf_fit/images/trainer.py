@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_fit.images.camera_poses import CameraPoses, expected_errors
 from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
 from regnf_fit.images.depth_supervision import DepthSupervision, supervise
 from regnf_fit.images.depth_terms import depth_terms
@@ -19,6 +20,7 @@ from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import least_sharpness
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
+from regnf_fit.images.rays import PixelRays
 from regnf_fit.network import make_optimizer
 
 _SHARPEST = 50.0
@@ -59,6 +61,11 @@ class Trainer:
         networks += [field.feature_weight, field.feature_bias, field.background]
         sharpness = {"params": [field.log_sharpness], "lr": _SHARPNESS_RATE * options.network_rate}
         self.optimizer = make_optimizer(field.table, networks, options, sharpness)
+        self.poses: CameraPoses | None = None
+        if options.refine_poses and prepared.has_depth:
+            errors = expected_errors(prepared.spread, prepared.size)
+            self.poses = CameraPoses(prepared.images, errors).to(device)
+            self.optimizer.add_param_group({"params": [self.poses.steps], "lr": options.pose_rate})
         self._rates = [group["lr"] for group in self.optimizer.param_groups]
 
     def mean_loss(self) -> float:
@@ -105,12 +112,22 @@ class Trainer:
         if self._data is None:
             loss, near = self._color_alone()
             return loss + weights.eikonal * self._eikonal(function, near)
-        surface, free_space, near = depth_terms(function, self._data, self.options, self.generator)
+        surface, free_space, near = depth_terms(function, self._data, self.options, self.generator, self._correct)
         loss = weights.surface * surface + weights.free_space * free_space
+        if (poses := self._learning_poses()) is not None:
+            loss = loss + weights.poses * poses.prior()
         loss = loss + weights.eikonal * self._eikonal(function, near)
         if self.options.color_rays > 0:
             loss = loss + self._color(self._data)
         return loss
+
+    def _learning_poses(self) -> CameraPoses | None:
+        """The poses, where they are corrected in this iteration."""
+        return self.poses if self.iteration >= self.options.poses_from * self.options.iterations else None
+
+    def _correct(self, rays: PixelRays) -> PixelRays:
+        poses = self._learning_poses()
+        return rays if poses is None else poses.correct(rays)
 
     def _eikonal(self, function: NeusFactoFunction, near: Tensor) -> Tensor:
         half = self.options.eikonal_points // 2
@@ -125,7 +142,7 @@ class Trainer:
         """Color and rendered depth of rays with depth, L1 both."""
         options = self.options
         index = torch.randint(len(data.rays), (options.color_rays,), generator=self.generator).to(self._device)
-        rays = data.rays.take(index)
+        rays = self._correct(data.rays.take(index))
         depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
         rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
         color = (rendered.colors - rays.colors).abs().mean()
@@ -156,6 +173,7 @@ class Trainer:
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
+            **({} if self.poses is None else {"poses": self.poses.state_dict()}),
         }
 
     def resume(self, state: dict[str, Any]) -> None:
@@ -165,3 +183,5 @@ class Trainer:
         self.averaged.load_state_dict(state["averaged"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
+        if self.poses is not None:
+            self.poses.load_state_dict(state["poses"])

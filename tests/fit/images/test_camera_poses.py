@@ -1,0 +1,84 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from regnf_core.fields.build import open_field
+from regnf_core.geometry.exponential_map import rotation_exp
+from regnf_fit.images.camera_poses import CameraPoses, PoseErrors, expected_errors
+from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread
+from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.preparation import prepare
+from tests.fit.images import scenes
+from tests.fit.images.test_reconstruct import SMALL, StoppedError, surface_errors
+
+SHIFT, TURN = 0.025, 0.015
+OPTIONS = replace(SMALL, iterations=400, refine_poses=True)
+
+
+def astray(images, seed=0):
+    """The images with poses that err, but for the first one."""
+    rng = np.random.default_rng(seed)
+    poses = images.T_world_camera.copy()
+    for number in range(1, len(images)):
+        turn = rotation_exp(torch.from_numpy(TURN * rng.normal(size=3))).numpy()
+        poses[number, :3, :3] = turn @ poses[number, :3, :3]
+        poses[number, :3, 3] += SHIFT * rng.normal(size=3)
+    return replace(images, T_world_camera=poses)
+
+
+def test_corrections_move_rays_and_images_alike():
+    images = replace(scenes.images(count=3), bounds=np.array([[-2.0] * 3, [2.0] * 3]))  # which all rays meet
+    poses = CameraPoses(3, PoseErrors(0.1, 0.1))
+    with torch.no_grad():
+        poses.steps += torch.randn(poses.steps.shape, generator=torch.Generator().manual_seed(1))
+    rays = prepare(images, "auto", np.random.default_rng(0)).training
+    again = prepare(poses.corrected(images), "auto", np.random.default_rng(0)).training
+    moved = poses.correct(rays)
+    torch.testing.assert_close(moved.directions, again.directions, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(moved.origins, again.origins, atol=1e-5, rtol=0.0)
+    still = rays.images == 0
+    assert torch.equal(moved.origins[still], rays.origins[still])
+    assert not torch.equal(moved.origins[~still], rays.origins[~still])
+
+
+def test_poses_that_err_are_corrected(tmp_path):
+    true = scenes.images(count=12)
+    given = astray(true)
+    with_errors, corrected = tmp_path / "given.safetensors", tmp_path / "corrected.safetensors"
+    reconstruct(given, FitFiles(with_errors), replace(OPTIONS, refine_poses=False), device="cpu")
+    report = reconstruct(given, FitFiles(corrected), OPTIONS, device="cpu")
+    before, _ = surface_errors(open_field(with_errors), scenes.distance)
+    after, _ = surface_errors(open_field(corrected), scenes.distance)
+    assert after < 0.7 * before
+    assert report.pose_shift is not None
+    assert 0.3 * SHIFT < report.pose_shift < 4.0 * SHIFT
+
+
+def test_without_the_option_nothing_is_said_of_poses(tmp_path):
+    options = replace(OPTIONS, refine_poses=False, iterations=5)
+    assert reconstruct(scenes.images(), FitFiles(tmp_path / "f.safetensors"), options).pose_shift is None
+
+
+def test_an_interrupted_fit_goes_on_with_its_poses(tmp_path):
+    images = astray(scenes.images())
+    options = replace(OPTIONS, iterations=40)
+    whole, path, checkpoint = (tmp_path / name for name in ("whole.safetensors", "f.safetensors", "f.checkpoint"))
+    reconstruct(images, FitFiles(whole), options, device="cpu")
+
+    def stop(iteration, loss, seconds_left):
+        if iteration >= 25:
+            raise StoppedError
+
+    with pytest.raises(StoppedError):
+        reconstruct(images, FitFiles(path, checkpoint), options, device="cpu", progress=stop)
+    assert checkpoint.exists()
+    reconstruct(images, FitFiles(path, checkpoint), options, device="cpu")
+    assert path.read_bytes() == whole.read_bytes()
+
+
+def test_what_is_expected_of_poses():
+    found = expected_errors(DepthSpread(np.array([1.0, 2.0, 4.0]), np.array([0.01, 0.02, 0.08])), 3.0)
+    assert found == PoseErrors(0.02, 0.01)
+    assert expected_errors(NO_SPREAD, 3.0).shift == pytest.approx(0.003)
