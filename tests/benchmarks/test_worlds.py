@@ -1,0 +1,85 @@
+"""Worlds as files, their truth, and the tables made of their runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+
+from benchmarks.worlds.cases import cases_of
+from benchmarks.worlds.making import Task, make
+from benchmarks.worlds.tables import lost_at, lower_bound, markdown, success, upper_bound, wrong
+from regnf_core.errors import DatasetError
+from regnf_core.fields.observation import observation_of
+from regnf_core.schema.observation_grid import SURFACE
+from regnf_data.worlds.models import read_catalog
+from regnf_data.worlds.split import PARTS
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    """A folder with twelve things."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for number in range(12):
+        trimesh.creation.icosphere(radius=0.08 + 0.01 * number).export(folder / f"ball{number}.ply")
+    return folder
+
+
+def test_the_truth_puts_every_object_onto_the_scenes_surface(tmp_path: Path, meshes: Path) -> None:
+    task = Task(12, "single", "mesh", (meshes,), tmp_path / "worlds")
+    make(task)
+    made = list(cases_of(task.home))
+    assert made
+    for one in made:
+        truth = one.case.truth
+        assert truth is not None
+        placed = truth.inverse().apply(one.points)
+        off = one.case.scene.signed_distance(placed).abs() * float(truth.scale)
+        size = float(torch.pdist(one.points[::20]).max())
+        assert float(off.quantile(0.95)) < 1e-3 * size
+        assert one.case.detection.contains(placed, 1e-6).all()
+        seen = observation_of(one.case.scene)
+        assert seen is not None
+        assert float((seen.at(placed) == SURFACE).float().mean()) > 0.05
+    assert make(task).endswith("there")
+
+
+def test_parts_share_no_mesh_and_a_folder_without_meshes_is_named(tmp_path: Path, meshes: Path) -> None:
+    catalogs = [read_catalog([meshes], part) for part in PARTS]
+    drawn = [{*catalog.small, *catalog.big} for catalog in catalogs]
+    assert not (drawn[0] & drawn[1] | drawn[0] & drawn[2] | drawn[1] & drawn[2])
+    assert sum(map(len, drawn)) == 12
+    with pytest.raises(DatasetError, match="has no meshes"):
+        read_catalog([tmp_path / "absent"], "train")
+
+
+def run(**changes: object) -> dict[str, object]:
+    """A success, changed."""
+    facts = {"world": "w", "part": "train", "kind": "room", "length": "long", "walk": "long", "scene": "tsdf",
+             "sensor": "stereo", "pixels": "160x120", "case": 0, "object": "mug", "field": "mesh", "seen": 0.5,
+             "voxels_across": 30.0, "drift_spread": 0.0, "observed": True, "seconds": 1.0}  # fmt: skip
+    found = {"verdict": "registered", "reason": "SURFACES_AGREE", "mssd_share": 0.01, "listed_mssd": 0.01,
+             "near_mssd": 0.01, "searched_mssd": 0.02, "refined_mssd": 0.01, "truth_mssd": 0.01}  # fmt: skip
+    return facts | found | changes
+
+
+def test_a_run_is_lost_at_the_first_stage_without_a_right_pose() -> None:
+    assert lost_at(run()) == "none"
+    assert lost_at(run(verdict="rejected")) == "verdict"
+    assert lost_at(run(mssd_share=0.3, listed_mssd=0.3)) == "choice"
+    assert lost_at(run(mssd_share=0.3, listed_mssd=0.3, refined_mssd=0.3)) == "refinement"
+    assert lost_at(run(mssd_share=0.3, listed_mssd=0.3, refined_mssd=0.3, searched_mssd=0.3)) == "search"
+    assert success(run(verdict="ambiguous", mssd_share=0.3))
+    assert wrong(run(mssd_share=0.3))
+    text = markdown([run(), run(verdict="rejected"), run(length="short")])
+    assert "| long | 2 | 1/2 (50.0 %) |" in text
+
+
+def test_bounds_are_exact() -> None:
+    assert upper_bound(0, 3000) == pytest.approx(1.0 - 0.05 ** (1.0 / 3000))
+    assert lower_bound(60, 60) == pytest.approx(0.05 ** (1.0 / 60))
+    assert upper_bound(5, 5) == 1.0
+    assert lower_bound(0, 5) == 0.0
