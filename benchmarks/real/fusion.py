@@ -24,12 +24,17 @@ def fuse(recording: Recording, frames: Iterable[int], path: Path) -> None:
     """Write the fused map to ``path`` (.npz) and its surface beside it (.ply)."""
     core = open3d.core
     grid = open3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), VOXEL_M, _BLOCK, _BLOCKS
+        ("tsdf", "weight"),
+        (core.float32, core.float32),
+        (core.SizeVector(1), core.SizeVector(1)),
+        VOXEL_M,
+        _BLOCK,
+        _BLOCKS,
     )
-    camera = core.Tensor(recording.intrinsics)
+    camera = core.Tensor.from_numpy(recording.intrinsics)
     for frame in frames:
         image = open3d.t.geometry.Image(recording.depth(frame))
-        to_camera = core.Tensor(np.linalg.inv(recording.pose(frame)))
+        to_camera = core.Tensor.from_numpy(np.linalg.inv(recording.pose(frame)))
         blocks = grid.compute_unique_block_coordinates(image, camera, to_camera, 1.0, FARTHEST_M, TRUNCATION_VOXELS)
         grid.integrate(blocks, image, camera, to_camera, 1.0, FARTHEST_M, TRUNCATION_VOXELS)
     grid.save(str(path))

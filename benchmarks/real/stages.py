@@ -70,6 +70,7 @@ def _from_truth(setting: _Setting) -> dict[str, Any]:
     found = evaluate_candidates(setting.problem, held, setting.options)
     metrics = {f"truth_{name}": value for name, value in found.metrics.items() if isinstance(value, float)}
     return {
+        "truth_in_bound": bool(setting.problem.bound.admits(setting.truth[None]).all()),
         "truth_moves_to": setting.nearest(held.T[:1]),
         "truth_verdict": found.verdict,
         "truth_reason": found.reason,
@@ -86,11 +87,13 @@ def _search(setting: _Setting, seed: int) -> tuple[Sim3, dict[str, Any]]:
     matched = feature_seeds(view.foreground, model.samples, setting.options.robust.feature_draws, seed)
     poses, left, best, of_truth = Sim3.cat([seeds, matched]), [], [], []
     for stage in SEARCH.stages:
-        found = search_poses(view, model, poses, generator, [stage])
+        found = search_poses(view, model, poses, generator, problem.bound, [stage])
         poses = found.T
         left.append(setting.nearest(poses))
         best.append(float(found.scores.min()))
-        of_truth.append(float(search_poses(view, model, setting.truth[None], generator, [stage]).scores.min()))
+        of_truth.append(
+            float(search_poses(view, model, setting.truth[None], generator, problem.bound, [stage]).scores.min())
+        )
     return poses, {
         "nearest_seed": setting.nearest(seeds),
         "nearest_feature": setting.nearest(matched),
