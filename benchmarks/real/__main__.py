@@ -3,10 +3,10 @@
     python -m benchmarks.real fuse FRAMES WORK            both halves' maps, and what the second one's frames observed
     python -m benchmarks.real cut FRAMES WORK             the things of the first half as points and as grids
     python -m benchmarks.real fit FRAMES WORK             the things, and the second half's room, by regnf fit
-    python -m benchmarks.real register FRAMES WORK        one line a run, all of them in WORK/runs.json
-    python -m benchmarks.real report FRAMES WORK          the tables of WORK/runs.json
+    python -m benchmarks.real register FRAMES WORK        one line a run, all of them in WORK/runs.json (--runs NAME)
+    python -m benchmarks.real report FRAMES WORK          the tables of WORK/runs.json (--runs NAME ...)
 
-FRAMES is a folder that the reader gets for himself (docs/real-data.md). What lies in WORK is kept, but for runs.json.
+FRAMES is a folder that the reader gets for himself (docs/real-data.md). What lies in WORK is kept, but for the runs.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ def _fit(
         fit_room(recording, second, work, "B", options)
 
 
-def _register(work: Work, things: tuple[Thing, ...], wanted: Wanted, runs: list[Run]) -> None:
+def _register(work: Work, things: tuple[Thing, ...], wanted: Wanted, runs: list[Run], kept: Path) -> None:
     for run in register_all(work, things, wanted):
         runs.append(run)
         print(line(run), flush=True)
-        (work.folder / "runs.json").write_text(json.dumps(runs, indent=1) + "\n")
+        kept.write_text(json.dumps(runs, indent=1) + "\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -81,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", nargs="+", default=[], help="names of things")
     parser.add_argument("--iterations", type=int, default=ReconstructionOptions.iterations, help="of a fit")
     parser.add_argument("--refine-poses", action="store_true", help="of a fit")
+    parser.add_argument("--runs", nargs="+", default=["runs.json"], help="files of WORK that runs are kept in")
     parser.add_argument("--stages", action="store_true", help="find out which stage loses the truth")
     return parser
 
@@ -90,7 +91,7 @@ def main() -> None:
     given.work.mkdir(parents=True, exist_ok=True)
     recording, things = open_recording(given.frames), things_of(given.scene)
     if given.command == "report":
-        print(tables(json.loads((given.work / "runs.json").read_text())))
+        print(tables([run for name in given.runs for run in json.loads((given.work / name).read_text())]))
         return
     wanted = Wanted(given.maps, given.observations, given.objects, given.seeds, given.only, given.stages)
     runs: list[Run] = []
@@ -104,7 +105,7 @@ def main() -> None:
             options = ReconstructionOptions(iterations=given.iterations, refine_poses=given.refine_poses)
             _fit(recording, work, things, given.only, options)
         else:
-            _register(work, things, wanted, runs)
+            _register(work, things, wanted, runs, given.work / given.runs[0])
     if runs:
         print(tables(runs))
 
