@@ -21,8 +21,8 @@ _REACH_M = 0.1
 
 @dataclass(frozen=True)
 class Overlap:
-    """drift_m: the largest way that rigid alignment of the two maps moves a point of the thing, meters · seen_share:
-    of the thing's points that the other map has a surface near, after it."""
+    """drift_m: the largest way that rigid alignment of the two maps moves a point of the thing, meters, at most as far
+    as the alignment looks · seen_share: of the thing's points that the other map has a surface near, by the poses."""
 
     drift_m: float
     seen_share: float
@@ -46,8 +46,9 @@ def overlap(first: Path, second: Path, thing: Thing) -> Overlap:
     T = found.transformation
     moved = points @ T[:3, :3].T + T[:3, 3]
     target_tree = cKDTree(np.asarray(target.points))
-    distances = target_tree.query(moved)[0]
-    return Overlap(float(np.linalg.norm(moved - points, axis=1).max()), float((distances < _NEAR_M / 2.0).mean()))
+    distances = target_tree.query(points)[0]
+    drift = float(np.linalg.norm(moved - points, axis=1).max())
+    return Overlap(min(drift, _NEAR_M), float((distances < _NEAR_M).mean()))
 
 
 def _cloud(fused: Path, thing: Thing, margin: float) -> open3d.geometry.PointCloud:

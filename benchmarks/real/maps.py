@@ -14,6 +14,8 @@ from regnf_core import SdfField, Sim3
 from regnf_core.fields.observation import Observation, ObservedField
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.loading import open_field
+from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.depth_spread import depth_spread
 from regnf_fit.images.observing import observe
 
 MAPS = ("fused", "fit")
@@ -65,7 +67,9 @@ def fit_frame(fused: Path) -> Sim3:
 def keep_observation(recording: Recording, frames: range, files: MapFiles) -> None:
     """Write what the half's frames observed."""
     images = posed_images(recording, frames[::_EVERY], Sim3.identity(), bounds_of(files.fused), stride=2)
-    seen = observe(images, _VOXELS)
+    assert images.depths is not None
+    spread = depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
+    seen = observe(images, _VOXELS, spread)
     assert seen is not None
     np.savez_compressed(files.seen, states=seen.states.numpy(), low=seen.low.numpy(), voxel=seen.voxel)
 

@@ -16,6 +16,9 @@ from benchmarks.robust.judging import SUCCESS
 from benchmarks.robust.runs import Job, Run, run_one
 from regnf_core import RegistrationResult, SdfField
 
+_SHOWN = 0.5
+"""The share of a thing's surface that the other half must show; else nothing is asked of its registration but to be
+rejected."""
 _MISSING = float("inf")
 
 
@@ -80,5 +83,6 @@ def _register_one(case: Case, thing: Thing, common: Overlap, seed: int, with_sta
         "accepted": run["verdict"] in ("registered", "ambiguous"),
         "drift_m": common.drift_m,
         "seen_share": common.seen_share,
+        "shown": common.seen_share >= _SHOWN,
     }
     return run | found | (stages_of(case, seed) if with_stages else {})

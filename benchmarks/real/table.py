@@ -49,8 +49,9 @@ def tables(runs: Sequence[Run]) -> str:
     ordered = sorted(runs, key=lambda run: tuple(str(run[name]) for name in _GROUP))
     groups = [(key, list(part)) for key, part in groupby(ordered, key=lambda run: tuple(run[name] for name in _GROUP))]
     lines = [
-        "| halves | map | observation | object | runs | pose right | right within the drift | accepted and right "
-        "| accepted and right within the drift | registered and wrong beyond the drift | median seconds |",
+        "| halves | map | observation | object | shown in the map | pose right | right within the drift "
+        "| accepted and right | accepted and right within the drift | registered and wrong beyond the drift "
+        "| median seconds |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [f"| {' | '.join(key)} | {_counts(part)} |" for key, part in groups]
@@ -60,15 +61,17 @@ def tables(runs: Sequence[Run]) -> str:
 
 
 def _counts(runs: Sequence[Run]) -> str:
+    """Of the things that the map shows; wrong ones of all."""
     seconds = sorted(run["seconds"] for run in runs)[len(runs) // 2]
+    shown = [run for run in runs if run["shown"]]
     return " | ".join(
         str(value)
         for value in (
-            len(runs),
-            sum(run["right"] for run in runs),
-            sum(run["right_within_drift"] for run in runs),
-            sum(run["right"] and run["accepted"] for run in runs),
-            sum(run["right_within_drift"] and run["accepted"] for run in runs),
+            f"{len(shown)} of {len(runs)}",
+            sum(run["right"] for run in shown),
+            sum(run["right_within_drift"] for run in shown),
+            sum(run["right"] and run["accepted"] for run in shown),
+            sum(run["right_within_drift"] and run["accepted"] for run in shown),
             sum(not run["right_within_drift"] and run["verdict"] == "registered" for run in runs),
             f"{seconds:.1f}",
         )

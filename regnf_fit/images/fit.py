@@ -70,7 +70,7 @@ def reconstruct(
     rng = np.random.default_rng(seed)
     prepared = prepare(images, options.start, rng)
     trainer = Trainer(prepared, options, seed, torch_device, rng)
-    write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels))
+    write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels, prepared.spread))
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
@@ -78,7 +78,8 @@ def reconstruct(
     held_out = prepared.held_out.to(torch_device)
     pose_shift = None
     if trainer.poses is not None:
-        write = replace(write, observation=observe(trainer.poses.corrected(images), options.observation_voxels))
+        seen = observe(trainer.poses.corrected(images), options.observation_voxels, prepared.spread)
+        write = replace(write, observation=seen)
         with torch.no_grad():
             held_out = trainer.poses.correct(held_out)
         pose_shift = trainer.poses.median_shift()

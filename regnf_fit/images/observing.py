@@ -18,20 +18,25 @@ from regnf_core.fields.observation import Observation
 from regnf_core.schema.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.posed_images import PosedImages
+from regnf_fit.images.depth_normals import local_planes
+from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread, depth_spread
 
 _MARGIN = 1.0
 """Voxels before a measured surface that may be matter as well."""
+_SPREADS = 3.0
+"""The same in standard deviations of a depth, where the images contradict each other by more."""
 _PIXELS = 1.2
 """Widths of a pixel that a voxel is across at least: narrower ones would fall between the pixels' rays."""
 _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
 """So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
 
 
-def observe(images: PosedImages, voxels: int) -> Observation | None:
+def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -> Observation | None:
     """Carve the bounds (Kutulakos and Seitz 2000, "A Theory of Shape by Space Carving", with depths for colors): what
     a camera looked through is free, where a depth ends there is a surface, the rest is unobserved.
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
+    spread: of the depths from image to image; what is nearer to a measured surface than that is not seen to be free.
     Voxels are classified by their centers, in every image that shows them.
     """
     if images.depths is None or voxels == 0:
@@ -44,7 +49,8 @@ def observe(images: PosedImages, voxels: int) -> Observation | None:
     centers = torch.cartesian_prod(*axes).float()
     left = torch.arange(len(centers))
     for image in range(len(images)):
-        free = _looked_through(centers[left], images, image, _MARGIN * voxel)
+        margins = np.maximum(_SPREADS * spread.at(images.depths[image]), np.float32(_MARGIN * voxel))
+        free = _looked_through(centers[left], images, image, torch.from_numpy(margins))
         states[left[free]] = FREE
         left = left[~free]
     ends = torch.cat([_ends(images, image) for image in range(len(images))])
@@ -61,8 +67,8 @@ def _pixel_width(images: PosedImages) -> float:
     return float(np.median(widths)) if widths.size else 0.0
 
 
-def _looked_through(centers: Tensor, images: PosedImages, image: int, margin: float) -> Tensor:
-    """(N,) bool: which centers (N, 3) lie before what one image shows, by ``margin`` along the camera's axis."""
+def _looked_through(centers: Tensor, images: PosedImages, image: int, margins: Tensor) -> Tensor:
+    """(N,) bool: which centers (N, 3) lie before what one image shows, by margins (H, W) along the camera's axis."""
     assert images.depths is not None
     T = torch.from_numpy(np.linalg.inv(images.T_world_camera[image])).float()
     local = centers @ T[:3, :3].T + T[:3, 3]
@@ -74,7 +80,7 @@ def _looked_through(centers: Tensor, images: PosedImages, image: int, margin: fl
     at = shown.nonzero()[:, 0]
     places = row[at].long(), column[at].long()
     measured = torch.from_numpy(images.depths[image])[places]
-    free = (measured > 0.0) & (z[at] < measured - margin)
+    free = (measured > 0.0) & (z[at] < measured - margins[places])
     if images.masks is not None:
         free |= torch.from_numpy(~images.masks[image])[places]
     return torch.zeros_like(shown).index_put((at,), free)
@@ -97,7 +103,10 @@ def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Ob
     Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
     images saw one; FieldFormatError as :func:`regnf_core.fields.build.open_field`.
     """
-    seen = observe(images, voxels)
+    spread = NO_SPREAD
+    if images.depths is not None:
+        spread = depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
+    seen = observe(images, voxels, spread)
     if seen is None:
         raise DatasetError("an observation needs depths, and there are none", reason="DATASET_DEPTH_MISSING")
     _check_frame(open_field(path), seen)

@@ -11,6 +11,7 @@ import torch
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_fit.images.depth_spread import DepthSpread
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions
@@ -105,3 +106,16 @@ def test_voxels_are_no_narrower_than_pixels() -> None:
     assert seen is not None
     assert 400 * pixel > 1.2
     assert abs(seen.voxel / pixel - 1.2) < 1e-6
+
+
+def test_what_is_nearer_to_a_surface_than_the_noise_is_not_seen_to_be_free() -> None:
+    some, deviation = images(count=16, **SIZE), 0.03
+    sure, unsure = observe(some, VOXELS), observe(some, VOXELS, DepthSpread(np.array([1.0]), np.array([deviation])))
+    assert sure is not None
+    assert unsure is not None
+    assert torch.equal(sure.states == SURFACE, unsure.states == SURFACE)
+    assert not bool(((sure.states != FREE) & (unsure.states == FREE)).any())
+    lost = ((sure.states == FREE) & (unsure.states == UNSEEN)).numpy()
+    assert lost.any()
+    # a ray of these images is at most 1.25 times as long as its depth
+    assert distance(centers(lost.shape, sure.voxel)[lost]).max() < 1.25 * 3.0 * deviation + sure.voxel
