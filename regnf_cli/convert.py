@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from regnf_cli.camera_options import Axes, with_cameras
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
-from regnf_cli.paths import FIELD, folder
+from regnf_cli.paths import FIELD, existing, folder
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.field_source import FieldSource
 
@@ -48,6 +50,26 @@ def convert(
             metavar="FOLDER",
         ),
     ] = None,
+    cameras: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
+            "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
+            "image is needed.",
+            parser=existing,
+            metavar="PATH",
+        ),
+    ] = None,
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
+    ] = None,
+    axes: Annotated[
+        Axes | None,
+        typer.Option(
+            "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
+        ),
+    ] = None,
 ) -> None:
     """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
 
@@ -59,28 +81,43 @@ def convert(
         raise InvalidOptionsError(message, hint="The ending chooses the format.")
     if not output.parent.is_dir():
         raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
-    if images is not None and output.suffix.lower() != ".safetensors":
-        raise InvalidOptionsError("--images goes with a safe field (.safetensors)")
-    source = source_of(field, description, choice_of(config, no_config))
+    if (images or cameras) is not None and output.suffix.lower() != ".safetensors":
+        raise InvalidOptionsError("--images and --cameras go with a safe field (.safetensors)")
+    if images is not None and cameras is not None:
+        raise InvalidOptionsError("--images and --cameras: images tell more, give them alone")
+    said = with_cameras(description, intrinsics, None if axes is None else axes.value)
+    if said is not description and cameras is None:
+        raise InvalidOptionsError("--intrinsics and --camera-axes go with --cameras")
+    source = source_of(field, said, choice_of(config, no_config))
     if output.suffix.lower() == ".safetensors":
-        _to_safe_field(source, output, images)
+        _to_safe_field(source, output, images, cameras)
     else:
         _evaluated(source, output, resolution)
 
 
-def _to_safe_field(source: FieldSource, output: Path, images: Path | None) -> None:
+def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None) -> None:
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
-        with err.status("importing"), source.naming(), source.packed_settings() as settings:
+        with err.status("importing"), source.naming(), source.packed_settings() as settings, _packed(cameras) as stood:
             said = source.description or None
-            report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings)
+            report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings, cameras=stood)
         if images is not None:
             with err.status("recording which parts the cameras observed"):
                 _keep_what_was_seen(Path(scratch) / FIELD_NAME, images)
         os.replace(Path(scratch) / FIELD_NAME, output)
     _say(output, f"{report.family}, {report.parameters:,} parameters")
+    for why in report.why:
+        if why.startswith("observed"):
+            err.print(why, markup=False, soft_wrap=True)
     _warn(report.warnings)
+
+
+def _packed(cameras: Path | None) -> AbstractContextManager[Path | None]:
+    """The file of cameras that the gate gets."""
+    from regnf_core.importing.run.cameras_folder import packed_cameras
+
+    return nullcontext() if cameras is None else packed_cameras(cameras)
 
 
 def _keep_what_was_seen(field: Path, images: Path) -> None:

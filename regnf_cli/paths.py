@@ -36,6 +36,14 @@ def folder(text: str) -> Path:
     return path
 
 
+def existing(text: str) -> Path:
+    """The path of a file or a folder that is there. Raises InvalidInputError (FILE_NOT_FOUND)."""
+    path = Path(text)
+    if not path.is_dir():
+        require_file(path)
+    return path
+
+
 def library_path(text: str) -> Path:
     """A folder of fields, or a field. Raises what ``require_field_file`` does."""
     path = Path(text)

@@ -50,6 +50,10 @@ HINTS: dict[str, str] = {
     "SETTINGS_NOT_RECOGNIZED": "docs/import-gate.md lists the settings of each trainer.",
     "SETTINGS_UNSAFE": "Write the values themselves into the file, or say them in a description.",
     "SETTINGS_CONTRADICT_TENSORS": "Most often the settings are another run's. Give this checkpoint's own, or none.",
+    "CAMERAS_NOT_RECOGNIZED": "docs/import-gate.md lists the files of cameras that are read.",
+    "CAMERAS_INTRINSICS_MISSING": "With regnf convert: --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT.",
+    "CAMERAS_OF_ANOTHER_FRAME": "Give the trainer's settings, or dataset_transform in a description; or say which way "
+    "cameras look: cameras.axes, opencv or opengl.",
     "RAW_PICKLE": "Save it again with torch.save.",
     "INVALID_DETECTION": "docs/api.md shows every form of a detection.",
     "INVALID_OPTIONS": "docs/api.md lists every option with its range.",

@@ -78,6 +78,20 @@ class EncodingDescription:
 
 
 @dataclass(frozen=True)
+class CamerasDescription:
+    """What the file of cameras does not say of them."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    intrinsics: Annotated[list[Annotated[float, Gt(0), Le(1e6)]], Len(4, 4)] | None = None
+    """fx, fy, cx, cy of all images, in pixels."""
+    size: Annotated[list[Annotated[int, Ge(1), Le(100_000)]], Len(2, 2)] | None = None
+    """Width and height of the images, in pixels; without it, twice cx and cy."""
+    axes: Literal["opencv", "opengl"] | None = None
+    """opencv: a camera looks along its z axis, y is down. opengl: it looks against z, y is up."""
+
+
+@dataclass(frozen=True)
 class UploadDescription:
     """Overrides of what the gate would conclude by itself. None means: conclude it."""
 
@@ -138,11 +152,12 @@ class UploadDescription:
     """False: the network has a hash grid's columns, but was trained without it."""
     hash: GridDescription = field(default_factory=GridDescription)
     positional_encoding: EncodingDescription = field(default_factory=EncodingDescription)
+    cameras: CamerasDescription = field(default_factory=CamerasDescription)
 
     def non_default(self) -> dict[str, Any]:
         """The entries that say something, as plain (JSON) values."""
         values = asdict(self)
-        for name in ("hash", "positional_encoding"):
+        for name in ("hash", "positional_encoding", "cameras"):
             values[name] = {part: value for part, value in values[name].items() if value is not None}
         values["as"] = values.pop("as_")
         return {name: value for name, value in values.items() if value not in (None, {})}

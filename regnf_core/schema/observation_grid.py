@@ -19,9 +19,12 @@ OBSERVATION = "observation"
 UNSEEN, FREE, SURFACE = 0, 1, 2
 """A voxel's states: unobserved; seen to be free; a surface was measured in it."""
 _BITS, _PER_WORD = 2, 16
-_MAX_VOXELS = 512
-_Coordinate = Annotated[float, Ge(-1e6), Le(1e6)]  # which no NaN is
-_Count = Annotated[int, Ge(1), Le(_MAX_VOXELS)]
+MAX_COUNT = 512
+"""Voxels along an axis, at most."""
+FARTHEST = 1e6
+"""The largest coordinate."""
+_Coordinate = Annotated[float, Ge(-FARTHEST), Le(FARTHEST)]  # which no NaN is
+_Count = Annotated[int, Ge(1), Le(MAX_COUNT)]
 
 
 @dataclass(frozen=True)

@@ -131,3 +131,28 @@ def _refine_zero(
 def shortest_step(diagonal: float) -> float:
     """The shortest step of a march through a region with this diagonal."""
     return diagonal / _MIN_STEPS_ACROSS
+
+
+def free_lengths(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float) -> tuple[Tensor, Tensor]:
+    """How far every ray is free from its origin, (N,), and whether it ends at a surface there, (N,) bool.
+
+    0 for rays that start in matter and for those that miss the region; the exit where nothing is met. A ray that is
+    followed for too many steps is free as far as it came. The surface is where a line through the last two values is
+    zero: exact enough for voxels.
+    """
+    index = (exit_ > entry).nonzero().squeeze(-1)
+    free, meets = torch.zeros_like(entry), torch.zeros_like(entry, dtype=torch.bool)
+    t = entry[index]
+    s = _distance_along(field, rays, index, t)
+    index, t, s = index[s > 0], t[s > 0], s[s > 0]
+    for _ in range(_MAX_MARCH_STEPS):
+        if index.numel() == 0:
+            break
+        ahead = t + (_STEP_SHARE * s).clamp_min(min_step)
+        s_ahead = _distance_along(field, rays, index, ahead)
+        crossed, leaves = s_ahead <= 0, ahead >= exit_[index]
+        zero = t + (ahead - t) * (s / (s - s_ahead).clamp_min(1e-30))
+        free[index] = torch.where(crossed, zero, torch.minimum(ahead, exit_[index]))
+        meets[index] = crossed & (zero <= exit_[index])
+        index, t, s = (part[~crossed & ~leaves] for part in (index, ahead, s_ahead))
+    return free, meets

@@ -83,3 +83,27 @@ def test_what_images_have_seen_is_kept_with_the_field(run: Run, tmp_path: Path) 
     unsafe = run("convert", tmp_path / "scene.glb", tmp_path / "scene.ply", "--images", tmp_path / "images")
     assert (unsafe.code, "INVALID_OPTIONS" in unsafe.stderr) == (2, True)
     assert {path.name for path in tmp_path.iterdir()} <= {"scene.glb", "images", safe.name, "cache"}
+
+
+@pytest.mark.usefixtures("cache")
+def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=2, radius=0.5).export(tmp_path / "ball.glb")
+    # Half a turn about x: a camera at (0, 0, 1.5) that looks down on the ball.
+    poses = [f"{index} {0.1 * index} 0 1.5 1 0 0 0" for index in range(3)]
+    (tmp_path / "poses.txt").write_text("\n".join(poses))
+    said = ("--intrinsics", "100,100,64,48,128,96")
+    safe = tmp_path / "ball.safetensors"
+    outcome = run("convert", tmp_path / "ball.glb", safe, "--cameras", tmp_path / "poses.txt", *said)
+    assert outcome.code == 0, outcome.stderr
+    observation = observation_of(open_field(safe))
+    assert observation is not None
+    assert observation.at(torch.tensor([[0.0, 0.0, 0.499], [0.0, 0.0, -0.499], [0.0, 0.0, 0.0]])).tolist() == [2, 0, 0]
+    refusals = {
+        "CAMERAS_OF_ANOTHER_FRAME": ("--cameras", tmp_path / "poses.txt", *said, "--camera-axes", "opengl"),
+        "CAMERAS_INTRINSICS_MISSING": ("--cameras", tmp_path / "poses.txt"),
+        "INVALID_OPTIONS": said,
+    }
+    for reason, options in refusals.items():
+        outcome = run("convert", tmp_path / "ball.glb", safe, *options)
+        assert outcome.code != 0
+        assert reason in outcome.stderr

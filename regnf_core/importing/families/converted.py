@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
+import numpy.typing as npt
+
 from regnf_core.importing.arrays import StoredArray
+from regnf_core.schema.observation_grid import FREE, OBSERVATION, UNSEEN, ObservationGrid
 
 
 @dataclass(frozen=True)
@@ -70,3 +74,15 @@ def converted_of(
     first = readings[0]
     doubtful = readings if len(readings) > 1 or first.interpolation != "known" else ()
     return ConvertedField(family, why, first.description, first.tensors, warnings, doubtful)
+
+
+def observed_field(
+    field: ConvertedField, grid: ObservationGrid, words: npt.NDArray[np.int32], told: str
+) -> ConvertedField:
+    """The field with an observation. grid: of its kind's coordinates · words: the states as ``grid.pack`` gives them ·
+    told: what it is made from."""
+    states = np.bincount(grid.unpack(words).ravel(), minlength=3) / grid.voxels
+    told = f"observed {told}: {100 * states[FREE]:.0f} % of the volume is free, {100 * states[UNSEEN]:.0f} % unobserved"
+    changed = {**field.description, OBSERVATION: asdict(grid)}
+    tensors = {**field.tensors, OBSERVATION: words}
+    return replace(field, description=changed, tensors=tensors, why=(*field.why, told))

@@ -17,7 +17,7 @@ from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.safe_format import read_description
 
 FAMILY = "regnf"
-_OF_THE_IMPORT = frozenset({"family", "frame", "dataset_transform", "accept_implausible", "as"})
+_OF_THE_IMPORT = frozenset({"family", "frame", "dataset_transform", "accept_implausible", "as", "cameras"})
 """Entries that no field file has."""
 _OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}

@@ -21,6 +21,7 @@ _SHARED = frozenset(
         "dataset_transform",
         "accept_implausible",
         "as",
+        "cameras",
     }
 )
 """Entries that mean something for every family."""

@@ -1,9 +1,9 @@
 """The conversion itself, run in a throw-away process:
-``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS]``.
+``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS] [CAMERAS]``.
 
-Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings"}; standard output
-gets one JSON line: the report, or {"reason", "detail"} and perhaps "candidates". The field is written to
-OUT_DIR/field.safetensors, a picture beside it; of candidates too.
+Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings", "cameras"}, the last
+two the names of those files or null; standard output gets one JSON line: the report, or {"reason", "detail"} and perhaps
+"candidates". The field is written to OUT_DIR/field.safetensors, a picture beside it; of candidates too.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.gate.ambiguity import AmbiguousError
 from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
 from regnf_core.schema.kinds.voxel_grid import WEIGHTS
@@ -33,7 +34,7 @@ from regnf_core.schema.observation_grid import OBSERVATION
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
     from regnf_core.importing.families.converted import ConvertedField
-    from regnf_core.importing.gate.reading import Named
+    from regnf_core.importing.gate.reading import ReadUpload
     from regnf_core.importing.upload_description import UploadDescription
 
 FIELD_NAME = "field.safetensors"
@@ -61,32 +62,35 @@ def convert_file(
     description: dict[str, Any] | None,
     limits: ImportLimits,
     picture: bool = False,
-    settings: Named | None = None,
+    beside: Companions | None = None,
 ) -> dict[str, Any]:
     """Convert ``upload``, write the safe field, evaluate it once, draw it if asked to. Returns the report's values.
 
-    settings: the trainer's own, as the name and the path of one file or of an archive of files. Confines nothing: the
+    beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
     from regnf_core.importing.gate.cost_estimate import require_affordable
+    from regnf_core.importing.gate.observed import observed
     from regnf_core.importing.gate.placement import placed
     from regnf_core.schema.safe_format import add_to_source, write_safe_field
 
-    converted, said, used = _read(upload, out_dir, description, limits, settings)
+    read = _read(upload, out_dir, description, limits, beside or Companions())
+    converted = read.field
     _require_text(converted.description)
     require_affordable(converted, limits)
-    converted = placed(_settled(converted), said)
+    converted = placed(_settled(converted), read.description)
+    converted = observed(converted, read, limits, required=beside is not None and beside.cameras is not None)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors, _ROOM)
     parameters = sum(array.size for name, array in converted.tensors.items() if name not in _SEEN)
     family, why, warnings = converted.family, converted.why, converted.warnings
     kind = str(converted.description["kind"])
     bounds, label = converted.description["bounds"], converted.description["label"]
-    guessed = _Guess(None if _sign_is_said(converted, said) else int(converted.description["sign"]))
+    guessed = _Guess(None if _sign_is_said(converted, read.description) else int(converted.description["sign"]))
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
     drawn_to = out_dir / PICTURE_NAME if picture else None
-    measured, more = _evaluated(target, up_axis, drawn_to, None if said.accept_implausible else guessed)
+    measured, more = _evaluated(target, up_axis, drawn_to, None if read.description.accept_implausible else guessed)
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     warned = list(kept_warnings(_latest([*warnings, *more])))
@@ -100,19 +104,19 @@ def convert_file(
         "plausibility": measured,
         "warnings": warned,
         "label": label,
-        "settings": used,
+        "settings": read.settings,
     }
 
 
 def _read(
-    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
-) -> tuple[ConvertedField, UploadDescription, dict[str, Any] | None]:
+    upload: Path, out_dir: Path, description: dict[str, Any] | None, limits: ImportLimits, beside: Companions
+) -> ReadUpload:
     """What ``read_upload`` returns; nothing that it has unpacked is left, but what is mapped stays readable."""
     from regnf_core.importing.gate.reading import read_upload
     from regnf_core.importing.run.unpacking import remove_unpacked
 
     try:
-        return read_upload(upload, out_dir, description, limits, settings)
+        return read_upload(upload, out_dir, description, limits, beside)
     finally:
         remove_unpacked(out_dir)
 
@@ -206,12 +210,12 @@ def run(
     description: dict[str, Any] | None,
     limits: ImportLimits,
     picture: bool = False,
-    settings: Named | None = None,
+    beside: Companions | None = None,
 ) -> dict[str, Any]:
     """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
     started = time.monotonic()
     try:
-        return convert_file(upload, out_dir, description, limits, picture, settings)
+        return convert_file(upload, out_dir, description, limits, picture, beside)
     except AmbiguousError as error:
         if picture:
             _draw_asked(error, out_dir, limits.wall_s - (time.monotonic() - started))
@@ -239,8 +243,8 @@ def main(arguments: list[str]) -> int:
     threads = sniff_format(os.pread(opened[0], HEAD_BYTES, 0)) in _THREADED_FORMATS
     isolation = confine(limits, request["parent_pid"], opened, out_dir, threads)
     upload, *others = (Path(f"/proc/self/fd/{number}") for number in opened)
-    settings = (request["settings"], others[0]) if others else None
-    report = run(upload, out_dir, request["description"], limits, request["picture"], settings)
+    named = {part: (request[part], others.pop(0)) for part in ("settings", "cameras") if request[part] is not None}
+    report = run(upload, out_dir, request["description"], limits, request["picture"], Companions(**named))
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
     sys.stdout.flush()

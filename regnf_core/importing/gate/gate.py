@@ -55,21 +55,23 @@ def import_field(
     limits: ImportLimits | None = None,
     picture: bool = False,
     settings: Path | None = None,
+    cameras: Path | None = None,
 ) -> ImportReport:
     """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
     ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
     of the field in ``out_dir``/preview.png too, and in the error one of each function that the file may stand for, if
-    they can be made in good time. settings: the trainer's own, one file or an archive of several. The upload may be an
-    archive of a whole run; then it brings its settings along.
+    they can be made in good time. settings: the trainer's own, one file or an archive of several. cameras: where those
+    stood whose images the field was made from, likewise. The upload may be an archive of a whole run; then it brings
+    its settings along.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
     limits = limits or ImportLimits()
-    request = _request(description, limits, picture, settings)
-    files = [upload.resolve(strict=True), *([] if settings is None else [settings.resolve(strict=True)])]
+    request = _request(description, limits, picture, settings, cameras)
+    files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]
     out_dir.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     try:
@@ -105,7 +107,13 @@ def _import_once(
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: bool, settings: Path | None) -> bytes:
+def _request(
+    description: dict[str, Any] | None,
+    limits: ImportLimits,
+    picture: bool,
+    settings: Path | None,
+    cameras: Path | None,
+) -> bytes:
     try:
         request = {
             "description": description,
@@ -113,6 +121,7 @@ def _request(description: dict[str, Any] | None, limits: ImportLimits, picture: 
             "parent_pid": os.getpid(),
             "picture": picture,
             "settings": None if settings is None else settings.name[-_MAX_NAME:],
+            "cameras": None if cameras is None else cameras.name[-_MAX_NAME:],
         }
         text = json.dumps(request, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.observing.trajectory import Trajectory
     from regnf_core.importing.run.opened import OpenedUpload, SettingsFile
     from regnf_core.importing.settings.facts import Facts
     from regnf_core.importing.settings.translate import Settings
@@ -29,10 +31,29 @@ Named = tuple[str, Path]
 """What a file is called, and where it can be read."""
 
 
+@dataclass(frozen=True, eq=False)
+class ReadUpload:
+    """What was read. description: of caller and settings · settings: what the report says about the latter · cameras:
+    those that came, or those beside the checkpoint, unless there are none of either."""
+
+    field: ConvertedField
+    description: UploadDescription
+    settings: dict[str, Any] | None
+    cameras: Trajectory | None
+
+
+@dataclass(frozen=True)
+class Companions:
+    """Files that came with an upload: the trainer's settings, and where the cameras stood."""
+
+    settings: Named | None = None
+    cameras: Named | None = None
+
+
 def read_upload(
-    upload: Path, folder: Path, description: dict[str, Any] | None, limits: ImportLimits, settings: Named | None
-) -> tuple[ConvertedField, UploadDescription, dict[str, Any] | None]:
-    """The field in ``upload``, the description of caller and settings, and what the report says about the latter.
+    upload: Path, folder: Path, description: dict[str, Any] | None, limits: ImportLimits, beside: Companions
+) -> ReadUpload:
+    """The field in ``upload``, and what came with it.
 
     Large parts of archives are unpacked to ``folder``. Raises FieldFormatError with the reason of the refusing stage.
     """
@@ -42,14 +63,50 @@ def read_upload(
 
     said = UploadDescription.from_dict(description)
     opened = open_upload(_mapped(upload), folder, limits.file_bytes)
-    files = opened.settings
+    files, settings = opened.settings, beside.settings
+    trajectory = None if beside.cameras is None else _given_cameras(beside.cameras, folder, limits, said)
     if settings is not None:
         files = open_settings(_mapped(settings[1]), settings[0], folder, limits.file_bytes)
     required = settings is not None and len(files) == 1 and files[0].name == settings[0]
     translated = _Translation(files, said, description or {}, required)
     path = upload if opened.name is None else new_file(folder)
     converted = _convert(opened, path, translated, limits)
-    return translated.noted(converted, opened.name), translated.description, translated.settings.report()
+    converted = translated.noted(converted, opened.name)
+    if trajectory is None:
+        trajectory, converted = _found_cameras(files, translated.description, converted)
+    return ReadUpload(converted, translated.description, translated.settings.report(), trajectory)
+
+
+def _given_cameras(named: Named, folder: Path, limits: ImportLimits, said: UploadDescription) -> Trajectory:
+    """The cameras that came with the upload. Raises FieldFormatError: the CAMERAS_* reasons and those of archives."""
+    from regnf_core.importing.observing.reading import read_trajectory
+    from regnf_core.importing.observing.trajectory import MOST_CAMERAS
+    from regnf_core.importing.run.opened import open_settings
+
+    files = open_settings(_mapped(named[1]), named[0], folder, limits.file_bytes, MOST_CAMERAS)
+    return read_trajectory(files, said.cameras)
+
+
+def _found_cameras(
+    files: tuple[SettingsFile, ...], description: UploadDescription, converted: ConvertedField
+) -> tuple[Trajectory | None, ConvertedField]:
+    """The cameras in a run's settings, where the field's frame is known against theirs, or a warning."""
+    from regnf_core.importing.observing.reading import beside_checkpoint, read_trajectory
+
+    found = beside_checkpoint(files)
+    if not found or description.dataset_transform is None:
+        return None, converted
+    try:
+        return read_trajectory(found, description.cameras), converted
+    except FieldFormatError as error:
+        if error.reason in ("CAMERAS_NOT_RECOGNIZED", "CAMERAS_INTRINSICS_MISSING"):
+            return None, converted  # the file is there for other things
+        return None, with_unused_cameras(converted, str(error))
+
+
+def with_unused_cameras(converted: ConvertedField, why: str) -> ConvertedField:
+    """The field with a warning: cameras that cannot be used, or need not, are no reason to refuse it."""
+    return replace(converted, warnings=(*converted.warnings, f"CAMERAS_NOT_USED: {why}"))
 
 
 class _Translation:
@@ -77,8 +134,6 @@ class _Translation:
 
     def noted(self, converted: ConvertedField, name: str | None) -> ConvertedField:
         """The field, with what the settings decided among the evidence."""
-        from dataclasses import replace
-
         where = () if name is None else (f"the run's checkpoint is {name[-200:]}",)
         return replace(
             converted,

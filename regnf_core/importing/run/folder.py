@@ -74,11 +74,11 @@ def pack_settings(run: Run, into: Path) -> Path:
         raise FieldFormatError(message, reason="SETTINGS_TOO_LARGE")
     with tarfile.open(target, "w", format=tarfile.GNU_FORMAT, dereference=True) as archive:
         for path in run.settings[:MAX_FILES]:
-            archive.add(path, arcname=str(path.relative_to(top)), recursive=False, filter=_nameless)
+            archive.add(path, arcname=str(path.relative_to(top)), recursive=False, filter=nameless)
     return target
 
 
-def _nameless(member: tarfile.TarInfo) -> tarfile.TarInfo:
+def nameless(member: tarfile.TarInfo) -> tarfile.TarInfo:
     """Without the user's name and the file's times: the same settings are the same bytes."""
     member.uid = member.gid = member.mtime = 0
     member.uname = member.gname = ""

@@ -65,15 +65,20 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     )
 
 
-def open_settings(data: memoryview, name: str, folder: Path, most: int) -> tuple[SettingsFile, ...]:
-    """The one file of settings of the name ``name``, or those in an archive of settings. Raises as ``open_upload``."""
+def open_settings(
+    data: memoryview, name: str, folder: Path, most: int, files: int = MAX_FILES
+) -> tuple[SettingsFile, ...]:
+    """The one file of settings of the name ``name``, or the ``files`` at most in an archive of settings.
+
+    Raises as ``open_upload``.
+    """
     archive = None if name.lower().endswith(".npz") else _opened(data, most)
     if archive is None:
         if len(data) > MAX_SETTINGS_BYTES:
             raise _too_large(f"the settings have {len(data)} bytes")
         return (SettingsFile(name, data),)
-    if len(archive.sizes) > MAX_FILES:
-        raise _too_large(f"{len(archive.sizes)} files of settings; at most {MAX_FILES} are read")
+    if len(archive.sizes) > files:
+        raise _too_large(f"{len(archive.sizes)} files; at most {files} are read")
     _require_few(archive, tuple(archive.sizes))
     return tuple(SettingsFile(each, content) for each, content in archive.take(archive.sizes, folder).items())
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from regnf_core.importing.gate.convert import convert_file
+from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 
 
@@ -15,4 +16,4 @@ def convert(
     """The report of ``upload``, whose field is written below ``folder``."""
     folder.mkdir()
     named = None if settings is None else (settings.name, settings)
-    return convert_file(upload, folder, description, ImportLimits(), settings=named)
+    return convert_file(upload, folder, description, ImportLimits(), beside=Companions(settings=named))

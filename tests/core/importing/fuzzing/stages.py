@@ -16,6 +16,7 @@ from regnf_core.importing.families import convert_checkpoint
 from regnf_core.importing.gate import convert
 from regnf_core.importing.gate.cost_estimate import require_affordable
 from regnf_core.importing.gate.placement import placed
+from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.run.opened import SettingsFile
@@ -138,7 +139,8 @@ def _file(data: bytes, folder: Path) -> None:
     upload, out = folder / "upload", folder / "out"
     upload.write_bytes(data)
     try:
-        converted, said, _ = convert._read(upload, folder, None, _LIMITS, None)
+        read = convert._read(upload, folder, None, _LIMITS, Companions())
+        converted, said = read.field, read.description
         converted = placed(converted, said)
         convert._require_text(converted.description)
         require_affordable(converted, _LIMITS)

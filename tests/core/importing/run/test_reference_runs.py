@@ -20,6 +20,7 @@ import trimesh
 from regnf_core.fields.build import open_field
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
+from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.run.folder import find_run, pack_settings
 from tests.core.importing.archives import assert_refused, zip_bytes
@@ -37,7 +38,7 @@ def with_settings(folder: Path, out: Path, said: dict[str, Any] | None = None) -
     """The report of the run in ``folder``, its settings packed as for the gate."""
     run = find_run(folder)
     packed = pack_settings(run, out)
-    return convert_file(run.checkpoint, out, said, ImportLimits(), settings=(packed.name, packed))
+    return convert_file(run.checkpoint, out, said, ImportLimits(), beside=Companions(settings=(packed.name, packed)))
 
 
 def zipped(folder: Path) -> bytes:
@@ -163,6 +164,8 @@ def test_another_run_s_settings_are_refused(tmp_path: Path) -> None:
     checkpoint = find_run(dev_data("formats", "neuralangelo")).checkpoint
     other = find_run(dev_data("formats", "instant_nsr_pl")).settings[0]
     assert_refused(
-        lambda: convert_file(checkpoint, tmp_path, None, ImportLimits(), settings=(other.name, other)),
+        lambda: convert_file(
+            checkpoint, tmp_path, None, ImportLimits(), beside=Companions(settings=(other.name, other))
+        ),
         "FAMILY_NOT_SUPPORTED",
     )

@@ -1,0 +1,51 @@
+"""What was observed of a converted field, by what tells it: its own file, where its cameras stood, or its weights."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.converted import observed_field
+from regnf_core.importing.gate.reading import with_unused_cameras
+from regnf_core.schema.observation_grid import OBSERVATION
+
+if TYPE_CHECKING:
+    from regnf_core.importing.families.converted import ConvertedField
+    from regnf_core.importing.gate.reading import ReadUpload
+    from regnf_core.importing.gate.report import ImportLimits
+    from regnf_core.importing.observing.trajectory import Trajectory
+
+
+def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, required: bool) -> ConvertedField:
+    """The field with an observation, if anything tells. required: the caller has asked for that of the cameras.
+
+    A map's own weights go before all else: they know of depths that were missing, through which lines of sight would
+    pass. Then come cameras that were asked for, then an observation in the file, then cameras found beside it, if they
+    can be used. Raises FieldFormatError as ``observed_by_cameras`` does, if ``required``.
+    """
+    from regnf_core.importing.observing.by_weights import observed_by_weights
+
+    found = observed_by_weights(converted.description, converted.tensors)
+    if found is not None:
+        if required:
+            converted = with_unused_cameras(converted, "the map's weights say what was observed, and they tell more")
+        return observed_field(converted, *found, "by the weights of the map")
+    if read.cameras is None or (converted.description.get(OBSERVATION) is not None and not required):
+        return converted
+    try:
+        return _by_cameras(converted, read, read.cameras, limits)
+    except FieldFormatError as error:
+        if required:
+            raise
+        return with_unused_cameras(converted, str(error))
+
+
+def _by_cameras(
+    converted: ConvertedField, read: ReadUpload, cameras: Trajectory, limits: ImportLimits
+) -> ConvertedField:
+    from regnf_core.importing.gate.plausibility import without_new_code  # loads torch
+    from regnf_core.importing.observing.by_cameras import observed_by_cameras
+
+    with without_new_code():
+        found = observed_by_cameras(converted.description, converted.tensors, cameras, read.description, limits.work_s)
+    return observed_field(converted, *found, f"by lines of sight from {len(cameras)} cameras")

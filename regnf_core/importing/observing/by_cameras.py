@@ -1,0 +1,84 @@
+"""The observation of a field by where its cameras stood: their frame is found, and lines of sight are followed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.build import build_field
+from regnf_core.importing.arrays import StoredArray
+from regnf_core.importing.cost.calls import Calls
+from regnf_core.importing.gate.cost_estimate import seconds_of
+from regnf_core.importing.observing.trajectory import Array, Trajectory
+from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
+from regnf_core.schema.parsing import parse_description
+from regnf_core.surface.observing import observe_by_cameras
+
+Observed = tuple[ObservationGrid, npt.NDArray[np.int32]]
+_SHARE = 0.5
+"""Of the seconds that the checks may take; as many again may go into this."""
+_MOST_POINTS, _LEAST_POINTS = 5_000_000, 60_000
+_ASKED = 1 << 14
+
+
+def observed_by_cameras(
+    description: Mapping[str, Any],
+    tensors: Mapping[str, StoredArray],
+    trajectory: Trajectory,
+    said: UploadDescription,
+    work_s: float,
+) -> Observed:
+    """What the cameras saw of the field of ``description``, as its file keeps it, within an estimated time.
+
+    Raises FieldFormatError: CAMERAS_OF_ANOTHER_FRAME, IMPORT_TOO_COSTLY, FIELD_NOT_FINITE.
+    """
+    own = {name: array for name, array in tensors.items() if name != OBSERVATION}
+    points = _points(description, own, work_s)
+    field = _own_field(description, own)
+    cameras = trajectory.pinhole().moved(torch.from_numpy(_into_function(description, trajectory, said)))
+    try:
+        return observe_by_cameras(field, cameras, points).stored()
+    except InvalidInputError as error:
+        raise FieldFormatError(str(error), reason=error.reason) from error
+
+
+def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], work_s: float) -> int:
+    """How many points may be evaluated. Raises FieldFormatError (IMPORT_TOO_COSTLY) for too few."""
+    plain = {**description, OBSERVATION: None}
+    asked = seconds_of(plain, tensors, Calls((_ASKED,), ()))
+    points = int(min(_MOST_POINTS, _SHARE * work_s * _ASKED / max(asked, 1e-9)))
+    if points < _LEAST_POINTS:
+        message = f"lines of sight take {_LEAST_POINTS} evaluations at least; there is time for an estimated {points}"
+        raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
+    return points
+
+
+def _own_field(description: Mapping[str, Any], tensors: Mapping[str, StoredArray]) -> SdfField:
+    """The field in the coordinates of its kind's function, which are those of an observation."""
+    parsed = parse_description(dict(description))
+    plain = replace(parsed, bounds=parsed.function_bounds, world_scale=1.0, placement=None, observation=None)
+    return build_field(plain, {name: torch.from_numpy(np.ascontiguousarray(each)) for name, each in tensors.items()})
+
+
+def _into_function(description: Mapping[str, Any], trajectory: Trajectory, said: UploadDescription) -> Array:
+    """(4, 4), from the file's world to the function's coordinates.
+
+    The file's cameras are in the dataset's frame where that is known, else in that of the field.
+    """
+    if said.dataset_transform is not None:
+        known = np.linalg.inv(np.array(said.dataset_transform, np.float64))
+        return known if trajectory.T_dataset_file is None else known @ trajectory.T_dataset_file
+    scale = np.diag([1.0 / description["world_scale"]] * 3 + [1.0])
+    placement = description.get("placement")
+    if placement is None:
+        return scale
+    known = scale @ np.linalg.inv(np.array(placement["transform"], np.float64))
+    return known if trajectory.T_dataset_file is None else known @ trajectory.T_dataset_file

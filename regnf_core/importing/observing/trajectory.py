@@ -1,0 +1,111 @@
+"""Where the cameras of a run stood, as files say it: poses and intrinsics, checked, in one convention."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from regnf_core.errors import FieldFormatError
+
+if TYPE_CHECKING:
+    from regnf_core.geometry.pinhole import PinholeCameras
+
+Array = npt.NDArray[np.float64]
+Axes = Literal["opencv", "opengl"]
+"""opencv: x right, y down, z forward. opengl: x right, y up, z backward."""
+MOST_CAMERAS = 20_000
+_FARTHEST = 1e6
+_NOT_RIGID = 0.02
+"""How far a pose's axes may be from unit length and from right angles."""
+_FIELD_OF_VIEW = (0.05, 50.0)
+"""Focal lengths over the image's size that some lens has."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Of one camera, in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """poses: (N, 4, 4), camera to the file's world, opencv · focal, middle: (N, 2), over the image's width and height ·
+    aspect: (N,) · T_dataset_file: (4, 4), from the file's world to the dataset's, where they differ."""
+
+    poses: Array
+    focal: Array
+    middle: Array
+    aspect: Array
+    T_dataset_file: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def pinhole(self) -> PinholeCameras:
+        """The cameras in the file's world."""
+        import torch
+
+        from regnf_core.geometry.pinhole import PinholeCameras
+
+        parts = (self.poses[:, :3, 3], self.poses[:, :3, :3], self.focal, self.middle, self.aspect)
+        return PinholeCameras(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
+
+
+def trajectory_of(
+    name: str,
+    poses: Array,
+    intrinsics: list[Intrinsics] | Intrinsics,
+    axes: Axes,
+    T_dataset_file: Array | None = None,
+) -> Trajectory:
+    """Checked. poses: (N, 4, 4), by ``axes``; those with numbers that are not finite, of lost cameras, are left out.
+
+    Raises FieldFormatError (CAMERAS_MALFORMED) naming ``name``, the file.
+    """
+    each = [intrinsics] * len(poses) if isinstance(intrinsics, Intrinsics) else intrinsics
+    kept = np.isfinite(poses).all(axis=(1, 2))
+    poses = poses[kept].copy()
+    if not len(poses):
+        raise malformed(f"{name} holds no camera's pose")
+    if axes == "opengl":
+        poses[:, :, 1:3] *= -1.0
+    _require_rigid(name, poses)
+    K = np.array([[one.fx, one.fy, one.cx, one.cy, one.width, one.height] for one in each], np.float64)[kept]
+    size = K[:, 4:6]
+    with np.errstate(all="ignore"):
+        focal, middle, aspect = K[:, :2] / size, K[:, 2:4] / size, size[:, 0] / size[:, 1]
+    low, high = _FIELD_OF_VIEW
+    sound = (size > 0).all(1) & (focal > low).all(1) & (focal < high).all(1)
+    sound &= (np.abs(middle - 0.5) <= 1.0).all(1) & (aspect > 0.05) & (aspect < 20.0)
+    if not sound.all():
+        raise malformed(f"{name}: the intrinsics of camera {int(np.flatnonzero(~sound)[0])} are no camera's")
+    return Trajectory(poses, focal, middle, aspect, T_dataset_file)
+
+
+def _require_rigid(name: str, poses: Array) -> None:
+    axes = poses[:, :3, :3]
+    off = np.abs(axes.transpose(0, 2, 1) @ axes - np.eye(3)).max(axis=(1, 2))
+    wrong = (off > _NOT_RIGID) | (np.linalg.det(axes) <= 0) | (np.abs(poses[:, :3, 3]).max(axis=1) > _FARTHEST)
+    wrong |= np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1) > 1e-6
+    if wrong.any():
+        raise malformed(f"{name}: pose {int(np.flatnonzero(wrong)[0])} is no rotation and place")
+
+
+def malformed(message: str) -> FieldFormatError:
+    """The error for cameras that break their format."""
+    return FieldFormatError(message, reason="CAMERAS_MALFORMED")
+
+
+def without_intrinsics(name: str) -> FieldFormatError:
+    """The error for poses whose file does not say how wide the cameras' view is."""
+    message = f"{name} has no intrinsics: say them, cameras.intrinsics [fx, fy, cx, cy] and cameras.size"
+    return FieldFormatError(message, reason="CAMERAS_INTRINSICS_MISSING")

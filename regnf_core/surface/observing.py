@@ -1,0 +1,171 @@
+"""What cameras observed of a field that was made from their images: told by where they stood, without the images.
+
+A ray of sight ends at the field's first surface. What lies before is free, a surface to which one leads was observed,
+and what lies behind was not. Surface that a field has invented is behind what was observed, or it would be in the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation
+from regnf_core.geometry.pinhole import PinholeCameras
+from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.surface.projection import project_to_surface
+from regnf_core.surface.sphere_tracing import finite_distance
+from regnf_core.surface.surface_cells import Cells, surface_cells
+from regnf_core.surface.traced_depths import TracedDepths, free_depths, trace_depths
+
+_BASE = 40
+"""Voxels along the longest side of what was seen, before they are halved."""
+_POINTS_A_RAY = 12
+_RAYS_SHARE = 0.4
+"""Of all evaluations, those for the images' rays. The surface's voxels take about as many, and the rest is for single
+points."""
+_POINTS_HALVED = (400_000, 2_500_000)
+"""With so many evaluations and more the voxels are halved, once and twice."""
+_MOST_CAMERAS, _RAYS_EACH = 128, 400
+"""Cameras that are used at most; rays of each at least, where there are so many."""
+_MARGIN = 1.0
+"""Voxels before a surface that may be matter as well."""
+_CLOSE = 0.5
+"""Voxels behind the least depth of the rays round it at which a point is seen all the same."""
+_TRIES = 4
+"""Cameras that a single point is looked for from."""
+_SEEING = 0.02
+"""A camera sees the field where so large a share of its rays ends at a surface; half of the cameras have to."""
+_SLOPE = 0.2
+
+
+def observe_by_cameras(field: SdfField, cameras: PinholeCameras, points: int) -> Observation:
+    """What the cameras, in the field's frame, observed within its bounds.
+
+    points: evaluations of the field, about; fewer make voxels larger, and images coarser. Deterministic.
+    Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most of them see nothing of the field.
+    """
+    rays = int(_RAYS_SHARE * points / _POINTS_A_RAY)
+    chosen = cameras.evenly(max(1, min(_MOST_CAMERAS, rays // _RAYS_EACH)))
+    images = trace_depths(field, chosen, max(4, rays // len(chosen)))
+    ends = _ends(chosen, images)
+    grid = _grid_round(ends, field.bounds, sum(points >= enough for enough in _POINTS_HALVED))
+    states = torch.full(grid.counts, UNSEEN, dtype=torch.uint8).view(-1)
+    cells, _ = surface_cells(_value(field), grid.low, grid.high, max(grid.counts) >> grid.halvings, grid.halvings)
+    states[_looked_through(grid.middles(), chosen, images, _MARGIN * grid.voxel)] = FREE
+    near = grid.index(cells.centers)
+    states[near[cells.values < 0]] = UNSEEN
+    states[near[_seen_surface(field, cells, chosen, images)]] = SURFACE
+    states[grid.index(ends)] = SURFACE
+    return Observation(states.view(grid.counts), grid.low, grid.voxel)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Where the voxels are: their lowest corner (3,), counts and edge; they are halves of halves of larger ones."""
+
+    low: Tensor
+    counts: list[int]
+    voxel: float
+    halvings: int
+
+    @property
+    def high(self) -> Tensor:
+        """The highest corner (3,)."""
+        return self.low + torch.tensor(self.counts) * self.voxel
+
+    def middles(self) -> Tensor:
+        """Of all voxels, (N, 3) float32."""
+        axes = [self.low[k] + (torch.arange(self.counts[k], dtype=torch.float64) + 0.5) * self.voxel for k in range(3)]
+        return torch.cartesian_prod(*axes).float()
+
+    def index(self, points: Tensor) -> Tensor:
+        """The numbers of the voxels of points (M, 3), which lie within the grid but for rounding."""
+        cell = ((points - self.low) / self.voxel).floor().long()
+        x, y, z = torch.minimum(cell.clamp_min(0), torch.tensor(self.counts) - 1).unbind(-1)
+        return (x * self.counts[1] + y) * self.counts[2] + z
+
+
+def _grid_round(ends: Tensor, bounds: Tensor, halvings: int) -> _Grid:
+    """Voxels round all points (M, 3) at which rays end, within the bounds (2, 3)."""
+    low, high = ends.amin(0), ends.amax(0)
+    edge = float((high - low).max()) / (_BASE - 2)
+    low, high = torch.maximum(low - edge, bounds[0]), torch.minimum(high + edge, bounds[1])
+    counts = ((high - low) / edge - 1e-9).ceil().clamp_min(1)
+    low = (low + high) / 2 - counts * edge / 2
+    return _Grid(low, [int(count) << halvings for count in counts], edge / 2**halvings, halvings)
+
+
+def _ends(cameras: PinholeCameras, images: list[TracedDepths]) -> Tensor:
+    """(M, 3) float64 where rays end at a surface. Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME)."""
+    found = []
+    for camera, image in enumerate(images):
+        if float(image.meets.float().mean()) >= _SEEING:
+            depths = image.free[image.meets].double()[:, None]
+            found.append(cameras.positions[camera] + depths * cameras.directions(camera, image.places()[image.meets]))
+    if 2 * len(found) < len(images):
+        raise FieldFormatError(
+            f"{len(images) - len(found)} of {len(images)} cameras stand within matter or see no surface of the field:"
+            " are they of the same scene, in the same frame?",
+            reason="CAMERAS_OF_ANOTHER_FRAME",
+        )
+    return torch.cat(found)
+
+
+def _looked_through(points: Tensor, cameras: PinholeCameras, images: list[TracedDepths], margin: float) -> Tensor:
+    """(N,) bool: which points (N, 3) a camera looked through, before all of the rays round them by ``margin``."""
+    through = torch.zeros(len(points), dtype=torch.bool)
+    left = torch.arange(len(points))
+    for camera, image in enumerate(images):
+        places, depth = cameras.project(camera, points[left])
+        at = _shown(places, depth).nonzero()[:, 0]
+        at = at[depth[at] < image.around(places[at])[0] - margin]
+        through[left[at]] = True
+        left = left[~through[left]]
+    return through
+
+
+def _seen_surface(field: SdfField, cells: Cells, cameras: PinholeCameras, images: list[TracedDepths]) -> Tensor:
+    """(N,) bool: which cells hold surface that a line of sight leads to."""
+    points = project_to_surface(field.signed_distance_and_gradient, cells.centers.float(), 1, _SLOPE).points
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    tries = torch.zeros(len(points), dtype=torch.uint8)
+    left = torch.arange(len(points))
+    doubtful: list[tuple[int, Tensor]] = []
+    for camera, image in enumerate(images):
+        places, depth = cameras.project(camera, points[left])
+        at = _shown(places, depth).nonzero()[:, 0]
+        least, largest = image.around(places[at])
+        before = depth[at] - _CLOSE * cells.edge
+        seen[left[at[before <= least]]] = True
+        doubtful.append((camera, left[at[(before > least) & (before <= largest)]]))
+        left = left[~seen[left]]
+    for camera, asked in doubtful:
+        asked = asked[~seen[asked] & (tries[asked] < _TRIES)]
+        tries[asked] += 1
+        seen[asked] = _sees(field, cameras.positions[camera], points[asked], _CLOSE * cells.edge)
+    return seen
+
+
+def _sees(field: SdfField, position: Tensor, points: Tensor, close: float) -> Tensor:
+    """(M,) bool: to which points (M, 3) the straight line from ``position`` is free, but for the last ``close``."""
+    directions = points.double() - position
+    if len(directions) == 0:
+        return torch.zeros(0, dtype=torch.bool)
+    free, _ = free_depths(field, position, directions)
+    sees: Tensor = free >= 1.0 - close / directions.norm(dim=-1)
+    return sees
+
+
+def _shown(places: Tensor, depth: Tensor) -> Tensor:
+    """(M,) bool: which image coordinates (M, 2) lie in the image, before the camera."""
+    shown: Tensor = (depth > 0.0) & (places >= 0.0).all(-1) & (places < 1.0).all(-1)
+    return shown
+
+
+def _value(field: SdfField) -> Callable[[Tensor], Tensor]:
+    return lambda points: finite_distance(field, points.float())

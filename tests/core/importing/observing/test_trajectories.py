@@ -1,0 +1,204 @@
+"""Where cameras stood, by every format that says it: the same cameras, written in each and read again."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.observing.reading import read_trajectory
+from regnf_core.importing.observing.trajectory import Trajectory
+from regnf_core.importing.run.opened import SettingsFile
+from regnf_core.importing.upload_description import CamerasDescription
+
+WIDTH, HEIGHT = 640, 480
+K = np.array([[525.0, 0.0, 319.5], [0.0, 520.0, 239.5], [0.0, 0.0, 1.0]])
+SAID = CamerasDescription(intrinsics=[525.0, 520.0, 319.5, 239.5], size=[WIDTH, HEIGHT])
+NOTHING = CamerasDescription()
+
+
+def poses(count: int = 5) -> np.ndarray:
+    """(N, 4, 4), camera to world, opencv."""
+    found = np.tile(np.eye(4), (count, 1, 1))
+    found[:, :3, :3] = Rotation.random(count, random_state=0).as_matrix()
+    found[:, :3, 3] = np.random.default_rng(1).uniform(-2, 2, (count, 3))
+    return found
+
+
+def opengl(matrices: np.ndarray) -> np.ndarray:
+    """By a rotation of the camera's frame, not by signs of columns: half a turn about x."""
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", 180, degrees=True).as_matrix()
+    return matrices @ turn
+
+
+def file(name: str, text: str | bytes) -> SettingsFile:
+    return SettingsFile(name, memoryview(text.encode() if isinstance(text, str) else text))
+
+
+def transforms(**more: Any) -> dict[str, Any]:
+    said = {"fl_x": 525.0, "fl_y": 520.0, "cx": 319.5, "cy": 239.5, "w": WIDTH, "h": HEIGHT}
+    frames = [{"file_path": f"{i}.png", "transform_matrix": pose.tolist()} for i, pose in enumerate(opengl(poses()))]
+    return {"camera_model": "OPENCV", **said, "frames": frames, **more}
+
+
+def meta_data() -> dict[str, Any]:
+    frames = [{"rgb_path": "0.png", "camtoworld": pose.tolist(), "intrinsics": K.tolist()} for pose in poses()]
+    return {"camera_model": "OPENCV", "width": WIDTH, "height": HEIGHT, "frames": frames}
+
+
+def tum() -> str:
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for index, pose in enumerate(poses()):
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat() * (-1.0) ** index
+        lines.append(" ".join(map(repr, [index / 30, *pose[:3, 3].tolist(), *quaternion.tolist()])))
+    return "\n".join(lines) + "\n"
+
+
+def matrices() -> list[SettingsFile]:
+    """In another order than that of the numbers in their names."""
+    each = [
+        file(f"frame-{i}.pose.txt", "\n".join(" ".join(map(repr, row)) for row in pose.tolist()))
+        for i, pose in enumerate(poses())
+    ]
+    return each[::-1]
+
+
+def neus() -> bytes:
+    out = io.BytesIO()
+    arrays: dict[str, Any] = {}
+    for index, pose in enumerate(poses()):
+        inverse = np.linalg.inv(pose)
+        arrays[f"world_mat_{index}"] = np.vstack([(-1.0) ** index * 3.0 * K @ inverse[:3], [[0, 0, 0, 1]]])
+        arrays[f"scale_mat_{index}"] = np.eye(4)
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def require_same(found: Trajectory) -> None:
+    expected = poses()
+    points = np.random.default_rng(2).uniform(-1, 1, (20, 3))
+    size = np.array([WIDTH, HEIGHT])
+    assert len(found) == len(expected)
+    cameras = found.pinhole()
+    for index, pose in enumerate(expected):
+        local = (np.c_[points, np.ones(20)] @ np.linalg.inv(pose).T)[:, :3]
+        pixels = local @ K.T
+        places, depth = cameras.project(index, torch.from_numpy(points))
+        before = local[:, 2] > 0.01
+        assert np.allclose(depth.numpy(), local[:, 2], atol=1e-6)
+        assert np.allclose(places.numpy()[before] * size, (pixels[:, :2] / pixels[:, 2:])[before], atol=1e-4)
+
+
+def test_transforms_of_nerfstudio() -> None:
+    require_same(read_trajectory([file("transforms.json", json.dumps(transforms()))], NOTHING))
+
+
+def test_the_name_of_the_file_does_not_matter() -> None:
+    require_same(read_trajectory([file("cameras", json.dumps(transforms()))], NOTHING))
+
+
+def test_an_angle_in_place_of_pixels() -> None:
+    said = {"camera_angle_x": 2 * math.atan(WIDTH / 2 / 525.0), "w": WIDTH, "h": HEIGHT}
+    frames = transforms()["frames"]
+    found = read_trajectory([file("transforms_train.json", json.dumps({**said, "frames": frames}))], NOTHING)
+    assert np.allclose(found.focal, [525.0 / WIDTH, 525.0 / HEIGHT])
+    assert np.allclose(found.middle, 0.5)
+
+
+def test_axes_that_are_said_go_before_the_files_own() -> None:
+    frames = [{"transform_matrix": pose[:3].tolist()} for pose in poses()]
+    said = CamerasDescription(axes="opencv")
+    require_same(read_trajectory([file("transforms.json", json.dumps({**transforms(), "frames": frames}))], said))
+
+
+def test_the_transform_that_nerfstudio_applied_is_told() -> None:
+    applied = np.eye(4)
+    applied[:3] = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0.5]])
+    content = transforms(applied_transform=applied[:3].tolist(), applied_scale=2.0)
+    found = read_trajectory([file("transforms.json", json.dumps(content))], NOTHING)
+    assert found.T_dataset_file is not None
+    point = np.array([0.3, -0.2, 0.9, 1.0])
+    moved = applied @ point
+    moved[:3] *= 2.0
+    assert np.allclose(found.T_dataset_file @ moved, point)
+
+
+def test_meta_data_of_sdfstudio_without_its_images() -> None:
+    require_same(read_trajectory([file("meta_data.json", json.dumps(meta_data()))], NOTHING))
+
+
+def test_poses_of_tum() -> None:
+    require_same(read_trajectory([file("groundtruth.txt", tum())], SAID))
+
+
+def test_a_folder_of_poses_with_and_without_intrinsics() -> None:
+    require_same(read_trajectory(matrices(), SAID))
+    text = "\n".join(" ".join(map(repr, row)) for row in K.tolist())
+    size = CamerasDescription(size=[WIDTH, HEIGHT])
+    require_same(read_trajectory([*matrices(), file("camera-intrinsics.txt", text)], size))
+
+
+def test_cameras_of_neus() -> None:
+    require_same(read_trajectory([file("cameras_sphere.npz", neus())], CamerasDescription(size=[WIDTH, HEIGHT])))
+
+
+def test_lost_cameras_are_passed_over() -> None:
+    lost = file("frame-9.pose.txt", "\n".join(["-inf -inf -inf -inf"] * 4))
+    require_same(read_trajectory([*matrices(), lost], SAID))
+
+
+def _with(change: Callable[[dict[str, Any]], Any]) -> list[SettingsFile]:
+    content = transforms()
+    change(content)
+    return [file("transforms.json", json.dumps(content))]
+
+
+BAD: list[tuple[list[SettingsFile], str]] = [
+    ([file("a.json", "{}")], "CAMERAS_NOT_RECOGNIZED"),
+    ([file("a.txt", "")], "CAMERAS_NOT_RECOGNIZED"),
+    ([file("a.txt", "1 2 3\n")], "CAMERAS_NOT_RECOGNIZED"),
+    ([file("a.txt", "hello\n")], "CAMERAS_MALFORMED"),
+    ([file("a.txt", b"\xff\xfe\x00")], "CAMERAS_MALFORMED"),
+    ([file("transforms.json", '{"frames": [')], "CAMERAS_MALFORMED"),
+    ([file("groundtruth.txt", tum())], "CAMERAS_INTRINSICS_MISSING"),
+    (_with(lambda c: [c.pop(name) for name in ("fl_x", "fl_y")]), "CAMERAS_INTRINSICS_MISSING"),
+    (_with(lambda c: c.update(camera_model="EQUIRECTANGULAR")), "CAMERAS_NOT_SUPPORTED"),
+    (_with(lambda c: c.update(fl_x=1e-9)), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c.update(w=-5)), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c.update(fl_x="525")), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c["frames"].append(3)), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c["frames"].append({})), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c["frames"][2].update(transform_matrix=[[1, 2], [3, 4]])), "CAMERAS_MALFORMED"),
+    (_with(lambda c: c["frames"][2]["transform_matrix"][0].__setitem__(3, 1e300)), "CAMERAS_MALFORMED"),
+    (
+        _with(lambda c: c["frames"][2].update(transform_matrix=np.diag([2.0, 2.0, 2.0, 1.0]).tolist())),
+        "CAMERAS_MALFORMED",
+    ),
+    (
+        _with(lambda c: c["frames"][2].update(transform_matrix=np.diag([-1.0, 1.0, 1.0, 1.0]).tolist())),
+        "CAMERAS_MALFORMED",
+    ),
+    (_with(lambda c: c.update(applied_transform=np.zeros((3, 4)).tolist())), "CAMERAS_MALFORMED"),
+]
+
+
+@pytest.mark.parametrize(("files", "reason"), BAD)
+def test_what_is_refused(files: list[SettingsFile], reason: str) -> None:
+    with pytest.raises(FieldFormatError) as raised:
+        read_trajectory(files, NOTHING)
+    assert raised.value.reason == reason
+
+
+def test_a_quaternion_of_zeros_is_no_pose() -> None:
+    with pytest.raises(FieldFormatError) as raised:
+        read_trajectory([file("a.txt", "0 1 2 3 0 0 0 0\n")], SAID)
+    assert raised.value.reason == "CAMERAS_MALFORMED"
