@@ -40,7 +40,7 @@ def original_key(reference: str) -> str:
 
 
 def settings_key(reference: str, sha256: str) -> str:
-    """Where the trainer's settings that came with them lie, for as long."""
+    """Where the trainer's settings, or the cameras, that came with them lie, for as long."""
     return f"fields/{reference}/settings-{sha256}"
 
 
@@ -57,15 +57,13 @@ def candidate_key(reference: str, number: int) -> str:
 def delete_upload(blobs: BlobStore, field: FieldRecord) -> None:
     """Delete what was uploaded, but nothing that was made of it."""
     blobs.delete(original_key(field.sha256))
-    if field.settings is not None:
-        blobs.delete(settings_key(field.sha256, field.settings.sha256))
+    for file in field.beside:
+        blobs.delete(settings_key(field.sha256, file.sha256))
 
 
 def delete_all_but_upload(blobs: BlobStore, field: FieldRecord) -> None:
-    """Delete what was made of an upload, and uploads of settings that are no longer its own."""
-    own = {original_key(field.sha256)}
-    if field.settings is not None:
-        own.add(settings_key(field.sha256, field.settings.sha256))
+    """Delete what was made of an upload, and files that came with it and are no longer its own."""
+    own = {original_key(field.sha256), *(settings_key(field.sha256, file.sha256) for file in field.beside)}
     for key in list(blobs.list(f"fields/{field.sha256}")):
         if key not in own:
             blobs.delete(key)

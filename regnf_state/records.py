@@ -128,8 +128,13 @@ SETTINGS = "settings"
 """In a field's description: the file of settings that came with the upload. No description has such an entry."""
 
 
+CAMERAS = "cameras_file"
+"""The same of the file that says where its cameras stood."""
+_BESIDE = (SETTINGS, CAMERAS)
+
+
 class SettingsFile(NamedTuple):
-    """A trainer's settings that came with an upload."""
+    """A file that came with an upload: a trainer's settings, or where cameras stood."""
 
     name: str
     sha256: str
@@ -148,7 +153,8 @@ class FieldRecord:
     version: int = 1
     label: str | None = None
     description: dict[str, Any] = field(default_factory=dict)
-    """What the uploader said that the file does not: family, level mask ...; and under SETTINGS which settings came."""
+    """What the uploader said that the file does not: family, level mask ...; under SETTINGS and CAMERAS which files
+    came with it."""
     report: dict[str, Any] = field(default_factory=dict)
     """What the import found: family, bounds, parameters, plausibility, warnings."""
     error: dict[str, Any] | None = None
@@ -168,13 +174,26 @@ class FieldRecord:
 
     @property
     def said(self) -> dict[str, Any]:
-        """The description without the settings that came."""
-        return {name: value for name, value in self.description.items() if name != SETTINGS}
+        """The description without the files that came."""
+        return {name: value for name, value in self.description.items() if name not in _BESIDE}
 
     @property
     def settings(self) -> SettingsFile | None:
         """The settings that came with the upload."""
-        match self.description.get(SETTINGS):
+        return self._beside(SETTINGS)
+
+    @property
+    def cameras(self) -> SettingsFile | None:
+        """The file of cameras that came with the upload."""
+        return self._beside(CAMERAS)
+
+    @property
+    def beside(self) -> list[SettingsFile]:
+        """The files that came with the upload."""
+        return [file for file in map(self._beside, _BESIDE) if file is not None]
+
+    def _beside(self, entry: str) -> SettingsFile | None:
+        match self.description.get(entry):
             case {"name": str() as name, "sha256": str() as sha256, "bytes": int() as size}:
                 return SettingsFile(name, sha256, size)
         return None
@@ -194,8 +213,8 @@ class FieldRecord:
 
     @property
     def upload_bytes(self) -> int:
-        """The upload and the settings that came with it."""
-        return self.bytes + (self.settings.bytes if self.settings is not None else 0)
+        """The upload and the files that came with it."""
+        return self.bytes + sum(file.bytes for file in self.beside)
 
     @property
     def kept_bytes(self) -> int:

@@ -68,6 +68,21 @@ def test_settings_are_stored_beside_the_file(world: World) -> None:
     assert world.client.get(PLACE).json()["settings"]["name"] == "config.yml"
 
 
+def test_cameras_are_stored_beside_the_file_and_make_another_function_of_it(world: World) -> None:
+    poses = b"0 0 0 0 0 0 0 1\n"
+    said = json.dumps({"cameras": {"intrinsics": [1, 1, 1, 1]}})
+    files = {"file": ("a.ckpt", A), "cameras": ("walk/poses.txt", poses), "settings": ("config.yml", CONFIG)}
+    answer = world.client.post("/fields", files={**files, "description": (None, said, "application/json")})
+    assert answer.status_code == 201, answer.text
+    document = answer.json()
+    assert document["cameras"] == {"name": "poses.txt", "sha256": sha256(poses), "bytes": len(poses)}
+    assert document["description"] == {"cameras": {"intrinsics": [1.0, 1.0, 1.0, 1.0]}}
+    assert world.blobs.blobs[f"fields/{sha256(A)}/settings-{sha256(poses)}"] == poses
+    assert send(world, json.loads(said), ("config.yml", CONFIG)).json()["reason"] == "FIELD_DESCRIPTION_DIFFERS"
+    imported(world)
+    assert set(world.blobs.blobs) == {f"fields/{sha256(A)}/{name}" for name in ("field.safetensors", "report.json")}
+
+
 @pytest.mark.parametrize(
     ("filename", "name"),
     [

@@ -69,7 +69,9 @@ def publish(blobs: BlobStore, manifest: Manifest) -> bool:
     return published
 
 
-def held_importer(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+def held_importer(
+    upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+) -> dict[str, Any]:
     wait_while("hold-import")
     return tiny_importer(upload, folder, description, settings)
 

@@ -19,7 +19,9 @@ from tests.contract.world import World, assert_refused, make_world, sha256
 LIMITS = ImportLimits(tensor_bytes=64 * MIB)
 
 
-def convert(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+def convert(
+    upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+) -> dict[str, Any]:
     """What the gate's process does, without a process of its own: the gate's own tests cover that."""
     return convert_file(upload, folder, description or None, LIMITS)
 

@@ -34,7 +34,7 @@ def test_a_field_deleted_while_it_is_imported_leaves_nothing(context: Context) -
     begin_import(context)
 
     def importer(
-        upload: Path, folder: Path, description: dict[str, object], settings: Path | None
+        upload: Path, folder: Path, description: dict[str, object], settings: Path | None, cameras: Path | None = None
     ) -> dict[str, object]:
         context.records.delete_field(SHA)
         return tiny_importer(upload, folder, description, settings)
@@ -47,7 +47,7 @@ def test_an_upload_after_a_deletion_owes_nothing_to_the_import_before_it(context
     begin_import(context)
 
     def importer(
-        upload: Path, folder: Path, description: dict[str, object], settings: Path | None
+        upload: Path, folder: Path, description: dict[str, object], settings: Path | None, cameras: Path | None = None
     ) -> dict[str, object]:
         context.records.delete_field(SHA)
         begin_import(context)

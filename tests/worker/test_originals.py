@@ -84,7 +84,9 @@ def test_settings_reach_the_import_under_their_own_name_and_go_with_the_upload(c
     uploaded_with_settings(context)
     seen: list[Any] = []
 
-    def importer(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+    def importer(
+        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+    ) -> dict[str, Any]:
         assert settings is not None
         seen.append((description, settings.name, settings.read_bytes()))
         return tiny_importer(upload, folder, description, settings)
@@ -166,3 +168,25 @@ def test_an_upload_that_is_sent_again_in_between_stays(context: Context, monkeyp
     monkeypatch.setattr(context.records, "update_field", and_sent_again)
     assert originals(context).free("anonymous")
     assert keys(context) == {place}
+
+
+def test_cameras_reach_the_import_beside_settings_and_go_with_the_upload(context: Context) -> None:
+    settings, poses = uploaded_with_settings(context), b"0 0 0 0 0 0 0 1\n"
+    digest = hashlib.sha256(poses).hexdigest()
+    known = context.records.get_field(SHA)
+    assert known is not None
+    said = {**known.description, "cameras_file": {"name": "poses.txt", "sha256": digest, "bytes": len(poses)}}
+    context.records.update_field(SHA, description=said)
+    context.blobs.put(f"fields/{SHA}/settings-{digest}", poses)
+    seen: list[Any] = []
+
+    def importer(
+        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+    ) -> dict[str, Any]:
+        assert cameras is not None
+        seen.append((description, cameras.name, cameras.read_bytes()))
+        return tiny_importer(upload, folder, description, settings)
+
+    run_import_attempt(context, SHA, 1, "w", importer)
+    assert seen == [({"sign": -1}, "poses.txt", poses)]
+    assert not {settings, f"fields/{SHA}/settings-{digest}"} & keys(context)

@@ -168,7 +168,9 @@ def test_an_import_waits_for_redis_and_rejects_nothing_for_it(
     context.blobs.put(f"fields/{SHA}/original", data)
     refuse(monkeypatch, context, name, 2)
 
-    def importer(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+    def importer(
+        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+    ) -> dict[str, Any]:
         if upload.read_bytes() == b"raise":
             raise ValueError("no field")
         return tiny_importer(upload, folder, description, settings)

@@ -157,7 +157,9 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     run_import_attempt(Context.from_settings(Settings()), sha256, attempt, worker, tiny_importer)
 
 
-def tiny_importer(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
+def tiny_importer(
+    upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None = None
+) -> dict[str, Any]:
     if upload.read_bytes() == b"die":
         os.kill(os.getpid(), signal.SIGKILL)
     (folder / "field.safetensors").write_bytes(upload.read_bytes())

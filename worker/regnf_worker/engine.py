@@ -15,8 +15,9 @@ from regnf_core.options import RegistrationOptions
 from regnf_state.registration_request import RegistrationRequest
 
 Report = Callable[[str, float], None]
-Importer = Callable[[Path, Path, dict[str, Any], Path | None], dict[str, Any]]
-"""(upload, folder, description, settings) -> report; writes folder/field.safetensors, and folder/preview.png if it can.
+Importer = Callable[[Path, Path, dict[str, Any], Path | None, Path | None], dict[str, Any]]
+"""(upload, folder, description, settings, cameras) -> report; writes folder/field.safetensors, and folder/preview.png
+if it can.
 
 Raises FieldFormatError."""
 
@@ -192,7 +193,10 @@ def _fields(notes: Notes, obj: str | None) -> dict[str, FieldNotes]:
 def core_importer(limits: ImportLimits) -> Importer:
     """The import gate of regnf_core within ``limits``."""
 
-    def run(upload: Path, folder: Path, description: dict[str, Any], settings: Path | None) -> dict[str, Any]:
-        return import_field(upload, folder, description or None, limits, picture=True, settings=settings).to_dict()
+    def run(
+        upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None
+    ) -> dict[str, Any]:
+        said = description or None
+        return import_field(upload, folder, said, limits, picture=True, settings=settings, cameras=cameras).to_dict()
 
     return run

@@ -21,7 +21,7 @@ from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.originals import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
 from regnf_state.problems import problem_document
-from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, StaleAttemptError
+from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, SettingsFile, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
 from regnf_worker.problems import are_files_away, fault, new_incident
@@ -38,7 +38,7 @@ def claim_import(context: Context, sha256: str, attempt: int, worker: str) -> bo
 
 
 def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str, importer: Importer) -> None:
-    """Import with ``importer(upload, folder, description, settings) -> report`` and write down how it ended.
+    """Import with ``importer(upload, folder, description, settings, cameras) -> report`` and write down how it ended.
 
     The original is deleted before the record changes, unless it is kept: a new upload of the same bytes finds either a
     validating record, or one that has ended, and then stores its own original. Writes that Redis refuses for
@@ -149,8 +149,8 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
     sha256, description = field.sha256, field.description
     with TemporaryDirectory(prefix="import-") as temporary, context.blobs.local_copy(original_key(sha256)) as upload:
         folder = Path(temporary)
-        with _settings(context, field) as settings:
-            report: dict[str, Any] = importer(upload, folder, field.said, settings)
+        with _beside(context, field, field.settings) as settings, _beside(context, field, field.cameras) as cameras:
+            report: dict[str, Any] = importer(upload, folder, field.said, settings, cameras)
         _require_current(context, field)
         delete_all_but_upload(context.blobs, field)  # an object's model, of what the field was before
         if (folder / PICTURE_NAME).exists():
@@ -164,14 +164,14 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
 
 
 @contextmanager
-def _settings(context: Context, field: FieldRecord) -> Iterator[Path | None]:
-    """The settings that came with the upload, in a file of their own name; None where none came."""
-    if field.settings is None:
+def _beside(context: Context, field: FieldRecord, came: SettingsFile | None) -> Iterator[Path | None]:
+    """What came with the upload, in a file of its own name; None where nothing came."""
+    if came is None:
         yield None
         return
-    key = settings_key(field.sha256, field.settings.sha256)
-    with TemporaryDirectory(prefix="settings-") as temporary, context.blobs.open(key) as stored:
-        named = Path(temporary) / field.settings.name
+    key = settings_key(field.sha256, came.sha256)
+    with TemporaryDirectory(prefix="beside-") as temporary, context.blobs.open(key) as stored:
+        named = Path(temporary) / came.name
         with named.open("wb") as file:
             shutil.copyfileobj(stored, file)
         yield named

@@ -15,7 +15,7 @@ from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.originals import delete_upload, original_key, settings_key
 from regnf_state.ownership import reference_of
-from regnf_state.records import ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
+from regnf_state.records import CAMERAS, ORIGINAL_UNTIL, SETTINGS, FieldRecord, Quota, QuotaError, UnreadableRecordError
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,19 @@ class Beside:
 
     description: UploadDescription | None = None
     settings: ReceivedSettings | None = None
+    cameras: ReceivedSettings | None = None
     role: Role | None = None
 
     @property
     def is_nothing(self) -> bool:
         """Whether the caller says nothing of the file: then any field of the same bytes is meant."""
-        return self.description is None and self.settings is None
+        return self.description is None and not self.files
+
+    @property
+    def files(self) -> dict[str, ReceivedSettings]:
+        """The files that came, by the entries of the record's description that say which they are."""
+        found = {SETTINGS: self.settings, CAMERAS: self.cameras}
+        return {entry: file for entry, file in found.items() if file is not None}
 
     @property
     def label(self) -> str | None:
@@ -37,12 +44,11 @@ class Beside:
         return None if self.description is None else self.description.label
 
     def function(self) -> dict[str, Any]:
-        """What makes another function of the same bytes: everything that was said but the label, and the settings."""
+        """What makes another function of the same bytes: everything that was said but the label, and the files."""
         said = {} if self.description is None else function_of(self.description)
-        if self.settings is None:
-            return said
-        received = self.settings.received
-        return said | {SETTINGS: {"name": self.settings.name, "sha256": received.sha256, "bytes": received.bytes}}
+        for entry, file in self.files.items():
+            said[entry] = {"name": file.name, "sha256": file.received.sha256, "bytes": file.received.bytes}
+        return said
 
     def function_of_new(self, format_: str | None) -> dict[str, Any]:
         """The same for a field that is not held: where the file does not say how to read it, its use does."""
@@ -58,8 +64,8 @@ class Beside:
 
 
 def _by_content(function: Mapping[str, Any]) -> dict[str, Any]:
-    settings = function.get(SETTINGS)
-    return dict(function) if settings is None else {**function, SETTINGS: settings["sha256"]}
+    files = {entry: function[entry]["sha256"] for entry in (SETTINGS, CAMERAS) if function.get(entry) is not None}
+    return {**function, **files}
 
 
 def function_of(description: UploadDescription) -> dict[str, Any]:
@@ -148,9 +154,8 @@ async def store_upload(
         await in_thread(services.room.make, caller)
     elif field.original_until is None:
         return StoredUpload((await in_thread(services.records.create_field, field))[0], created=True)
-    if beside.settings is not None:
-        place = settings_key(reference, beside.settings.received.sha256)
-        await beside.settings.upload.commit(place)
+    for file in beside.files.values():
+        await file.upload.commit(settings_key(reference, file.received.sha256))
     await upload.commit(original_key(reference))
     return await in_thread(_record, services, field, beside)
 

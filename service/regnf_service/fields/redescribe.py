@@ -9,7 +9,7 @@ from regnf_service.fields.ingest import check_workers, function_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.originals import original_key, settings_key
-from regnf_state.records import SETTINGS, FieldRecord, StaleAttemptError
+from regnf_state.records import CAMERAS, SETTINGS, FieldRecord, StaleAttemptError
 
 
 def redescribe(services: Services, caller: str, known: FieldRecord, said: UploadDescription, label: str | None) -> bool:
@@ -18,7 +18,9 @@ def redescribe(services: Services, caller: str, known: FieldRecord, said: Upload
     Raises Problem FIELD_VALIDATING, FIELD_IN_USE, FIELD_BYTES_GONE, QUOTA_IMPORTS, QUOTA_WORKER_SECONDS, CONFLICT, and
     RecordsFullError.
     """
-    function = function_of(said) | {name: value for name, value in known.description.items() if name == SETTINGS}
+    function = function_of(said) | {
+        name: value for name, value in known.description.items() if name in (SETTINGS, CAMERAS)
+    }
     if function == known.description:
         if label != known.label:
             _changed(services, known, label)
@@ -47,8 +49,7 @@ def _require_unused(services: Services, field: FieldRecord) -> None:
 
 def _require_bytes(services: Services, field: FieldRecord) -> None:
     keys = [original_key(field.sha256)]
-    if field.settings is not None:
-        keys.append(settings_key(field.sha256, field.settings.sha256))
+    keys += [settings_key(field.sha256, file.sha256) for file in field.beside]
     if field.original_until is None or not all(map(services.blobs.exists, keys)):
         raise Problem("FIELD_BYTES_GONE")
 

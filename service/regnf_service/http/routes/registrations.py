@@ -212,7 +212,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         spec = await read_body(services, RegistrationSpec, parts["request"])
         said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}
-        beside = {name: Beside(said[name], await configs[name].received(), name) for name in _ROLES}
+        beside = {name: Beside(said[name], await configs[name].received(), role=name) for name in _ROLES}
         asked = spec.to_request(received["scene"].sha256, received["object"].sha256)
         await in_thread(check_fields, services, caller, asked, {})  # they are taken in next, so none need be held
         if keep:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack
 from typing import Annotated, Any
 
@@ -38,6 +38,7 @@ from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
+_BESIDE = ("settings", "cameras")
 _HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
 _DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
 _ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -54,7 +55,7 @@ _MULTIPART = {
         "type": "object",
         "required": ["file"],
         "additionalProperties": False,
-        "properties": {"file": FILE, "description": reference(UploadDescription), "settings": FILE},
+        "properties": {"file": FILE, "description": reference(UploadDescription), "settings": FILE, "cameras": FILE},
     }
 }
 
@@ -128,8 +129,9 @@ async def post_field(
 ) -> JSONResponse:
     """The bytes alone, or multipart with the part `file` and what goes with it.
 
-    `settings` is the file of settings that the trainer left, or a zip or tar file of several; `description` is JSON:
-    what no file says. An archive of a whole training run needs neither.
+    `settings` is the file of settings that the trainer left, or a zip or tar file of several; `cameras` says where the
+    cameras stood whose images the field was made from (docs/import-gate.md); `description` is JSON: what no file says.
+    An archive of a whole training run needs none of them.
     """
     if body.media_type(request).startswith("text/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
@@ -142,8 +144,8 @@ async def post_field(
         claim = stack.enter_context(services.under_way.claim(caller, room, declared))
         upload = await stack.enter_async_context(open_upload(services, claim))
         if in_parts:
-            settings = await stack.enter_async_context(open_settings(services, claim))
-            received, beside = await _receive_parts(request, services, upload, settings, pace, digest)
+            files = {part: await stack.enter_async_context(open_settings(services, claim)) for part in _BESIDE}
+            received, beside = await _receive_parts(request, services, upload, files, pace, digest)
         else:
             received, beside = await _receive_raw(request, services, upload, pace), Beside()
             if digest not in (None, received.sha256):
@@ -163,22 +165,23 @@ async def _receive_parts(
     request: Request,
     services: Services,
     upload: Upload,
-    settings: SettingsUpload,
+    beside: Mapping[str, SettingsUpload],
     pace: Pace,
     digest: str | None,
 ) -> tuple[Received, Beside]:
     body.refuse_encoding(request)
-    limit = services.settings.max_upload_bytes + settings_limit(services) + 2 * DESCRIPTION_BYTES
+    limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit, pace)
     if digest is not None:
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES}
-    files = {"file": upload, "settings": settings}
+    files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
     if "file" not in parts:
         raise Problem("MISSING_PART", "The part `file` is missing.")
     description = read_description(parts.get("description"))
-    return await upload.finish(), Beside(description, await settings.received())
+    settings, cameras = [await beside[part].received() for part in _BESIDE]
+    return await upload.finish(), Beside(description, settings, cameras)
 
 
 def read_description(text: bytes | None) -> UploadDescription | None:

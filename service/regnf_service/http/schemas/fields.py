@@ -26,7 +26,7 @@ from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord
 
 
 class SettingsDocument(Outgoing):
-    """A trainer's settings that came with an upload."""
+    """A file that came with an upload."""
 
     name: str
     sha256: Sha256
@@ -42,6 +42,7 @@ class FieldDocument(Outgoing):
     label: str | None = None
     description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
     settings: SettingsDocument | None = Field(None, description="The file of settings that came with the upload.")
+    cameras: SettingsDocument | None = Field(None, description="The file that says where its cameras stood.")
     report: dict[str, Any] = Field({}, description="What the import found: family, bounds, parameters, plausibility.")
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's own, found by the first job that registers the field as an object."
@@ -97,6 +98,7 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "label": record.label,
         "description": record.said,
         "settings": None if record.settings is None else record.settings._asdict(),
+        "cameras": None if record.cameras is None else record.cameras._asdict(),
         "report": _without_time(record.report),
         "symmetry": record.symmetry,
         "error": None if record.error is None else outgoing_problem(_error(record, address)),
