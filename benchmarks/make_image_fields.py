@@ -122,7 +122,7 @@ def list_pairs(wanted: PairList, meshes: Path, rooms: Path, fields: Path) -> Non
             name = instance["id"]
             scene = f"{stem}{wanted.suffix}" + (f"-{name}" if wanted.one else "")
             if name in UNITS_PER_METER and instance["class"] != "clutter" and _both(fields, scene, name):
-                pairs.append(_pair(room, instance, scene, meshes))
+                pairs.append(describe_pair(room, instance, scene, meshes))
     if pairs:
         (fields / wanted.file).write_text(json.dumps(pairs, indent=1) + "\n")
 
@@ -131,7 +131,8 @@ def _both(fields: Path, *names: str) -> bool:
     return all((fields / f"{name}.safetensors").exists() for name in names)
 
 
-def _pair(room: dict[str, Any], instance: dict[str, Any], scene: str, meshes: Path) -> dict[str, Any]:
+def describe_pair(room: dict[str, Any], instance: dict[str, Any], scene: str, meshes: Path) -> dict[str, Any]:
+    """One entry of a list of pairs: the detection and the truth of an instance in the scene's field ``scene``."""
     frame, name = demo.SceneFrame.of(room), instance["id"]
     truth = demo.truth(instance, demo.load_instance(meshes, instance), UNITS_PER_METER[name], frame)
     detection = demo.detection(instance, frame)

@@ -95,7 +95,7 @@ def load_pairs(folder: Path, file: str = MAIN) -> list[Pair]:
     path = folder / file
     if not path.exists():
         return []
-    return [_pair(folder, values) for values in json.loads(path.read_text())]
+    return [pair_of(folder, values) for values in json.loads(path.read_text())]
 
 
 @cache
@@ -111,7 +111,8 @@ def exact_surface(folder: Path, room: str) -> tuple[NDArray[np.float32], NDArray
         return file["vertices"], file["faces"]
 
 
-def _pair(folder: Path, values: dict[str, Any]) -> Pair:
+def pair_of(folder: Path, values: dict[str, Any]) -> Pair:
+    """The pair that one entry of such a list describes."""
     box = OrientedBox.from_quaternion(values["detection"]["center"], values["detection"]["size"])
     truth = Sim3.from_dict(values["truth"]["T_object_scene"])
     names = (values["room"], values["object"], values["instance"])
