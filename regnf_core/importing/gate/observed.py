@@ -43,8 +43,8 @@ def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, 
 def _by_cameras(
     converted: ConvertedField, read: ReadUpload, cameras: Trajectory, limits: ImportLimits
 ) -> ConvertedField:
+    from regnf_core.importing.gate.lines_of_sight import observed_by_cameras
     from regnf_core.importing.gate.plausibility import without_new_code  # loads torch
-    from regnf_core.importing.observing.by_cameras import observed_by_cameras
 
     with without_new_code():
         found = observed_by_cameras(converted.description, converted.tensors, cameras, read.description, limits.work_s)
