@@ -2,8 +2,8 @@
 ``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS] [CAMERAS]``.
 
 Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings", "cameras"}, the last
-two the names of those files or null; standard output gets one JSON line: the report, or {"reason", "detail"} and perhaps
-"candidates". The field is written to OUT_DIR/field.safetensors, a picture beside it; of candidates too.
+two the names of those files or null; standard output gets one JSON line: the report, or {"reason", "detail"} and
+perhaps "candidates". The field is written to OUT_DIR/field.safetensors, a picture beside it; of candidates too.
 """
 
 from __future__ import annotations
