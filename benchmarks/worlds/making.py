@@ -33,7 +33,7 @@ WORLD, SCENE = "world.json", "scene.safetensors"
 MAX_CASES = 8
 LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
 """Of an object's surface, measured in some image: what was seen less is no case."""
-LEAST_VOXELS = 16.0
+LEAST_VOXELS = 20.0
 """Across an object: what is smaller is no case."""
 _SCALES = (0.05, 20.0)
 _TRAINED = (0.03, 0.15)

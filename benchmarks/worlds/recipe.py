@@ -28,7 +28,7 @@ _FRAMES: dict[Length, dict[int, int]] = {
     "short": {120: 48, 240: 32, 480: 16},
     "single": {120: 1, 240: 1, 480: 1},
 }
-_VOXELS_M = {"room": (0.008, 0.014), "table": (0.004, 0.008), "shelf": (0.004, 0.009)}
+_VOXELS_M = {"room": (0.006, 0.01), "table": (0.003, 0.006), "shelf": (0.0035, 0.007)}
 _ABOUT_M = {"room": 0.05, "table": 0.2, "shelf": 0.15}
 _FARTHEST_M = {"room": (3.0, 5.0), "table": (1.6, 2.2), "shelf": (2.0, 2.6)}
 """Depths beyond are dropped, as one does whose interest is the table."""
@@ -96,7 +96,7 @@ def _draw_fusion(world: World, bounds: Array, sensor: RandomSensor, rng: np.rand
     farthest = min(sensor.farthest_m, rng.uniform(*_FARTHEST_M[world.kind]))
     if dense:
         voxel = max(voxel, float((bounds[1] - bounds[0]).max()) / LARGEST_DENSE)
-    return Fusion(voxel, float(rng.uniform(4.0, 8.0)), "dense" if dense else "blocks", farthest)
+    return Fusion(voxel, float(rng.uniform(3.0, 8.0)), "dense" if dense else "blocks", farthest)
 
 
 def _bounds(world: World) -> Array:
