@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 
 import numpy as np
@@ -21,7 +22,7 @@ from regnf_core.importing.observing.trajectory import (
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.similarity import is_similarity
 
-_PINHOLES = frozenset({"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"})
+_PINHOLES = re.compile(r"OPENCV|PERSPECTIVE|(SIMPLE_)?(PINHOLE|RADIAL)")
 """Camera models whose images are those of a pinhole, but for a little distortion."""
 _POSES = "transform_matrix", "camtoworld"
 _SIDE = 1000.0
@@ -55,7 +56,7 @@ def read_trajectory_json(keys: Keys, intrinsics: Intrinsics | None, axes: Axes |
 
 def _require_pinhole(keys: Keys) -> None:
     model = keys.find("camera_model")
-    if model is not None and model not in _PINHOLES:
+    if model is not None and not _PINHOLES.fullmatch(str(model)):
         message = f"{keys.file}: cameras of the model {str(model)[:40]} are not supported"
         raise FieldFormatError(message, reason="CAMERAS_NOT_SUPPORTED")
 

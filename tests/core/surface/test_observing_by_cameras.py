@@ -15,7 +15,7 @@ from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 from regnf_core.surface.observing import observe_by_cameras
 
-POINTS = 700_000
+POINTS = 1_500_000
 
 
 def room() -> UnionField:
