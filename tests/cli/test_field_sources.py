@@ -43,7 +43,9 @@ class Gate:
         limits: object = None,
         picture: bool = False,
         settings: Path | None = None,
+        cameras: Path | None = None,
     ) -> ImportReport:
+        assert cameras is None
         self.asked.append({"file": upload.name, "description": description, "settings": contents(settings)})
         name = "mix-room" if "room" in upload.name else "armchair"
         shutil.copy(DATA / f"{name}.safetensors", out_dir / "field.safetensors")

@@ -50,8 +50,9 @@ def evaluate(state: dict[str, Tensor], points: Tensor, levels: int) -> Tensor:
 
 
 def converted(folder: Path, state: dict[str, Any], overrides: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Random numbers are no distance, and may be matter all round: that is accepted."""
     torch.save(state, folder / "sdf.pth")
-    return convert_file(folder / "sdf.pth", folder, overrides, ImportLimits())
+    return convert_file(folder / "sdf.pth", folder, {"accept_implausible": True, **(overrides or {})}, ImportLimits())
 
 
 @pytest.mark.parametrize("levels", [None, 2, 1])
