@@ -34,7 +34,7 @@ from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 from tests.core.importing.fuzzing.stages import run_stage
 
 ROOT = Path(__file__).resolve().parents[3]
-CASES = 3_000
+CASES = 4_500
 
 LIMITS = PickleLimits(opcodes=20_000)
 quick = settings(
