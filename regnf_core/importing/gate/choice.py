@@ -99,7 +99,9 @@ def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple
     told = told_interpolation(linear, smooth)
     if told is None:
         habit = reading.description["hash"]["interpolation"]
-        raise _ambiguous([_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)])
+        asked = [_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)]
+        # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
+        raise _ambiguous(asked, whole=True)
     more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
     return _with_interpolation(reading, told), [*why, more]
 
@@ -107,14 +109,16 @@ def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:
     grid = {**reading.description["hash"], "interpolation": kind}
     name = f"{reading.name}, {kind}"
-    say = {"hash": {"interpolation": kind}}
+    say = {**reading.say, "hash": {**reading.say.get("hash", {}), "interpolation": kind}}
     return replace(reading, name=name, say=say, description={**reading.description, "hash": grid})
 
 
-def _ambiguous(readings: Sequence[Reading]) -> AmbiguousError:
-    """The refusal: what the description may say, the most usual first."""
+def _ambiguous(readings: Sequence[Reading], whole: bool = False) -> AmbiguousError:
+    """The refusal: what the description may say, the most usual first. whole: with what all have in common, too."""
     say = [reading.say for reading in readings]
-    asked = [OpenCandidate(one.name, _shortest(one.say, say), partial(_same, one)) for one in readings]
+    asked = [
+        OpenCandidate(one.name, one.say if whole else _shortest(one.say, say), partial(_same, one)) for one in readings
+    ]
     lines = list(dict.fromkeys(json.dumps(one.say) for one in asked))
     more = f", or {len(lines) - _SHOWN} others" if len(lines) > _SHOWN else ""
     message = f"{len(lines)} readings fit this table alike; add one to the description: {' or '.join(lines[:_SHOWN])}"

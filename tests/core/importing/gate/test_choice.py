@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import ConvertedField, converted_of
 from regnf_core.importing.families.grid_field import grid_readings
+from regnf_core.importing.gate.ambiguity import AmbiguousError
 from regnf_core.importing.gate.choice import choose_reading
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.parsing import parse_description
@@ -84,3 +87,16 @@ def test_where_none_has_a_surface_the_most_usual_one_stays_and_plausibility_deci
 def test_without_doubt_nothing_is_tried() -> None:
     plain = converted(ball_table(USUAL, 2), USUAL)
     assert choose_reading(plain) is plain
+
+
+def test_whoever_is_asked_for_the_interpolation_says_the_layout_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What cannot tell the interpolation does not prove the layout either: an answer must not confirm it unread."""
+    monkeypatch.setattr("regnf_core.importing.gate.choice.told_interpolation", lambda linear, smooth: None)
+    found = converted(ball_table(USUAL, 2), USUAL, OTHER)
+    said = {"levels": 5, "base_resolution": 16}
+    readings = tuple(replace(one, interpolation="open", say={"hash": said}) for one in found.readings)
+    with pytest.raises(AmbiguousError) as caught:
+        choose_reading(replace(found, readings=readings))
+    asked = [candidate.say for candidate in caught.value.asked]
+    assert asked == [{"hash": {**said, "interpolation": kind}} for kind in ("linear", "smoothstep")]
+    assert '"levels": 5' in str(caught.value)
