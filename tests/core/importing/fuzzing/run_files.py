@@ -9,7 +9,7 @@ import lzma
 import zipfile
 
 from tests.core.importing.archives import zip_bytes
-from tests.core.importing.settings import test_trainers as trainers
+from tests.core.importing.settings import configurations
 from tests.gate.bad_runs import tar_bytes
 
 
@@ -30,16 +30,16 @@ def make_runs(deepsdf: bytes, codes: bytes, scaling: bytes) -> dict[str, bytes]:
 def make_settings() -> dict[str, bytes]:
     """Files of settings, each behind a line with its name."""
     files = {
-        "sdfstudio": ("config.yml", trainers.studio(False)),
-        "nerfstudio": ("config.yml", trainers.studio(True)),
-        "nsr": ("parsed.yaml", trainers.nsr("ProgressiveBandHashGrid", trainers.BAND)),
-        "angelo": ("config.yaml", trainers.ANGELO % ("True", 4)),
-        "neus": ("a.conf", trainers.NEUS_CONF.format(scale=3.0, layers=8, skip=4)),
+        "sdfstudio": ("config.yml", configurations.studio(False)),
+        "nerfstudio": ("config.yml", configurations.studio(True)),
+        "nsr": ("parsed.yaml", configurations.nsr("ProgressiveBandHashGrid", configurations.BAND)),
+        "angelo": ("config.yaml", configurations.ANGELO % ("True", 4)),
+        "neus": ("a.conf", configurations.NEUS_CONF.format(scale=3.0, layers=8, skip=4)),
         "volsdf": (
             "a.conf",
             "model { scene_bounding_sphere = 3.0\n implicit_network\n { dims = [ 8, 8 ]\n multires = 6 } }",
         ),
-        "deepsdf": ("specs.json", json.dumps(trainers.SPECS)),
+        "deepsdf": ("specs.json", json.dumps(configurations.SPECS)),
         "pin_slam": ("run.yaml", "neuralpoints: {voxel_size_m: 0.3}\nloss: {sigma_sigmoid_m: 0.1}\n"),
         "sines": ("config.yaml", "model: {omega_0: 30.0}\n"),
         "fusion": ("config.yaml", "integrate: {voxel_size: 0.01, trunc_voxel_multiplier: 8}\n"),

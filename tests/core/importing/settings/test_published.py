@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from tests.core.importing.archives import assert_refused
-from tests.core.importing.settings.test_trainers import facts, translated
+from tests.core.importing.settings.translating import facts, translated
 
 _PUBLISHED = json.loads((Path(__file__).parent / "published_configurations.json").read_text())
 

@@ -1,0 +1,102 @@
+"""A receiver of webhooks, and what the tests of them share: jobs that end, and how their messages fare."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import pytest
+from redis import Redis
+
+from regnf_service.webhooks.deliverer import Deliverer
+from regnf_service.webhooks.sender import HttpSender
+from regnf_service.webhooks.signing import read_secrets
+from regnf_service.webhooks.targets import AllowList
+from regnf_state.ownership import reference_of
+from regnf_state.records import JobRecord
+from regnf_state.redis.jobs import RedisRecordStore
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+
+KEY = bytes(range(24))
+
+
+SECRET = f"whsec_{base64.b64encode(KEY).decode()}"
+
+
+def hmac_by_hand(key: bytes, message: bytes) -> bytes:
+    """HMAC-SHA256 from its definition (RFC 2104), for keys of at most 64 bytes."""
+    padded = key.ljust(64, b"\0")
+    inner = hashlib.sha256(bytes(byte ^ 0x36 for byte in padded) + message).digest()
+    return hashlib.sha256(bytes(byte ^ 0x5C for byte in padded) + inner).digest()
+
+
+class Receiver:
+    """Answers with the statuses it is given, the last one for ever; keeps what it was sent."""
+
+    def __init__(self) -> None:
+        self.statuses = [200]
+        self.location = ""
+        self.received: list[tuple[str, dict[str, str], bytes]] = []
+        self.address = ""
+
+
+@pytest.fixture
+def receiver() -> Iterator[Receiver]:
+    made = Receiver()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            made.received.append((self.path, {name.lower(): value for name, value in self.headers.items()}, body))
+            self.send_response(made.statuses.pop(0) if len(made.statuses) > 1 else made.statuses[0])
+            if made.location:
+                self.send_header("Location", made.location)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        made.address = f"http://127.0.0.1:{server.server_port}"
+        yield made
+        server.shutdown()
+        thread.join()
+
+
+def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> Deliverer:
+    hosts = AllowList(allowed)
+    secrets = read_secrets([f"alice:{SECRET}"], None)
+    store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
+    return Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s)
+
+
+def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1") -> JobRecord:
+    """A job of alice's with a webhook, ended."""
+    store = RedisRecordStore(redis)
+    request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
+    now = store.now()
+    record, _ = store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)
+    error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "text"} if status == "failed" else None
+    store.update_job(name, record.attempt, status="running")
+    return store.update_job(name, record.attempt, status=status, error=error)
+
+
+def delivery(redis: Redis, place: int = 0, name: str = "j1") -> Delivery:
+    """How the message to one of the job's webhooks fares."""
+    record = RedisRecordStore(redis).get_job(name)
+    assert record is not None
+    return RedisOutbox(redis).deliveries(record)[place]
+
+
+def ask(redis: Redis, url: str, name: str = "j1") -> JobRecord:
+    """Another request of alice's for the same job, with a webhook of its own."""
+    store = RedisRecordStore(redis)
+    request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
+    now = store.now()
+    return store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)[0]
