@@ -1,11 +1,15 @@
-"""What is said of cameras at the command line, as entries of a description."""
+"""What is said of cameras at the command line: the options, and the entries of a description that they become."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+import typer
+
+from regnf_cli.paths import existing, folder
 from regnf_core.errors import InvalidOptionsError
 
 
@@ -14,6 +18,37 @@ class Axes(StrEnum):
 
     OPENCV = "opencv"
     OPENGL = "opengl"
+
+
+Images = Annotated[
+    Path | None,
+    typer.Option(
+        help="The posed depth images that the field was fitted to: the safe field then records which parts the "
+        "cameras observed.",
+        parser=folder,
+        metavar="FOLDER",
+    ),
+]
+Cameras = Annotated[
+    Path | None,
+    typer.Option(
+        help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
+        "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
+        "image is needed.",
+        parser=existing,
+        metavar="PATH",
+    ),
+]
+Intrinsics = Annotated[
+    str | None,
+    typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
+]
+CameraAxes = Annotated[
+    Axes | None,
+    typer.Option(
+        "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
+    ),
+]
 
 
 def with_cameras(description: dict[str, Any] | None, intrinsics: str | None, axes: str | None) -> dict[str, Any] | None:

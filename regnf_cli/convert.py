@@ -7,16 +7,16 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from regnf_cli.camera_options import Axes, with_cameras
+from regnf_cli.camera_options import CameraAxes, Cameras, Images, Intrinsics, with_cameras
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
-from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
-from regnf_cli.paths import FIELD, existing, folder
+from regnf_cli.field_options import choice_of, source_of
+from regnf_cli.options import Config, Description, Field, NoConfig
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.field_source import FieldSource
 
@@ -24,58 +24,43 @@ _SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
 _GRID_MOST = 1024
 
 
+Resolution = Annotated[
+    int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
+]
+
+
 def convert(
-    field: Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)],
+    field: Field,
     output: Annotated[
         Path, typer.Argument(metavar="OUT", help="The file to write: *.safetensors, .glb, .ply or .npz.")
     ],
-    resolution: Annotated[
-        int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
-    ] = 128,
-    description: Annotated[
-        dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **CONFIG)
-    ] = None,
-    no_config: Annotated[
-        bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")
-    ] = False,
-    images: Annotated[
-        Path | None,
-        typer.Option(
-            help="The posed depth images that the field was fitted to: the safe field then records which parts the "
-            "cameras observed.",
-            parser=folder,
-            metavar="FOLDER",
-        ),
-    ] = None,
-    cameras: Annotated[
-        Path | None,
-        typer.Option(
-            help="Where the cameras stood whose images the field was made from: transforms.json, meta_data.json, "
-            "poses of TUM, or a folder with a pose a file. The safe field then records which parts they observed; no "
-            "image is needed.",
-            parser=existing,
-            metavar="PATH",
-        ),
-    ] = None,
-    intrinsics: Annotated[
-        str | None,
-        typer.Option(help="Of the cameras, in pixels, where their file does not say.", metavar="FX,FY,CX,CY[,W,H]"),
-    ] = None,
-    axes: Annotated[
-        Axes | None,
-        typer.Option(
-            "--camera-axes", help="Where cameras look: opencv along z, opengl against z. By default the file's own way."
-        ),
-    ] = None,
+    resolution: Resolution = 128,
+    description: Description = None,
+    config: Config = None,
+    no_config: NoConfig = False,
+    images: Images = None,
+    cameras: Cameras = None,
+    intrinsics: Intrinsics = None,
+    axes: CameraAxes = None,
 ) -> None:
     """Write a field as a safe field (.safetensors), as the mesh of its surface (.glb, .ply) or as a dense grid (.npz).
 
     Example: **regnf convert step-000030000.ckpt chair.glb --resolution 256**
     """
     require("engine")
+    _check(output, images, cameras)
+    said = with_cameras(description, intrinsics, None if axes is None else axes.value)
+    if said is not description and cameras is None:
+        raise InvalidOptionsError("--intrinsics and --camera-axes go with --cameras")
+    source = source_of(field, said, choice_of(config, no_config))
+    if output.suffix.lower() == ".safetensors":
+        _to_safe_field(source, output, images, cameras)
+    else:
+        _evaluated(source, output, resolution)
+
+
+def _check(output: Path, images: Path | None, cameras: Path | None) -> None:
+    """Refuse before the work what would fail after it."""
     if output.suffix.lower() not in _SUFFIXES:
         message = f"{output}: expected a name that ends in one of {', '.join(_SUFFIXES)}"
         raise InvalidOptionsError(message, hint="The ending chooses the format.")
@@ -85,14 +70,6 @@ def convert(
         raise InvalidOptionsError("--images and --cameras go with a safe field (.safetensors)")
     if images is not None and cameras is not None:
         raise InvalidOptionsError("--images and --cameras: images tell more, give them alone")
-    said = with_cameras(description, intrinsics, None if axes is None else axes.value)
-    if said is not description and cameras is None:
-        raise InvalidOptionsError("--intrinsics and --camera-axes go with --cameras")
-    source = source_of(field, said, choice_of(config, no_config))
-    if output.suffix.lower() == ".safetensors":
-        _to_safe_field(source, output, images, cameras)
-    else:
-        _evaluated(source, output, resolution)
 
 
 def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None) -> None:

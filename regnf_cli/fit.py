@@ -4,73 +4,52 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
+from regnf_cli.fit_options import (
+    Device,
+    DeviceChoice,
+    Extent,
+    HiddenWidth,
+    Iterations,
+    Label,
+    Pictures,
+    RefinePoses,
+    SafeField,
+    Sdfstudio,
+    Snapshots,
+    Source,
+    Start,
+    StartChoice,
+    TableLog2,
+)
+from regnf_cli.options import Seed
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
 
 _LONGEST_LABEL = 200  # of the safe format
-
-
-class StartChoice(StrEnum):
-    """A ball, a hollow ball round the cameras, or what the cameras' places suggest."""
-
-    auto = "auto"
-    object = "object"
-    room = "room"
-
-
-class DeviceChoice(StrEnum):
-    """Where to compute; auto: a GPU if there is one."""
-
-    auto = "auto"
-    cpu = "cpu"
-    cuda = "cuda"
+_OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto)
 
 
 def fit(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True
-        ),
-    ],
-    output: Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")],
-    iterations: Annotated[int, typer.Option(min=1, help="Training steps; more is finer.")] = 3000,
-    table_log2: Annotated[int, typer.Option(min=8, max=22, help="log2 of the entries per hash level.")] = 15,
-    extent: Annotated[
-        float | None,
-        typer.Option(
-            help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
-            "Else its own frame."
-        ),
-    ] = None,
-    label: Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1)] = 0,
-    hidden_width: Annotated[
-        int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
-    ] = None,
-    snapshots: Annotated[
-        str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
-    ] = None,
-    sdfstudio: Annotated[
-        Path | None,
-        typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt)."),
-    ] = None,
-    pictures: Annotated[
-        bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")
-    ] = False,
-    start: Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")] = StartChoice.auto,
-    refine_poses: Annotated[
-        bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
-    ] = False,
-    device: Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")] = DeviceChoice.auto,
+    source: Source,
+    output: SafeField,
+    iterations: Iterations = 3000,
+    table_log2: TableLog2 = 15,
+    extent: Extent = None,
+    label: Label = None,
+    seed: Seed = 0,
+    hidden_width: HiddenWidth = None,
+    snapshots: Snapshots = None,
+    sdfstudio: Sdfstudio = None,
+    pictures: Pictures = False,
+    start: Start = StartChoice.auto,
+    refine_poses: RefinePoses = False,
+    device: Device = DeviceChoice.auto,
 ) -> None:
     """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
 
@@ -80,33 +59,23 @@ def fit(
     """
     require("engine")
     _check(output, extent, label)
+    settings: dict[str, Any] = {"iterations": iterations} | (
+        {} if hidden_width is None else {"hidden_width": hidden_width}
+    )
+    rest = {"seed": seed, "label": label}
     if not source.is_dir():
-        if (
-            snapshots is not None
-            or sdfstudio is not None
-            or pictures
-            or start is not StartChoice.auto
-            or refine_poses
-            or device is not DeviceChoice.auto
-        ):
+        if (snapshots, sdfstudio, pictures, start, refine_poses, device) != _OF_IMAGES_UNSAID:
             named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses and --device"
             raise InvalidOptionsError(f"{named} are for images")
-        settings = {"iterations": iterations} | ({} if hidden_width is None else {"hidden_width": hidden_width})
-        _fit_mesh(source, output, settings, table_log2, extent, {"seed": seed, "label": label})
+        _fit_mesh(source, output, settings, table_log2, extent, rest)
         return
     if extent is not None:
         raise InvalidOptionsError("--extent is for meshes: a dataset has its own frame")
     from regnf_cli.fit_images import fit_images
 
-    choices: dict[str, Any] = {
-        "iterations": iterations,
-        "table_log2": table_log2,
-        "start": start.value,
-        "refine_poses": refine_poses,
-    }
-    choices |= {} if hidden_width is None else {"hidden_width": hidden_width}
+    settings |= {"table_log2": table_log2, "start": start.value, "refine_poses": refine_poses}
     files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures}
-    fit_images(source, output, choices, files, {"seed": seed, "label": label, "device": device.value})
+    fit_images(source, output, settings, files, rest | {"device": device.value})
 
 
 def _fit_mesh(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,33 +15,28 @@ import typer
 from regnf_cli.candidates import keep_pictures
 from regnf_cli.console import out
 from regnf_cli.extras import require
-from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
-from regnf_cli.paths import FIELD
+from regnf_cli.field_options import choice_of, source_of
+from regnf_cli.options import Config, Description, Field, NoConfig
 from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
+
+Picture = Annotated[Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)]
+Candidates = Annotated[
+    Path | None,
+    typer.Option(
+        help="Where to write pictures of what the file may be, if nothing in it tells.",
+        file_okay=False,
+        metavar="FOLDER",
+    ),
+]
 
 
 def inspect(
-    field: Annotated[Path, typer.Argument(help="A file, a training run's folder or an archive of one.", **FIELD)],
-    description: Annotated[
-        dict[str, Any] | None, typer.Option(help="What the file does not say: a file or JSON.", **DESCRIPTION)
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option(help="The settings that the field was trained with: a file or an archive.", **CONFIG)
-    ] = None,
-    no_config: Annotated[
-        bool, typer.Option("--no-config", help="Leave settings that lie beside the checkpoint unread.")
-    ] = False,
-    picture: Annotated[
-        Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)
-    ] = None,
-    candidates: Annotated[
-        Path | None,
-        typer.Option(
-            help="Where to write pictures of what the file may be, if nothing in it tells.",
-            file_okay=False,
-            metavar="FOLDER",
-        ),
-    ] = None,
+    field: Field,
+    description: Description = None,
+    config: Config = None,
+    no_config: NoConfig = False,
+    picture: Picture = None,
+    candidates: Candidates = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
 ) -> None:
     """Say what a field file is: its format and how it was recognized, bounds, parameters, plausibility.
@@ -50,17 +46,10 @@ def inspect(
     A file that may be one of several functions is refused with what to say for each; `--candidates` draws them.
     """
     require("engine")
-    import tempfile
-
+    _check(picture, candidates)
     from regnf_core.importing.gate.gate import ImportLimits, import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
-    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
-        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
-        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
-    if candidates is not None and not candidates.parent.is_dir():
-        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
-        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
     source = source_of(field, description, choice_of(config, no_config))
     drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:
@@ -73,6 +62,16 @@ def inspect(
         out.print_json(json.dumps(report))
     else:
         _show(report)
+
+
+def _check(picture: Path | None, candidates: Path | None) -> None:
+    """Refuse before the work what would fail after it."""
+    if picture is not None and (picture.suffix.lower() != ".png" or not picture.parent.is_dir()):
+        message = f"--picture {picture}: expected a name that ends in .png, in a folder that exists"
+        raise InvalidOptionsError(message, hint="Write for example --picture field.png.")
+    if candidates is not None and not candidates.parent.is_dir():
+        message = f"--candidates {candidates}: {candidates.parent} is no folder that exists"
+        raise InvalidOptionsError(message, hint=f"Make it: mkdir -p {candidates.parent}")
 
 
 @contextmanager

@@ -29,28 +29,28 @@ class Trajectory(StrEnum):
     SINGLE = "single"
 
 
+Source = Annotated[
+    Path,
+    typer.Argument(help="A mesh (glb, obj, ply, stl; meters, z up) or a layout (.json).", exists=True, dir_okay=False),
+]
+Meshes = Annotated[Path | None, typer.Option(help="The folder with the layout's meshes.", exists=True, file_okay=False)]
+Frames = Annotated[
+    int | None, typer.Option(min=1, max=10_000, help="Images; else 60 or 20 of a mesh, 240 or 60 of a layout.")
+]
+UnitsPerMeter = Annotated[float | None, typer.Option(help="World units a meter; else the layout's, or 1 for a mesh.")]
+
+
 def render_dataset(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            help="A mesh (glb, obj, ply, stl; meters, z up) or a layout (.json).", exists=True, dir_okay=False
-        ),
-    ],
+    source: Source,
     output: Annotated[Path, typer.Argument(metavar="OUT", help="The folder to make, in the sdfstudio data format.")],
-    meshes: Annotated[
-        Path | None, typer.Option(help="The folder with the layout's meshes.", exists=True, file_okay=False)
-    ] = None,
+    meshes: Meshes = None,
     trajectory: Annotated[Trajectory, typer.Option(help="All round, a walk past, or one bad view.")] = Trajectory.LONG,
     instance: Annotated[str | None, typer.Option(help="Which of the layout's instances a single view shows.")] = None,
-    frames: Annotated[
-        int | None, typer.Option(min=1, max=10_000, help="Images; else 60 or 20 of a mesh, 240 or 60 of a layout.")
-    ] = None,
+    frames: Frames = None,
     width: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 160,
     height: Annotated[int, typer.Option(min=8, max=_LARGEST_EDGE)] = 120,
     noise: Annotated[bool, typer.Option(help="A depth camera's errors, or exact depths.")] = True,
-    units_per_meter: Annotated[
-        float | None, typer.Option(help="World units a meter; else the layout's, or 1 for a mesh.")
-    ] = None,
+    units_per_meter: UnitsPerMeter = None,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of the noise.")] = 0,
 ) -> None:
     """Render posed RGB-D images of a mesh or of a furnished room, with boxes and true transforms.

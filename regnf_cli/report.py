@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from rich.markup import escape
@@ -16,6 +17,16 @@ _COLORS = {"registered": "green", "ambiguous": "yellow"}
 def exit_code(document: dict[str, Any]) -> int:
     """0 for a registered result, 4 for an ambiguous one, 1 for a rejected one."""
     return _EXIT_CODES.get(document["verdict"], EXIT_NOT_REGISTERED)
+
+
+def show(document: dict[str, Any], as_json: bool, top: int = 0) -> None:
+    """Print a result document as JSON, or in words, after the ``top`` likeliest candidates of a search."""
+    if as_json:
+        out.print_json(json.dumps(document))
+        return
+    if top:
+        show_ranking(document, top)
+    show_result(document)
 
 
 def show_result(document: dict[str, Any]) -> None:

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from regnf_cli.console import out, phase_progress
+from regnf_cli.console import phase_progress
 from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
+from regnf_cli.options import (
+    AsJson,
+    CancelOnInterrupt,
+    DetectionFile,
+    DetectionIndex,
+    NoConfigs,
+    Output,
+    Scene,
+    SceneConfig,
+    SceneDescription,
+    Seed,
+    Server,
+    Token,
+    WorkerTimeout,
+)
 from regnf_cli.output import prepare, write_into
-from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT, library_path
-from regnf_cli.report import exit_code, show_ranking, show_result
+from regnf_cli.paths import JSON_FILE, library_path
+from regnf_cli.report import exit_code, show
 from regnf_cli.request_files import read_detection, read_options
 from regnf_cli.scene_file import check_box_by_header, open_scene
 from regnf_core.detections import Detection
@@ -22,59 +37,44 @@ from regnf_core.errors import InvalidInputError, NoSurfaceError
 from regnf_core.field_files import checkpoint_below
 from regnf_core.field_source import FieldSource
 from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
-from regnf_core.options import RegistrationOptions
+from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
+    from regnf_core.library import LibraryObject
 
 _MOST = 512
 
 
+Library = Annotated[
+    list[Path],
+    typer.Argument(help="Folders of fields, or fields: the objects.", parser=library_path, metavar="LIBRARY..."),
+]
+Top = Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")]
+Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)]
+ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)]
+ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same of every object.", **DESCRIPTION)]
+
+
 def search(
-    scene: Annotated[
-        Path,
-        typer.Argument(help="The scene's field: a file, a run's folder or an archive.", **FIELD | {"metavar": "SCENE"}),
-    ],
-    library: Annotated[
-        list[Path],
-        typer.Argument(help="Folders of fields, or fields: the objects.", parser=library_path, metavar="LIBRARY..."),
-    ],
-    detection: Annotated[
-        Path, typer.Option(help="JSON: the box in the scene's frame and units, in any common form.", **JSON_FILE)
-    ],
-    detection_index: Annotated[
-        int | None, typer.Option(min=0, help="Which one, where the file holds a list of detections; 0 is the first.")
-    ] = None,
-    top: Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")] = 5,
-    options: Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)] = None,
-    scene_config: Annotated[
-        Path | None, typer.Option(help="The settings that the scene was trained with: a file or an archive.", **CONFIG)
-    ] = None,
-    object_config: Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)] = None,
-    no_config: Annotated[
-        bool, typer.Option("--no-config", help="Leave settings that lie beside a checkpoint unread.")
-    ] = False,
-    scene_description: Annotated[
-        dict[str, Any] | None, typer.Option(help="What the scene's file does not say: a file or JSON.", **DESCRIPTION)
-    ] = None,
-    object_description: Annotated[
-        dict[str, Any] | None, typer.Option(help="The same of every object.", **DESCRIPTION)
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1)] = 0,
-    output: Annotated[
-        Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", **OUTPUT)
-    ] = None,
-    server: Annotated[
-        str | None, typer.Option(help="Address of a regnf service; without it the work is done here.")
-    ] = None,
-    worker_timeout: Annotated[
-        int, typer.Option(min=0, help="With --server: seconds to wait for a worker before giving up.")
-    ] = 60,
-    cancel_on_interrupt: Annotated[
-        bool, typer.Option("--cancel-on-interrupt", help="With --server: Ctrl+C cancels the job; it goes on otherwise.")
-    ] = False,
-    token: Annotated[str | None, typer.Option(envvar="REGNF_API_TOKEN", help="The service's bearer token.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the whole result document.")] = False,
+    scene: Scene,
+    library: Library,
+    detection: DetectionFile,
+    detection_index: DetectionIndex = None,
+    top: Top = 5,
+    options: Options = None,
+    scene_config: SceneConfig = None,
+    object_config: ObjectConfig = None,
+    no_config: NoConfigs = False,
+    scene_description: SceneDescription = None,
+    object_description: ObjectDescription = None,
+    seed: Seed = 0,
+    output: Output = None,
+    server: Server = None,
+    worker_timeout: WorkerTimeout = 60,
+    cancel_on_interrupt: CancelOnInterrupt = False,
+    token: Token = None,
+    as_json: AsJson = False,
 ) -> None:
     """Find which object of a library stands in the box, and where.
 
@@ -83,34 +83,32 @@ def search(
     Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
     """
     box = read_detection(detection, detection_index)
-    request: dict[str, Any] = {
-        "detection": box.canonical(),
-        "options": read_options(options, None),
-        "seed": seed,
-    }
-    if RegistrationOptions.from_dict(request["options"]).preset != "robust":
-        message = f"{options}: only the preset robust searches a library"
-        hint = "Leave the preset out of the options."
-        raise InvalidInputError(message, reason="LIBRARY_SEARCH_UNSUPPORTED", hint=hint)
+    request = _request(box, options, seed)
     place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
     check_box_by_header(place.file, box)
     settings = choice_of(object_config, no_config)
     objects = [source_of(path, object_description, settings, "object") for path in library_files(library)]
-    if server is not None:
+    if server is None:
+        require("engine")
+        document = _search_here(place, objects, box, request, output)
+    else:
         from regnf_cli.remote import RemoteService
         from regnf_cli.remote_exchange import Delivery, search_remotely
 
         service = RemoteService(server, token, worker_timeout)
         document = search_remotely(service, place, objects, request, Delivery(output, cancel_on_interrupt))
-    else:
-        require("engine")
-        document = _search_here(place, objects, box, request, output)
-    if as_json:
-        out.print_json(json.dumps(document))
-    else:
-        show_ranking(document, top)
-        show_result(document)
+    show(document, as_json, top)
     raise typer.Exit(exit_code(document))
+
+
+def _request(box: Detection, options: Path | None, seed: int) -> dict[str, Any]:
+    """What a service is asked, too."""
+    request: dict[str, Any] = {"detection": box.canonical(), "options": read_options(options, None), "seed": seed}
+    if RegistrationOptions.from_dict(request["options"]).preset != "robust":
+        message = f"{options}: only the preset robust searches a library"
+        hint = "Leave the preset out of the options."
+        raise InvalidInputError(message, reason="LIBRARY_SEARCH_UNSUPPORTED", hint=hint)
+    return request
 
 
 def library_files(named: list[Path]) -> list[Path]:
@@ -150,32 +148,42 @@ def _field_of(source: FieldSource) -> SdfField:
     return load_field(source).field
 
 
+def _modeled(
+    objects: list[FieldSource], options: RobustOptions, progress: Callable[[float], None]
+) -> tuple[list[LibraryObject], dict[str, str]]:
+    """The objects with their models, and of those that are none the reasons, by name. Raises NoSurfaceError: all."""
+    from regnf_cli.object_models import object_model
+    from regnf_core.library import LibraryObject
+
+    library, unusable = [], {}
+    for taken, one in enumerate(objects):
+        progress(taken / len(objects))
+        try:
+            model = object_model(one, options)
+        except NoSurfaceError as error:
+            unusable[str(one.named)] = error.reason
+        else:
+            library.append(LibraryObject(str(one.named), partial(_field_of, one), model))
+    if not library:
+        raise NoSurfaceError("none of the files is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+    return library, unusable
+
+
 def _search_here(
     scene: FieldSource, objects: list[FieldSource], detection: Detection, request: dict[str, Any], output: Path | None
 ) -> dict[str, Any]:
-    from regnf_cli.object_models import object_model
     from regnf_core.geometry.box import OrientedBox
-    from regnf_core.library import LibraryObject, search_library
+    from regnf_core.library import search_library
     from regnf_core.loading import safe_field
     from regnf_core.viewing import ranking_document, result_document
 
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)
     prepare(output)
-    library, unusable = [], {}
     with phase_progress() as bar:
         task = bar.add_task("library", total=1.0)
         opened = open_scene(scene, detection)
-        for taken, one in enumerate(objects):
-            bar.update(task, completed=taken / len(objects))
-            try:
-                model = object_model(one, options.robust)
-            except NoSurfaceError as error:
-                unusable[str(one.named)] = error.reason
-            else:
-                library.append(LibraryObject(str(one.named), partial(_field_of, one), model))
-        if not library:
-            raise NoSurfaceError("none of the files is usable as an object", reason="NO_SURFACE_IN_OBJECT")
+        library, unusable = _modeled(objects, options.robust, lambda share: bar.update(task, completed=share))
         found = search_library(
             opened.field,
             box,

@@ -1,0 +1,66 @@
+"""The options of ``regnf fit``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class StartChoice(StrEnum):
+    """A ball, a hollow ball round the cameras, or what the cameras' places suggest."""
+
+    auto = "auto"
+    object = "object"
+    room = "room"
+
+
+class DeviceChoice(StrEnum):
+    """Where to compute; auto: a GPU if there is one."""
+
+    auto = "auto"
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+# of both kinds of sources
+
+Source = Annotated[
+    Path,
+    typer.Argument(help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True),
+]
+SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
+Iterations = Annotated[int, typer.Option(min=1, help="Training steps; more is finer.")]
+TableLog2 = Annotated[int, typer.Option(min=8, max=22, help="log2 of the entries per hash level.")]
+Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
+HiddenWidth = Annotated[
+    int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")
+]
+
+# of meshes
+
+Extent = Annotated[
+    float | None,
+    typer.Option(
+        help="Meshes: center it and scale its longest edge to this many units (up to 2 always fits). "
+        "Else its own frame."
+    ),
+]
+
+# of images
+
+Snapshots = Annotated[
+    str | None, typer.Option(help="Images: percents of the training to write the field after too, such as 1,3,10.")
+]
+Sdfstudio = Annotated[
+    Path | None,
+    typer.Option(help="Images: write a checkpoint in sdfstudio's layout too, colors included (.ckpt)."),
+]
+Pictures = Annotated[bool, typer.Option("--pictures", help="Images: draw the field early on and at the end.")]
+Start = Annotated[StartChoice, typer.Option(help="Images: the shape to start from.")]
+RefinePoses = Annotated[
+    bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
+]
+Device = Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")]
