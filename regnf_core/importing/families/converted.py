@@ -48,6 +48,16 @@ class OpenReading:
 
 
 @dataclass(frozen=True)
+class Variant:
+    """Another function of the same tensors. say: the entries of a description that choose it · of: makes it of the
+    reading that is chosen otherwise."""
+
+    name: str
+    say: dict[str, Any]
+    of: Callable[[Reading], Reading]
+
+
+@dataclass(frozen=True)
 class ConvertedField:
     """A field ready to be written: the safe file's description and tensors, and how the family was recognized."""
 
@@ -63,6 +73,8 @@ class ConvertedField:
     open_readings: tuple[OpenReading, ...] = ()
     """The same where what decides is how a network of plain layers behaves; see
     :mod:`regnf_core.importing.gate.network_form`."""
+    untold: tuple[Variant, ...] = ()
+    """Functions between which no behavior decides: a person is asked, once the readings are settled."""
     sign_is_open: bool = False
     """Whether trainers of this family save fields of either sign, and the upload does not say which this is."""
 

@@ -2,21 +2,27 @@
 
 The network sees [x / r, grid((x + r) / 2r)] for a scene within [-r, r]^3. Its progressive grid opens a level every
 thousand steps, from four on; how many are open is not saved, but the number of steps is.
+
+Between the layers is softplus where the network began as a sphere, else ReLU. Trained networks of either behave alike
+when they are read as the other, and differ by a percent of their range. But a sphere's last layer begins with weights
+of one sign, and keeps them.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
-from regnf_core.importing.families.converted import ConvertedField, converted_of
+from regnf_core.importing.families.converted import ConvertedField, Reading, Variant, converted_of
 from regnf_core.importing.families.grid_field import space_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces
-from regnf_core.importing.families.layers import Layers, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.layers import Layers, folded_weight, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import contradiction, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.sphere_start import began_as_a_sphere
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import UploadDescription
 
@@ -26,6 +32,7 @@ _TABLE = "encoding.encoding.params"
 _PROGRESSIVE_TABLE = "encoding.encoding.encoding.params"
 _HABITS = GridHabits((2, 4, 8, 1), "linear", writes_growth=True)
 _SHARPER = 1e4
+"""ReLU is softplus of numbers so many times as large, but for 1e-6."""
 _FIRST_LEVELS, _STEPS_A_LEVEL = 4, 1000
 
 
@@ -49,6 +56,7 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     require_shape(table_name, table, (None,))
     spaces = find_spaces(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", f"scene_aabb: the scene lies within {radius:g} of 0"]
+    untold = _untold(state, layers, source, overrides, why)
     warnings: list[str] = []
     mask = overrides.level_mask
     if mask is None and table_name == _PROGRESSIVE_TABLE:
@@ -61,7 +69,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     }
     how: Literal["open", "known"] = "open" if overrides.hash.interpolation is None else "known"
     readings = space_readings(table, spaces, _in_scene_units(layers, radius), entries, how)
-    return converted_of(FAMILY, tuple(why), readings, tuple(warnings))
+    if overrides.activation == "relu":
+        readings = tuple(_with_relu(reading) for reading in readings)
+    return replace(converted_of(FAMILY, tuple(why), readings, tuple(warnings)), untold=untold)
 
 
 def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
@@ -78,18 +88,49 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
     return layers
 
 
+def _untold(
+    state: dict[str, Any], layers: Layers, source: TensorSource, overrides: UploadDescription, why: list[str]
+) -> tuple[Variant, ...]:
+    """Both activations where neither the description nor the weights tell which it is; what they tell goes to
+    ``why``."""
+    if overrides.output_bias is None and overrides.output_scale is None:
+        why.append("nothing is said of sdf_bias and sdf_activation: none is assumed")
+    if overrides.activation is not None:
+        return ()
+    if not began_as_a_sphere(folded_weight(state, f"network.layers.{2 * len(layers.weights) - 2}", source)):
+        return _ACTIVATIONS
+    why.append("softplus: the last layer's weights have one sign, as those that begin as a sphere")
+    return ()
+
+
 def _said(layers: Layers, overrides: UploadDescription) -> Layers:
-    """The layers with what the settings say of them: ReLU instead of softplus (``sphere_init: false``), and
-    (result + output_bias) output_scale. ReLU is softplus of numbers a ten thousand times as large, but for 1e-6."""
+    """The layers with what the settings say of them: (result + output_bias) output_scale."""
     if overrides.activation not in (None, "softplus", "relu"):
         message = f"description.activation: {overrides.activation} means nothing for {FAMILY}: softplus or relu"
         raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
-    sharp = np.float32(_SHARPER if overrides.activation == "relu" else 1.0)
     scale = np.float32(overrides.output_scale or 1.0)
     (*weights, last), (*biases, last_bias) = layers.weights, layers.biases
-    weights[0] = weights[0] * sharp
     bias = (last_bias + np.float32(overrides.output_bias or 0.0)) * scale
-    return Layers((*weights, last * (scale / sharp)), (*(one * sharp for one in biases), bias))
+    return Layers((*weights, last * scale), (*biases, bias))
+
+
+def _with_relu(reading: Reading) -> Reading:
+    """ReLU in place of softplus (``sphere_init: false``)."""
+    last = max(int(name.split(".")[1]) for name in reading.tensors if name.startswith("layers."))
+    factors = {"layers.0.weight": _SHARPER, f"layers.{last}.weight": 1.0 / _SHARPER}
+    factors |= {f"layers.{layer}.bias": _SHARPER for layer in range(last)}
+    sharper = {name: np.asarray(reading.tensors[name] * by, dtype=np.float32) for name, by in factors.items()}
+    return replace(reading, tensors={**reading.tensors, **sharper})
+
+
+def _as_it_is(reading: Reading) -> Reading:
+    return reading
+
+
+_ACTIVATIONS = (
+    Variant("softplus between the layers", {"activation": "softplus"}, _as_it_is),
+    Variant("ReLU between the layers", {"activation": "relu"}, _with_relu),
+)
 
 
 def _scene_cube(state: dict[Any, Any], source: TensorSource) -> tuple[list[list[float]], float]:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.families.converted import Reading
+from regnf_core.importing.families.converted import ConvertedField, Reading
 
 
 @dataclass(frozen=True)
@@ -33,3 +34,14 @@ class AmbiguousError(FieldFormatError):
             if one.say:
                 lines.setdefault(json.dumps(one.say, sort_keys=True), one)
         self.asked = tuple(lines.values())[:MOST_CANDIDATES]
+
+
+def require_told(converted: ConvertedField) -> None:
+    """Raise AmbiguousError where the file leaves functions between which no behavior decides."""
+    if not converted.untold:
+        return
+    reading = Reading(converted.family, converted.description, converted.tensors)
+    asked = [OpenCandidate(one.name, one.say, partial(one.of, reading)) for one in converted.untold]
+    lines = " or ".join(json.dumps(one.say) for one in asked)
+    message = f"neither the tensors nor how they behave tell which function this is; add to the description {lines}"
+    raise AmbiguousError(message, asked)

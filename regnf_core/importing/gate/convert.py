@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_notes import WARNINGS, kept_warnings
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
-from regnf_core.importing.gate.ambiguity import AmbiguousError
+from regnf_core.importing.gate.ambiguity import AmbiguousError, require_told
 from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
@@ -190,11 +190,12 @@ def _settled(converted: ConvertedField) -> ConvertedField:
         from regnf_core.importing.gate.network_form import settle_form  # loads torch
 
         converted = settle_form(converted)
-    if not converted.readings:
-        return converted
-    from regnf_core.importing.gate.choice import choose_reading  # loads torch
+    if converted.readings:
+        from regnf_core.importing.gate.choice import choose_reading  # loads torch
 
-    return choose_reading(converted)
+        converted = choose_reading(converted)
+    require_told(converted)
+    return converted
 
 
 def _draw_asked(error: AmbiguousError, out_dir: Path, left_s: float) -> None:

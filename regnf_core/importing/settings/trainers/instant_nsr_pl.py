@@ -65,10 +65,9 @@ def _network(network: Keys, geometry: Keys, said: Said) -> None:
     first = said.facts.shape("geometry.network.layers.0.bias") or said.facts.shape("geometry.network.layers.0.weight_v")
     said.agree(network, "n_neurons", first[0] if first else None)
     said.agree(network, "n_hidden_layers", said.facts.hidden_layers("geometry.network.layers."))
-    if network.flag("sphere_init") is False:
-        said.put("activation", "relu", network, "sphere_init")
-    elif network.has("sphere_init"):
-        said.note(network, "sphere_init")
+    starts_round = network.flag("sphere_init")
+    if starts_round is not None:
+        said.put("activation", "softplus" if starts_round else "relu", network, "sphere_init")
     _output(geometry, said)
 
 

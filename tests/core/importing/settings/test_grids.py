@@ -23,7 +23,7 @@ NSR_HASH = {
 @pytest.mark.parametrize("name", ["neus-blender", "neus-dtu", "neus-dtu-wmask", "neus-colmap"])
 def test_instant_nsr_pl(name: str) -> None:
     found = translated({f"{name}.yaml": nsr("HashGrid")}, facts(global_step=20000))
-    assert found.values == {"family": "instant_nsr_pl", "hash": NSR_HASH, "level_mask": 16}
+    assert found.values == {"family": "instant_nsr_pl", "activation": "softplus", "hash": NSR_HASH, "level_mask": 16}
 
 
 @pytest.mark.parametrize(("step", "opened"), [(0, 4), (999, 4), (5000, 9), (20000, 16)])
