@@ -73,7 +73,7 @@ def settle_form(converted: ConvertedField) -> ConvertedField:
     if not any(min(one.trial.misses) < _DISTANCE_LIKE for one in finalists):
         raise _undecided(finalists or _as_candidates(readings), "none behaves like a distance")
     ends = any(one.open.ends_at is not None for one in finalists)
-    chosen, how = _by_end(finalists) if ends else _by_misses(finalists)
+    chosen, how, *warnings = _by_end(finalists) if ends else _by_misses(finalists)
     if len(readings) < len(converted.open_readings):
         raise _undecided([chosen], "the network is too large to try all")
     if chosen.improvable:
@@ -86,6 +86,7 @@ def settle_form(converted: ConvertedField) -> ConvertedField:
         why=(*converted.why, why),
         description=reading.description,
         tensors=reading.tensors,
+        warnings=(*converted.warnings, *warnings),
         open_readings=(),
     )
 
@@ -136,15 +137,21 @@ def _much_better(one: _Candidate, other: _Candidate) -> bool:
     return any(_CLEARLY * a < b for a, b in zip(one.trial.misses, other.trial.misses, strict=True))
 
 
-def _by_end(candidates: list[_Candidate]) -> tuple[_Candidate, str]:
-    """By where training ended. Nothing else tells a network from itself at another scale."""
+def _by_end(candidates: list[_Candidate]) -> tuple[_Candidate, str, str]:
+    """By where training ended. Nothing else tells a network from itself at another scale: the gradient is as long at
+    each. The trainer looks a little farther or less far, so scales near the one that is taken would look alike."""
     fitting = []
     for one in candidates:
         radius, contrast = end_of_training(one.field)
         ratio = radius / (one.open.ends_at or math.inf)
         trained = min(one.trial.misses) < _DISTANCE_LIKE
         if trained and contrast >= _SHARP_END and _END[0] <= ratio <= _END[1]:
-            fitting.append((one, f"the gradient's length is 1 up to a radius of {radius:.2f} and not beyond"))
+            how = f"the gradient's length is 1 up to a radius of {radius:.2f} and not beyond"
+            alike = f"{ratio / _END[1]:.2f} to {ratio / _END[0]:.2f}"
+            warning = (
+                f"SCALE_ASSUMED: {one.open.name} is taken, as published; where training ended fits {alike} times it"
+            )
+            fitting.append((one, how, f"{warning} as well, and lengths would be off by as much: say the trainer's own"))
     if len(fitting) != 1:
         raise _undecided(candidates, "where training ended does not show")
     return fitting[0]
