@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -21,6 +21,20 @@ def world(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
     made = make_world(tmp_path, any_redis)
     with made.client:
         yield made
+
+
+@pytest.fixture
+def worlds(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+    """Makes services with settings of their own."""
+    made: list[World] = []
+
+    def make(**settings: object) -> World:
+        made.append(make_world(tmp_path, any_redis, **settings))
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.client.close()
 
 
 @pytest.fixture(scope="session")

@@ -3,37 +3,32 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import httpx
 import pytest
-from redis import Redis
 
 from regnf_state.ownership import reference_of
 from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord
 from tests.contract.asgi import client_of
-from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
+from tests.contract.world import BOX, World, assert_refused, field_bytes, sha256
 
 TOKENS = frozenset({"greedy:the-greedy-one-s-token", "honest:the-honest-one-s-token"})
 HONEST = {"Authorization": "Bearer the-honest-one-s-token"}
 
 
 @pytest.fixture
-def shared(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+def shared(worlds: Callable[..., World]) -> Callable[..., World]:
     """Makes a service of two callers; its client is the greedy one's."""
-    made: list[World] = []
 
     def make(**settings: object) -> World:
-        made.append(make_world(tmp_path, any_redis, api_tokens=TOKENS, **settings))
-        made[-1].client.headers.update({"Authorization": "Bearer the-greedy-one-s-token"})
-        return made[-1]
+        made = worlds(api_tokens=TOKENS, **settings)
+        made.client.headers.update({"Authorization": "Bearer the-greedy-one-s-token"})
+        return made
 
-    yield make
-    for world in made:
-        world.client.close()
+    return make
 
 
 def put(client: httpx.Client, name: str) -> httpx.Response:

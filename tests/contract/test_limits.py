@@ -10,7 +10,6 @@ from pathlib import Path
 
 import httpx
 import pytest
-from redis import Redis
 
 from regnf_service.app import create_app
 from regnf_service.http.rate_limits import RedisRateLimiter
@@ -19,24 +18,8 @@ from regnf_service.upload_slots import UploadSlots
 from regnf_state.redis.client import connect
 from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
-from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
+from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
 from tests.stores import stores_over
-
-ALICE, BOB = {"Authorization": "Bearer one"}, {"Authorization": "Bearer two"}
-TOKENS = frozenset({"alice:one", "bob:two"})
-
-
-@pytest.fixture
-def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
-    made: list[World] = []
-
-    def make(**settings: object) -> World:
-        made.append(make_world(tmp_path, any_redis, **settings))
-        return made[-1]
-
-    yield make
-    for world in made:
-        world.client.close()
 
 
 def put(client: httpx.Client, name: str, size: int = 600, **headers: str) -> httpx.Response:
@@ -95,8 +78,8 @@ def test_without_a_word_there_is_no_rate_on_loopback(host: str, given: float | N
 # quotas
 
 
-def test_active_jobs(limited: Callable[..., World]) -> None:
-    world = limited(quota_active_jobs=2)
+def test_active_jobs(worlds: Callable[..., World]) -> None:
+    world = worlds(quota_active_jobs=2)
     first, _ = world.submit(seed=1), world.submit(seed=2)
     refused = world.client.post("/register", json=world.valid_request() | {"seed": 3})
     assert_refused(refused, 429, "QUOTA_ACTIVE_JOBS")
@@ -106,8 +89,8 @@ def test_active_jobs(limited: Callable[..., World]) -> None:
     world.submit(seed=3)
 
 
-def test_fields(limited: Callable[..., World]) -> None:
-    world = limited(quota_fields=2, api_tokens=TOKENS)
+def test_fields(worlds: Callable[..., World]) -> None:
+    world = worlds(quota_fields=2, api_tokens=TOKENS)
     world.client.headers.update(ALICE)
     assert [put(world.client, name).status_code for name in "ab"] == [201, 201]
     assert_refused(put(world.client, "c"), 403, "QUOTA_FIELDS")
@@ -119,8 +102,8 @@ def test_fields(limited: Callable[..., World]) -> None:
     assert put(world.client, "c").status_code == 201
 
 
-def test_stored_bytes(limited: Callable[..., World]) -> None:
-    world = limited(quota_stored_bytes=2000)
+def test_stored_bytes(worlds: Callable[..., World]) -> None:
+    world = worlds(quota_stored_bytes=2000)
     assert put(world.client, "a", 1500).status_code == 201
     assert_refused(put(world.client, "b", 501), 403, "QUOTA_STORED_BYTES")
     assert_refused(world.client.post("/fields", content=field_bytes("b", 501)), 403, "QUOTA_STORED_BYTES")
@@ -130,8 +113,8 @@ def test_stored_bytes(limited: Callable[..., World]) -> None:
     assert put(world.client, "c", 1500).status_code == 201, "the bytes of a rejected field were dropped"
 
 
-def test_a_field_that_grew_counts_as_what_it_became(limited: Callable[..., World]) -> None:
-    world = limited(quota_stored_bytes=2000)
+def test_a_field_that_grew_counts_as_what_it_became(worlds: Callable[..., World]) -> None:
+    world = worlds(quota_stored_bytes=2000)
     assert put(world.client, "a").status_code == 201
     name = sha256(field_bytes("a"))
     world.records.update_field(name, attempt=1, state="ready", report={"field_bytes": 1 << 31})
@@ -142,8 +125,8 @@ def test_a_field_that_grew_counts_as_what_it_became(limited: Callable[..., World
     assert put(world.client, "b").status_code == 201
 
 
-def test_bytes_under_way_count_too(limited: Callable[..., World]) -> None:
-    world = limited(quota_stored_bytes=3000, api_tokens=TOKENS)
+def test_bytes_under_way_count_too(worlds: Callable[..., World]) -> None:
+    world = worlds(quota_stored_bytes=3000, api_tokens=TOKENS)
     services = world.app.state.services
     alice, data = ALICE | {"Content-Type": "application/octet-stream"}, field_bytes("c", 1001)
     files = {"scene": ("s", field_bytes("s", 601)), "object": ("o", field_bytes("o")), "request": (None, "{}")}
@@ -171,8 +154,8 @@ def test_bytes_under_way_count_too(limited: Callable[..., World]) -> None:
         services.under_way.claim("alice", 1, 1).__enter__()
 
 
-def test_without_a_quota_uploads_under_way_are_not_bounded(limited: Callable[..., World]) -> None:
-    world = limited(api_tokens=TOKENS)
+def test_without_a_quota_uploads_under_way_are_not_bounded(worlds: Callable[..., World]) -> None:
+    world = worlds(api_tokens=TOKENS)
     with world.app.state.services.under_way.claim("alice", None, 1 << 50):
         assert put(world.client, "a", **ALICE).status_code == 201
 
@@ -194,8 +177,8 @@ class Sender:
         self.is_cut = True
 
 
-def test_uploads_at_once(limited: Callable[..., World]) -> None:
-    world = limited(max_uploads_per_caller=2, api_tokens=TOKENS)
+def test_uploads_at_once(worlds: Callable[..., World]) -> None:
+    world = worlds(max_uploads_per_caller=2, api_tokens=TOKENS)
     uploads = world.app.state.services.uploads
     with held(uploads, "alice", Sender(-99.0)):
         assert put(world.client, "a", **ALICE).status_code == 201
@@ -218,8 +201,8 @@ def held(uploads: UploadSlots, caller: str, sender: Sender) -> Iterator[None]:
     loop.close()
 
 
-def test_the_slowest_upload_makes_room(limited: Callable[..., World]) -> None:
-    world = limited(max_uploads_per_caller=3, api_tokens=TOKENS)
+def test_the_slowest_upload_makes_room(worlds: Callable[..., World]) -> None:
+    world = worlds(max_uploads_per_caller=3, api_tokens=TOKENS)
     senders = [Sender(-99.0), Sender(9.0), Sender(3.0)]
     uploads = world.app.state.services.uploads
     with ExitStack() as stack:
@@ -230,8 +213,8 @@ def test_the_slowest_upload_makes_room(limited: Callable[..., World]) -> None:
         assert uploads.taken == 3, "until it has been cleared up"
 
 
-def test_without_tokens_each_address_has_its_own_uploads(limited: Callable[..., World]) -> None:
-    world = limited(max_uploads_per_caller=2)
+def test_without_tokens_each_address_has_its_own_uploads(worlds: Callable[..., World]) -> None:
+    world = worlds(max_uploads_per_caller=2)
     uploads = world.app.state.services.uploads
     with held(uploads, "anonymous 127.0.0.2", Sender(-99.0)), held(uploads, "anonymous 127.0.0.2", Sender(-99.0)):
         assert put(world.client, "a").status_code == 201
@@ -239,8 +222,8 @@ def test_without_tokens_each_address_has_its_own_uploads(limited: Callable[..., 
         assert_refused(put(world.client, "b"), 429, "TOO_MANY_UPLOADS")
 
 
-def test_streams_at_once(limited: Callable[..., World]) -> None:
-    world = limited(max_streams_per_caller=1)
+def test_streams_at_once(worlds: Callable[..., World]) -> None:
+    world = worlds(max_streams_per_caller=1)
     job_id = world.submit()
     services = world.app.state.services
     with services.streams.held("anonymous"):

@@ -5,35 +5,23 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
+from functools import partial
 
 import httpx
 import pytest
-from redis import Redis
 
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.test_slow_clients import ended, submit
-from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
+from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
 
 MOST = 8
-TOKENS = frozenset({"alice:the-secret-of-alice", "bob:the-secret-of-bob"})
-ALICE = {"Authorization": "Bearer the-secret-of-alice"}
-BOB = {"Authorization": "Bearer the-secret-of-bob"}
 REQUEST = b"GET /openapi.yaml HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
 @pytest.fixture
-def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+def limited(worlds: Callable[..., World]) -> Callable[..., World]:
     """Makes a service where a caller has one request in progress."""
-    made: list[World] = []
-
-    def make(**settings: object) -> World:
-        made.append(make_world(tmp_path, any_redis, max_requests_per_caller=1, **settings))
-        return made[-1]
-
-    yield make
-    for world in made:
-        world.client.close()
+    return partial(worlds, max_requests_per_caller=1)
 
 
 @pytest.fixture(scope="module")

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import httpx
 import pytest
-from redis import Redis
 from starlette.types import Message, Receive, Scope, Send
 
 from regnf_service.http.buckets import Buckets
 from regnf_service.http.write_limits import WriteGate
 from regnf_state.settings import Settings
 from tests.contract.live import Live, live_service
-from tests.contract.world import NOBODY, World, assert_refused, field_bytes, make_world, sha256
+from tests.contract.world import ALICE, BOB, NOBODY, TOKENS, World, assert_refused, field_bytes, sha256
 
-TOKENS = frozenset({"alice:the-secret-of-alice", "bob:the-secret-of-bob"})
-ALICE = {"Authorization": "Bearer the-secret-of-alice"}
-BOB = {"Authorization": "Bearer the-secret-of-bob"}
 WRITES = [
     ("POST", "/register"), ("POST", "/v1/register"), ("POST", "/fields"), ("PUT", f"/fields/{'0' * 64}"),
     ("PATCH", f"/fields/{'0' * 64}"), ("DELETE", f"/fields/{'0' * 64}"), ("POST", f"/jobs/{NOBODY}/cancel"),
@@ -29,18 +24,10 @@ READS = ["/", "/fields", "/jobs", f"/jobs/{NOBODY}", "/version", "/openapi.yaml"
 
 
 @pytest.fixture
-def limited(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
+def limited(worlds: Callable[..., World]) -> Callable[..., World]:
     """Makes a service where two writes empty a bucket for minutes."""
-    made: list[World] = []
-
-    def make(**settings: object) -> World:
-        slow = {"write_limit_per_s": 0.01, "write_limit_burst": 2}
-        made.append(make_world(tmp_path, any_redis, **(slow | settings)))
-        return made[-1]
-
-    yield make
-    for world in made:
-        world.client.close()
+    slow = {"write_limit_per_s": 0.01, "write_limit_burst": 2}
+    return lambda **settings: worlds(**(slow | settings))
 
 
 @pytest.fixture(scope="module")

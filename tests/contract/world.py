@@ -22,6 +22,9 @@ from tests.stores import HeldBlobs, ShiftedJournaledRecords, WatchedQueue, store
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
 BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 NOBODY = "0" * 32
+TOKENS = frozenset({"alice:the-secret-of-alice", "bob:the-secret-of-bob"})
+ALICE = {"Authorization": "Bearer the-secret-of-alice"}
+BOB = {"Authorization": "Bearer the-secret-of-bob"}
 
 
 def field_bytes(name: str, size: int = 600) -> bytes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
@@ -41,6 +41,11 @@ router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
+_PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
+    200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
+    304: NOT_MODIFIED,
+    **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
+}
 
 
 def _require(services: Services, caller: str, sha256: str) -> FieldRecord:
@@ -90,11 +95,7 @@ async def get_field(
     "/fields/{sha256}/preview.png",
     summary="A picture of a field",
     response_class=Response,
-    responses={
-        200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
-        304: NOT_MODIFIED,
-        **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
-    },
+    responses=_PICTURE_ANSWERS,
 )
 @blocking
 def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
@@ -109,11 +110,7 @@ def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, hel
     "/fields/{sha256}/candidates/{number}.png",
     summary="A picture of what a rejected field may be",
     response_class=Response,
-    responses={
-        200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
-        304: NOT_MODIFIED,
-        **refusals("FIELD_NOT_FOUND", "FIELD_PREVIEW_NOT_FOUND"),
-    },
+    responses=_PICTURE_ANSWERS,
 )
 @blocking
 def get_candidate_picture(
