@@ -188,6 +188,38 @@ def _residuals(scene: Array, obj: Array, rng: np.random.Generator) -> bytes:
     return buffer.getvalue()
 
 
+def _detection(seen: Array) -> dict[str, Any]:
+    low, high = seen.min(axis=0) - 0.04, seen.max(axis=0) + 0.04
+    return {
+        "center": ((low + high) / 2).tolist(),
+        "size": (high - low).tolist(),
+        "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
+        "label": "chair",
+    }
+
+
+def _result(T_scene_object: Array, initial: Array, artifacts: dict[str, bytes]) -> dict[str, Any]:
+    return {
+        "verdict": "registered",
+        "verdict_reason": "SURFACES_AGREE",
+        "T_object_scene": sim3_document(np.linalg.inv(T_scene_object)),
+        "T_scene_object": sim3_document(T_scene_object),
+        "T_object_scene_initial": sim3_document(initial),
+        "alternatives": [],
+        "metrics": {
+            "residual_rms": 0.00412,
+            "inlier_share_scene": 0.962,
+            "inlier_share_object": 0.931,
+            "iterations": float(ITERATIONS),
+            "field_evaluations": 1_843_200.0,
+            **{f"seconds_{phase}": value for phase, value in PHASE_SECONDS.items()},
+        },
+        "seed": 7,
+        "engine": {"version": "0.1.0", "preset": "robust", "device": "cpu"},
+        "artifacts": [{"name": name, "bytes": len(data)} for name, data in artifacts.items()],
+    }
+
+
 def synthetic(seed: int = 7, spacing: float = 0.018) -> Synthetic:
     """The whole made-up registration; deterministic for ``seed``."""
     rng = np.random.default_rng(seed)
@@ -207,38 +239,13 @@ def synthetic(seed: int = 7, spacing: float = 0.018) -> Synthetic:
 
     poses = _path(T_scene_object)
     initial = np.linalg.inv(poses[0])
-    low, high = seen.min(axis=0) - 0.04, seen.max(axis=0) + 0.04
-    detection = {
-        "center": ((low + high) / 2).tolist(),
-        "size": (high - low).tolist(),
-        "rotation_quaternion_xyzw": [0.0, 0.0, 0.0, 1.0],
-        "label": "chair",
-    }
     artifacts = {
         "scene_points.ply": ply(scene, scene_normals, (150, 150, 150)),
         "object_points.ply": ply(library, library_normals, (60, 130, 220)),
         "trace.json": json.dumps(_trace(poses)).encode(),
         "residuals.npz": _residuals(seen, library, rng),
     }
-    result = {
-        "verdict": "registered",
-        "verdict_reason": "SURFACES_AGREE",
-        "T_object_scene": sim3_document(T_object_scene),
-        "T_scene_object": sim3_document(T_scene_object),
-        "T_object_scene_initial": sim3_document(initial),
-        "alternatives": [],
-        "metrics": {
-            "residual_rms": 0.00412,
-            "inlier_share_scene": 0.962,
-            "inlier_share_object": 0.931,
-            "iterations": float(ITERATIONS),
-            "field_evaluations": 1_843_200.0,
-            **{f"seconds_{phase}": value for phase, value in PHASE_SECONDS.items()},
-        },
-        "seed": 7,
-        "engine": {"version": "0.1.0", "preset": "robust", "device": "cpu"},
-        "artifacts": [{"name": name, "bytes": len(data)} for name, data in artifacts.items()],
-    }
+    result = _result(T_scene_object, initial, artifacts)
     # Held, but listed by the one story that has it: older results have no surroundings.
     artifacts["context_points.ply"] = ply(around, around_normals, (200, 200, 200))
-    return Synthetic(result, detection, artifacts, T_object_scene, initial)
+    return Synthetic(result, _detection(seen), artifacts, T_object_scene, initial)

@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import time
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
-
 from regnf_core.errors import RegnfError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.build import build_field
 from regnf_core.importing.cost.calls import Calls
-from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.gate.ambiguity import OpenCandidate
 from regnf_core.importing.gate.cost_estimate import seconds_of
 from regnf_core.importing.gate.picture import candidate_name
 from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.schema.parsing import parse_description
+from regnf_core.importing.gate.reading_field import field_of
 from regnf_core.viewing.field_picture import SMALL, field_picture
 
 _WORK = Calls((40_000, 37_000), (12_000,))
@@ -47,12 +41,4 @@ def _draw(candidate: OpenCandidate, path: Path, deadline: float) -> None:
     with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():
         reading = candidate.make()
         if seconds_of(reading.description, reading.tensors, _WORK) < deadline - time.monotonic():
-            field_picture(_field(reading), reading.description.get("up_axis"), SMALL, look).save(path)
-
-
-def _field(reading: Reading) -> SdfField:
-    with warnings.catch_warnings():
-        # the map of the upload is only read
-        warnings.filterwarnings("ignore", "The given NumPy array is not writable")
-        tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
-    return build_field(parse_description(reading.description), tensors)
+            field_picture(field_of(reading), reading.description.get("up_axis"), SMALL, look).save(path)

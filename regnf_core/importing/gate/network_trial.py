@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from dataclasses import dataclass
 
 import torch
@@ -16,11 +15,9 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
-from regnf_core.fields.build import build_field
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.schema.parsing import parse_description
-from regnf_core.schema.safe_format import tensor_specs
+from regnf_core.importing.gate.reading_field import field_of
 
 QUICK_SAMPLES, SAMPLES, COMPARED = 256, 2048, 1024
 _PARTS = (1, 2, 8)
@@ -107,14 +104,8 @@ def values_differ(one: SdfField, other: SdfField, share: float) -> bool:
 
 def _built(reading: Reading) -> SdfField | None:
     try:
-        description = parse_description(reading.description)
-        description.check(tensor_specs(reading.tensors))
-        with warnings.catch_warnings():
-            # the map of the upload is only read
-            warnings.filterwarnings("ignore", "The given NumPy array is not writable")
-            tensors = {name: torch.from_numpy(array) for name, array in reading.tensors.items()}
-        return build_field(description, tensors)
-    except FieldFormatError:  # a factor beyond what a field may have
+        return field_of(reading)
+    except FieldFormatError:
         return None
 
 
