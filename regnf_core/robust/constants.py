@@ -217,10 +217,26 @@ class SearchConstants:
         Stage(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05),
         Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=40, min_distance=0.05),
         Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=10, min_distance=0.05),
+        Stage(
+            points=160, widths=(0.06, 0.05, 0.04, 0.03, 0.03), score_width=0.03, keep=10, min_distance=0.03, copies=20
+        ),
     )
-    """Successive halving on distance grids. The first stage only ranks the seeds. [by hand]"""
+    """Successive halving on distance grids. The first stage only ranks the seeds. The last one leaves local minima:
+    thin parts and what is close by hold poses some hundredths of the diameter off. [by hand, the last one on random
+    worlds, docs/worlds.md]"""
+    copies_spread: tuple[float, float, float] = (0.10, 0.035, 0.05)
+    """Standard deviations of a stage's copies: rotation (radians), translation (diameters), log scale. [by
+    hand, on random worlds]"""
     min_share_of_detection: float = 0.25
     """Share of the detection box's edge. Along one of them at least, the object is that long. [by hand]"""
+    box_weight: float = 0.2
+    """Score, 0..1. So much worse is a pose that ends at none of the box's faces. [by hand, on random worlds]"""
+    box_width: float = 0.25
+    """Share of the box's edge. Kernel width of the distance between the object's end and the box's face.
+    [by hand, on random worlds]"""
+    min_face_distance: float = 0.2
+    """Diagonals. Shorter edges of a box count as this long: what is flat lies in a box that is not.
+    [by hand]"""
     seed_tolerance: float = 2.0
     """Seeds may reach beyond the detection this many times as far as poses: their scale and place are rough. [by
     hand]"""

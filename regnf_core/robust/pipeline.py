@@ -103,7 +103,7 @@ def search_poses(
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
-    context = RefinementContext(model.extremal_points, generator, admits=bound.admits)
+    context = RefinementContext(model.extremal_points, generator, admits=bound.admits, penalty=bound.penalty)
     return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
 
 
@@ -116,7 +116,9 @@ def refine_poses(
     """
     points = problem.model.extremal_points
     bound, max_offset = problem.bound, problem.view.max_offset
-    context = RefinementContext(points, generator, max_offset=max_offset, on_step=on_step, admits=bound.admits)
+    context = RefinementContext(
+        points, generator, max_offset=max_offset, on_step=on_step, admits=bound.admits, penalty=bound.penalty
+    )
     found = coarse_to_fine(problem.fit, PoseCandidates.start(T, with_offsets=True), REFINEMENT.stages, context)
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
     origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
@@ -156,8 +158,8 @@ def _best_attempt(
 ) -> Evaluation:
     """Around a given start, else from the shapes, else from feature matches too: slower ways where others fail."""
     found: list[Evaluation] = []
-    for seeds in _seed_sets(problem, options, seed, generator, T_start):
-        found.append(_attempt(problem, seeds, options, run, generator))
+    for seeds, given in _seed_sets(problem, options, seed, generator, T_start):
+        found.append(_attempt(problem, seeds, given, options, run, generator))
         if found[-1].verdict != "rejected":
             break
     return min(found, key=lambda one: one.rank)
@@ -169,26 +171,33 @@ def _seed_sets(
     seed: int,
     generator: torch.Generator,
     T_start: Sim3 | None,
-) -> Iterator[Sim3]:
-    """Seeds (H,) of one attempt after another, each made when its turn comes."""
+) -> Iterator[tuple[Sim3, Sim3]]:
+    """Seeds (H,) of one attempt after another, each made when its turn comes, and what is refined whatever the search
+    finds: a given start (1,), or nothing (0,)."""
     view, model = problem.view, problem.model
     if T_start is not None:
-        yield seed_poses_around(problem.in_working_frames(T_start), generator)
+        start = problem.in_working_frames(T_start)
+        yield seed_poses_around(start, generator), start.expand(1)
     seeds = geometric_seeds(view, model, start_rotations(options))
-    yield seeds
+    yield seeds, seeds[:0]
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
         if len(matched):
-            yield Sim3.cat([seeds, matched])
+            yield Sim3.cat([seeds, matched]), seeds[:0]
 
 
 def _attempt(
-    problem: RegistrationProblem, seeds: Sim3, options: RegistrationOptions, run: Run, generator: torch.Generator
+    problem: RegistrationProblem,
+    seeds: Sim3,
+    given: Sim3,
+    options: RegistrationOptions,
+    run: Run,
+    generator: torch.Generator,
 ) -> Evaluation:
     with run.phase("initializing"):
         candidates = search_poses(problem.view, problem.model, seeds, generator, problem.bound)
     with run.phase("optimizing"):
-        refined = refine_poses(problem, candidates.T, generator, _progress_of_steps(run))
+        refined = refine_poses(problem, Sim3.cat([candidates.T, given]), generator, _progress_of_steps(run))
     with run.phase("verifying"):
         return evaluate_candidates(problem, refined, options)
 

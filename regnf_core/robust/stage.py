@@ -13,7 +13,8 @@ class Stage:
     widths: kernel widths, one iteration each, object diameters; without any, poses are only scored · score_width:
     kernel width of the score · keep: at most so many poses · min_distance: between two kept poses, object diameters ·
     margin: kept poses score no worse than the best one plus this · adaptive: ``widths`` are lower limits, see
-    :func:`regnf_core.robust.refine.loss.adaptive_width`.
+    :func:`regnf_core.robust.refine.loss.adaptive_width` · copies: of each pose, moved at random, that are refined with
+    it.
     """
 
     points: int
@@ -23,3 +24,4 @@ class Stage:
     min_distance: float = 0.0
     margin: float = math.inf
     adaptive: bool = False
+    copies: int = 0

@@ -24,7 +24,8 @@ class RefinementContext:
 
     extremal_points: (E, 3) of the object, by which two poses are compared · generator: draws each stage's samples ·
     fix_scale: poses keep their scale · max_offset: of the surfaces, object diameters · on_step: called once an
-    iteration · admits: which poses (H,) may go on, (H,) bool; where it admits none, all may.
+    iteration · admits: which poses (H,) may go on, (H,) bool; where it admits none, all may · penalty: (H,) what is
+    added to the scores of poses (H,).
     """
 
     extremal_points: Tensor
@@ -33,6 +34,7 @@ class RefinementContext:
     max_offset: float = REFINEMENT.max_offset
     on_step: Callable[[], None] = lambda: None
     admits: Callable[[Sim3], Tensor] = lambda T: torch.ones_like(T.scale, dtype=torch.bool)
+    penalty: Callable[[Sim3], Tensor] = lambda T: torch.zeros_like(T.scale)
 
 
 def coarse_to_fine(
@@ -40,6 +42,8 @@ def coarse_to_fine(
 ) -> PoseCandidates:
     """The candidates that are left after all stages, best first."""
     for stage in stages:
+        if stage.copies:
+            candidates = candidates.with_copies(stage.copies, SEARCH.copies_spread, context.generator)
         few = surfaces.subsample(stage.points, context.generator)
         numbers = torch.arange(len(candidates))
         parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
@@ -57,7 +61,8 @@ def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context:
     """All candidates after one stage's iterations, with their scores there."""
     if not stage.widths:
         r = residuals(few, candidates.T, candidates.offsets)
-        return PoseCandidates(candidates.T, disagreement(r, stage.score_width), candidates.offsets, candidates.history)
+        scores = disagreement(r, stage.score_width) + context.penalty(candidates.T)
+        return PoseCandidates(candidates.T, scores, candidates.offsets, candidates.history)
     history = list(candidates.history)
 
     def record(done: Iteration) -> None:
@@ -67,7 +72,7 @@ def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context:
 
     settings = Settings(stage.adaptive, context.fix_scale, context.max_offset)
     refined = minimize(few, candidates.T, stage.widths, settings, candidates.offsets, record)
-    scores = disagreement(refined.residuals, stage.score_width)
+    scores = disagreement(refined.residuals, stage.score_width) + context.penalty(refined.T)
     return PoseCandidates(refined.T, scores, refined.residuals.offset, tuple(history))
 
 

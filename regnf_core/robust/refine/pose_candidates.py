@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -71,6 +71,17 @@ class PoseCandidates:
     def __getitem__(self, index: Tensor) -> PoseCandidates:
         offsets = None if self.offsets is None else self.offsets[index]
         return PoseCandidates(self.T[index], self.scores[index], offsets, tuple(step[index] for step in self.history))
+
+    def with_copies(self, count: int, spread: Sequence[float], generator: torch.Generator) -> PoseCandidates:
+        """These, and ``count`` copies of each, moved at random: ``spread`` is the standard deviation of the rotation
+        (radians), the translation and the log scale. Scores are those of the original."""
+        origins = torch.arange(len(self)).repeat(count + 1)
+        turn, shift, growth = spread
+        deviations = torch.tensor([turn] * 3 + [shift] * 3 + [growth], dtype=torch.float64)
+        steps = torch.randn(len(origins), 7, generator=generator, dtype=torch.float64) * deviations
+        steps[: len(self)] = 0.0
+        found = self[origins]
+        return replace(found, T=found.T.perturb(steps))
 
     @classmethod
     def cat(cls, parts: Sequence[PoseCandidates]) -> PoseCandidates:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.kernel import geman_mcclure_loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,13 @@ class DetectionBound:
         within = (low >= -reach).all(-1) & (high <= reach).all(-1)
         size = ((high - low) / self.edges).amax(-1)
         return within & (size >= SEARCH.min_share_of_detection)
+
+    def penalty(self, T: Sim3) -> Tensor:
+        """(H,): how badly the posed object fills the box, as a score: a Geman-McClure loss over the box's six faces."""
+        placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
+        length = self.edges.clamp_min(SEARCH.min_face_distance)
+        off = torch.cat([placed.amin(-2) + self.edges / 2, placed.amax(-2) - self.edges / 2], -1) / length.repeat(2)
+        return SEARCH.box_weight * geman_mcclure_loss(off, SEARCH.box_width).mean(-1)
 
     def loosened(self, factor: float) -> DetectionBound:
         """The bound with ``factor`` times the tolerance."""

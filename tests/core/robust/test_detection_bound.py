@@ -11,6 +11,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
+from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.search.detection_bound import DetectionBound
 from tests.core.robust.shapes import random_pose, reframed
 
@@ -60,6 +61,18 @@ def test_the_boxs_own_axes_count() -> None:
     turn = torch.tensor([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     poses = Sim3.cat([placed(0.70), placed(0.71)])
     assert bound(0.0, turn).admits(poses).tolist() == [True, False]
+
+
+def test_a_pose_that_fills_the_box_is_not_penalized() -> None:
+    poses = Sim3.cat([placed(1.0), placed(0.9), placed(0.5), placed(2.5), placed(1.0, (0.3, 0.0, 0.0))])
+    exact, tight, small, large, beside = bound(1.0).penalty(poses).tolist()
+    assert exact == pytest.approx(0.0, abs=1e-12)
+    assert exact < tight < beside < small < large < SEARCH.box_weight
+
+
+def test_the_penalty_is_half_its_weight_where_every_face_is_one_kernel_width_off() -> None:
+    pose = placed(1.0 + 2.0 * SEARCH.box_width)
+    assert float(bound(1.0).penalty(pose)) == pytest.approx(SEARCH.box_weight / 2)
 
 
 def test_loosened() -> None:
