@@ -215,10 +215,10 @@ class SearchConstants:
     stages: tuple[Stage, ...] = (
         Stage(points=48, widths=(), score_width=0.10, keep=500),
         Stage(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05),
-        Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=40, min_distance=0.05),
-        Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=10, min_distance=0.05),
+        Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=60, min_distance=0.05),
+        Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=20, min_distance=0.05),
         Stage(
-            points=160, widths=(0.06, 0.05, 0.04, 0.03, 0.03), score_width=0.03, keep=10, min_distance=0.03, copies=20
+            points=200, widths=(0.06, 0.05, 0.04, 0.03, 0.03), score_width=0.03, keep=12, min_distance=0.03, copies=12
         ),
     )
     """Successive halving on distance grids. The first stage only ranks the seeds. The last one leaves local minima:
@@ -276,10 +276,11 @@ class RefinementConstants:
     """Levenberg-Marquardt on the fields (refine/)."""
 
     stages: tuple[Stage, ...] = (
-        Stage(96, (0.10, 0.07, 0.05, 0.035, 0.025, 0.02), 0.02, keep=5, min_distance=0.03, margin=0.15, adaptive=True),
+        Stage(200, (0.05, 0.04, 0.03, 0.02, 0.02), 0.02, keep=6, min_distance=0.03, margin=0.15, adaptive=True),
         Stage(300, (0.02, 0.015, 0.01, 0.01), 0.015, keep=3, min_distance=0.03, margin=0.10, adaptive=True),
     )
-    """On all pose candidates. The first kernel is as wide as the gap that a missing table top leaves. [by hand]"""
+    """On all pose candidates. The first stage was chosen together with the last one of the search, which uses the wider
+    kernels. [by hand, the first on random worlds]"""
     last_stage: Stage = _LAST_STAGE
     """On what is left, and the best pose's symmetry equivalents. [by hand]"""
     same_pose: float = 0.06

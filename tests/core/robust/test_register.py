@@ -12,6 +12,8 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import WarmStart, register
 from regnf_core.result import RegistrationResult
+from regnf_core.robust import pipeline
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from tests.core.analytic import chair, chair_pose, room, table
 from tests.core.robust.shapes import (
     ROBUST,
@@ -149,6 +151,16 @@ def test_a_warm_start_is_refined_and_a_wrong_one_does_no_harm() -> None:
         result = register(room(chair_pose()), chair(), detection(), ROBUST, warm_start=WarmStart(T_object_scene=start))
         assert result.verdict == "registered"
         assert placement_error(result, chair_pose()) < 0.005
+
+
+def test_a_given_pose_is_refined_whatever_the_search_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = PoseCandidates.start(Sim3.cat([random_pose(seed, 1.0) for seed in range(3)]))
+    monkeypatch.setattr(pipeline, "search_poses", lambda *_: wrong)
+    assert run(room(chair_pose()), chair(), detection()).verdict == "rejected"
+    start = perturbed(chair_pose(), torch.tensor([0.02, -0.02, 0.03, 0.01, 0.01, -0.01, 0.02]))
+    result = register(room(chair_pose()), chair(), detection(), ROBUST, warm_start=WarmStart(T_object_scene=start))
+    assert result.verdict == "registered"
+    assert placement_error(result, chair_pose()) < 0.005
 
 
 def test_with_an_up_axis_only_turns_about_it_are_searched() -> None:
