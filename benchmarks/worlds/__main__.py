@@ -3,6 +3,8 @@
     python -m benchmarks.worlds make FOLDER --meshes DIR [DIR ...] --part train --count 20
     python -m benchmarks.worlds register FOLDER --part train --output runs.jsonl
     python -m benchmarks.worlds report runs.jsonl [--output report.md]
+    python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
+    python -m benchmarks.worlds train evidence.jsonl --output probability.json --table calibration.md
 
 One seed is one world; a world is made once and kept. The part `test` is for reporting: choose nothing on it.
 """
@@ -23,7 +25,8 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
 
-from benchmarks.worlds import tables  # noqa: E402
+from benchmarks.worlds import tables, training  # noqa: E402
+from benchmarks.worlds.evidence import evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.recipe import SCENES  # noqa: E402
 from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
@@ -37,6 +40,8 @@ def main() -> None:
         "make": _make,
         "register": _register,
         "report": _report,
+        "evidence": _evidence,
+        "train": _train,
     }
     commands[arguments.command](arguments)
 
@@ -57,11 +62,7 @@ def _make(arguments: argparse.Namespace) -> None:
 
 
 def _register(arguments: argparse.Namespace) -> None:
-    homes = sorted(path.parent for path in arguments.folder.glob(f"{arguments.scene}-*/{WORLD}"))
-    homes = [home for home in homes if part_of_world(int(home.name.split("-")[1])) == arguments.part]
-    homes = [home for home in homes if home.name.split("-")[2] in arguments.lengths]
-    if arguments.seeds:
-        homes = [home for home in homes if int(home.name.split("-")[1]) in arguments.seeds]
+    homes = _homes(arguments)
     way = Way(arguments.registration_seed, not arguments.without_observation, not arguments.quick)
     done = 0
     with arguments.output.open("a") as file:
@@ -71,6 +72,43 @@ def _register(arguments: argparse.Namespace) -> None:
             file.flush()
             done += 1
             _say(f"{done}/{len(homes)} {tables.summary(runs)}")
+
+
+def _homes(arguments: argparse.Namespace) -> list[Path]:
+    """The folders of the worlds that the arguments name."""
+    homes = sorted(path.parent for path in arguments.folder.glob(f"{arguments.scene}-*/{WORLD}"))
+    homes = [home for home in homes if part_of_world(int(home.name.split("-")[1])) == arguments.part]
+    homes = [home for home in homes if home.name.split("-")[2] in arguments.lengths]
+    if arguments.seeds:
+        homes = [home for home in homes if int(home.name.split("-")[1]) in arguments.seeds]
+    return homes
+
+
+def _evidence(arguments: argparse.Namespace) -> None:
+    homes = _homes(arguments)
+    known = {path.parent for path in arguments.folder.glob(f"*/{WORLD}")}
+    work = partial(_evidence_of, sorted(known), not arguments.without_observation, arguments.cases)
+    with arguments.output.open("a") as file:
+        for rows in _in_parallel(work, homes, arguments.workers):
+            file.writelines(json.dumps(row) + "\n" for row in rows)
+            file.flush()
+            _say(f"{rows[0]['world'] if rows else 'a world'}: {len(rows)} poses")
+
+
+def _evidence_of(known: list[Path], observed: bool, cases: int, home: Path) -> list[Run]:
+    """The evidence of a world. Wrong objects come from the other worlds of its part."""
+    seed = int(home.name.split("-")[1])
+    others = [one for one in known if part_of_world(int(one.name.split("-")[1])) == part_of_world(seed)]
+    return evidence_of_world(home, [one for one in others if one.name.split("-")[1] != str(seed)], observed, cases)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    rows = [json.loads(line) for path in arguments.rows for line in path.read_text().splitlines()]
+    model, table = training.trained(rows)
+    arguments.output.write_text(json.dumps(model, indent=1) + "\n")
+    if arguments.table is not None:
+        arguments.table.write_text(table)
+    _say(table)
 
 
 def _runs_of(way: Way, home: Path) -> list[Run]:
@@ -113,13 +151,21 @@ def _parser() -> argparse.ArgumentParser:
     registering.add_argument("--registration-seed", type=int, default=0)
     registering.add_argument("--without-observation", action="store_true")
     registering.add_argument("--quick", action="store_true", help="do not look into the stages")
-    for command in (making, registering):
+    gathering = commands.add_parser("evidence", help="poses with their evidence, for `train`")
+    gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
+    gathering.add_argument("--without-observation", action="store_true")
+    gathering.add_argument("--cases", type=int, default=8, help="of each world, at most")
+    for command in (making, registering, gathering):
         command.add_argument("folder", type=Path)
         command.add_argument("--part", choices=PARTS, default="train")
         command.add_argument("--scene", choices=SCENES, default="tsdf")
         command.add_argument("--lengths", nargs="+", choices=LENGTHS, default=list(LENGTHS))
         command.add_argument("--seeds", type=int, nargs="*", help="these worlds alone")
         command.add_argument("--workers", type=int, default=1)
+    learning = commands.add_parser("train", help="the verdict's probability model")
+    learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote")
+    learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
+    learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     reporting = commands.add_parser("report", help="tables of runs")
     reporting.add_argument("runs", type=Path, nargs="+")
     reporting.add_argument("--output", type=Path)

@@ -8,6 +8,8 @@ The source stands in brackets at the end of each entry:
 - [early fits]: introduced for fits to images that were stopped early or show unseen parts (benchmarks/images). Chosen
   by hand there; how the results depend on the value was not recorded.
 - [library]: measured on the library of 64 objects of the benchmark (benchmarks/results/robust/library.md).
+- [random worlds]: chosen on the parts train and validation of random worlds, each world left out in its turn
+  (docs/verdict.md).
 - [by hand]: chosen by hand; no tuning and no comparison with other values is recorded.
 
 "Diameters" are diameters of the library object, the length unit of the object's working frame. "Diagonals" are
@@ -336,8 +338,17 @@ class EvidenceConstants:
     """Inlier distances. Largest residual of coarse agreement. [early fits]"""
     tail_quantiles: tuple[float, float] = (0.3, 0.75)
     """Quantiles of |residuals|; the tail ratio is the second over the first. [early fits]"""
-    beyond: float = 2.0
-    """Inlier distances. A sample farther outside of the object's surface is no part of it. [early fits]"""
+    close: float = 0.02
+    """Diameters. Residuals of close agreement; object samples farther out stand in free space that was seen. [derived:
+    less than half of the 5 % by which a pose may be off]"""
+    agreement: float = 0.03
+    """Diameters. Samples with smaller residuals may belong to the same surface; others do not. [derived: as above]"""
+    coarse: float = 0.04
+    """Diameters. Residuals of coarse agreement. [derived: as above]"""
+    hull_margin: float = 0.01
+    """Diameters. What lies so far within the object's hull touches it from inside. [by hand]"""
+    min_core: float = 0.002
+    """Diameters. Smallest core of residuals that the tail is compared with: exact fields have a core of 0. [by hand]"""
     min_slope: float = 1e-3
     """Length of the gradient. A shorter one has no direction. [derived]"""
     facing_cosine: float = -0.25
@@ -388,6 +399,9 @@ class VerdictConstants:
     """Share of occluded object samples with which coarse agreement is enough. [early fits]"""
     max_offset: float = 0.015
     """Diameters. Surface offset with which coarse agreement is enough in a smooth field. [early fits]"""
+    min_probability: float = 0.7
+    """Probability of being right that a pose needs even where it meets all criteria. [random worlds: worlds left out of
+    the parts train and validation, docs/verdict.md]"""
     rivals_min_distance: float = 0.1
     """Diameters. Poses closer together are one answer with its uncertainty. [by hand]"""
     rival_margin_per_score: float = 0.15

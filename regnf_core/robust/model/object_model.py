@@ -12,6 +12,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import MODEL
 from regnf_core.robust.model.extremal_points import extremal_points
+from regnf_core.robust.model.hull import Hull
 from regnf_core.robust.model.self_symmetry import SelfSymmetry, confirm_symmetries, propose_symmetries
 from regnf_core.robust.model.signature import signature
 from regnf_core.robust.samples import Samples
@@ -42,6 +43,11 @@ class ObjectModel:
     def distance_grid(self) -> DistanceGrid:
         """Distances to the samples, on a grid."""
         return distance_grid(self.samples, self.spacing)
+
+    @cached_property
+    def hull(self) -> Hull:
+        """The samples' convex hull."""
+        return Hull.of(self.samples.on_surface())
 
     def field(self, obj: SdfField) -> WorkingField:
         """The object's field, the one that this model was made from, in the working frame."""

@@ -29,7 +29,7 @@ class SceneView:
 
     foreground: the samples in front of floors and walls · spacing: between samples · occlusion_boundary_share: of the
     samples, removed as occlusion boundary or as surface that was not observed · evaluations: of the scene's field, that
-    it took to make this.
+    it took to make this · observation: of the scene; None where the field has none.
     """
 
     frame: WorkingFrame
@@ -38,6 +38,7 @@ class SceneView:
     spacing: float
     occlusion_boundary_share: float
     evaluations: int
+    observation: WorkingObservation | None = None
 
     def field(self, scene: SdfField) -> WorkingField:
         """The scene's field, the one that this view is of, in the working frame."""
@@ -74,10 +75,17 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions, 
     outside = None if unobserved is None else ~_within(observed, detection)
     foreground = observed[~support_planes(observed, generator, outside)]
     if len(foreground) < SCENE.min_foreground:
-        foreground = observed if len(observed) >= SCENE.min_foreground else sampled.samples
-    return SceneView(
-        sampled.frame, detection, foreground, sampled.spacing, float(removed.float().mean()), counted.evaluations
-    )
+        foreground = (
+            observed if len(observed) >= SCENE.min_foreground else replace(sampled.samples, unobserved=unobserved)
+        )
+    share = float(removed.float().mean())
+    observation = _observation(counted, sampled)
+    return SceneView(sampled.frame, detection, foreground, sampled.spacing, share, counted.evaluations, observation)
+
+
+def _observation(scene: SdfField, sampled: SampledField) -> WorkingObservation | None:
+    observation = observation_of(scene)
+    return None if observation is None else WorkingObservation(observation, sampled.frame)
 
 
 def _unobserved_surface(
@@ -85,9 +93,8 @@ def _unobserved_surface(
 ) -> tuple[Tensor, UnobservedTest | None]:
     """Which samples (N,) were not observed, and where else nothing was: by the field's observation, where it has one,
     else by its occlusion boundaries."""
-    observation = observation_of(scene)
-    if observation is not None:
-        observed = WorkingObservation(observation, sampled.frame)
+    observed = _observation(scene, sampled)
+    if observed is not None:
         return ~observed.on_surface(sampled.samples.points), observed.unobserved
     boundary = occlusion_boundary(sampled.samples, generator)
     return boundary, behind_surfaces if bool(boundary.any()) else None

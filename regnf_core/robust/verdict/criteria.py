@@ -55,24 +55,34 @@ _UNKNOWN_QUALITY = SceneQuality()
 
 
 def evaluate_pose(
-    evidence: Evidence, index: int, rivals: int, options: RobustOptions, quality: SceneQuality = _UNKNOWN_QUALITY
+    evidence: Evidence,
+    index: int,
+    rivals: int,
+    options: RobustOptions,
+    quality: SceneQuality = _UNKNOWN_QUALITY,
+    probability: float | None = None,
 ) -> PoseVerdict:
     """The verdict on pose number ``index`` of the evidence, which ``rivals`` other poses equal.
 
-    Written so that a number that is not finite can only lead to a rejection.
+    probability: that the pose is right, 0..1, by all the evidence together. Where it is high, it stands in for the
+    agreement of the surfaces; where it is low, the pose is rejected although all criteria are met. Written so that a
+    number that is not finite can only lead to a rejection.
     """
     occluded = _Criterion("TOO_LITTLE_SURFACE", options.max_occluded_share - float(evidence.occluded[index]))
     accurate = list(_of_accurate_fields(evidence, index, options))
     unexplained = _unexplained(evidence, index, quality.unexplained)
     rough = _smallest_slack(_of_rough_fields(evidence, index, options, quality.normal_roughness))
     observed = _smallest_slack(_of_observed_surface(evidence, index, options))
-    agreement = max(_smallest_slack(accurate), rough, observed)
+    likely = -1.0 if probability is None else probability - options.min_probability
+    agreement = max(_smallest_slack(accurate), rough, observed, likely)
     margin = min(_smallest_slack([occluded, unexplained]), agreement)
     if not margin >= 0.0:
         relevant = [occluded, unexplained]
         if not agreement >= 0.0:
             relevant = [occluded, accurate[0], unexplained, *accurate[1:]]
         return PoseVerdict("rejected", next(one.reason for one in relevant if not one.met), margin)
+    if probability is not None and not probability >= VERDICT.min_probability:
+        return PoseVerdict("rejected", "LOW_PROBABILITY", probability - VERDICT.min_probability)
     if rivals:
         return PoseVerdict("ambiguous", "SEVERAL_POSES_AGREE", margin)
     return PoseVerdict("registered", "SURFACES_AGREE", margin)

@@ -19,8 +19,9 @@ from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.covariance import covariance, in_object_units
 from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
 from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
+from regnf_core.robust.verdict.pose_features import pose_features
+from regnf_core.robust.verdict.probability import probability_model
 from regnf_core.robust.verdict.relation import relation
-from regnf_core.robust.verdict.unexplained_surface import unexplained_share
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,18 +50,13 @@ def evaluate_candidates(
     assert candidates.offsets is not None, "candidates refined on the fields have offsets"
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust)
     winner = int(evidence.scores.argmin())
-    rivals = _rivals(problem, candidates, evidence, options.robust.rival_margin)
-    T_work = candidates.T[winner]
-    unexplained = unexplained_share(problem.held_out, T_work, evidence.offsets[winner], options.robust)
-    quality = SceneQuality(problem.view.normal_roughness, unexplained)
-    found = evaluate_pose(evidence, winner, len(rivals), options.robust, quality)
-    if not bool(problem.bound.admits(candidates.T[winner : winner + 1])[0]):
-        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
-    T = problem.in_field_frames(T_work)
+    rivals = rival_numbers(problem, candidates, evidence, options.robust.rival_margin)
+    found, metrics = _verdict(problem, candidates[torch.tensor([winner])], evidence, (winner, len(rivals)), options)
+    T = problem.in_field_frames(candidates.T[winner])
     alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, evidence, rivals, T)
     metrics = {
         **evidence.of(winner),
-        "unexplained_share_scene": unexplained,
+        **metrics,
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
         "occlusion_boundary_share_scene": problem.view.occlusion_boundary_share,
@@ -70,7 +66,27 @@ def evaluate_candidates(
     return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives)
 
 
-def _rivals(
+def _verdict(
+    problem: RegistrationProblem,
+    best: PoseCandidates,
+    evidence: Evidence,
+    numbers: tuple[int, int],
+    options: RegistrationOptions,
+) -> tuple[PoseVerdict, dict[str, float]]:
+    """The verdict on the best pose (1,), and what else it rests on. numbers: of the pose in the evidence, of rivals."""
+    assert best.offsets is not None
+    features = pose_features(problem, best.T, best.offsets)
+    unexplained = float(features["unexplained"][0])
+    winner, rivals = numbers
+    quality = SceneQuality(problem.view.normal_roughness, unexplained)
+    probability = float(probability_model().logit(features).sigmoid()[0])
+    found = evaluate_pose(evidence, winner, rivals, options.robust, quality, probability)
+    if not bool(problem.bound.admits(best.T)[0]):
+        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
+    return found, {"probability": probability, "unexplained_share_scene": unexplained}
+
+
+def rival_numbers(
     problem: RegistrationProblem, candidates: PoseCandidates, evidence: Evidence, rival_margin: float
 ) -> list[int]:
     """Numbers of the other poses that explain the held-out samples as well as the best one, best first."""

@@ -1,7 +1,9 @@
-"""Surface of the scene that is joined to the object and no part of it: a cushion on a chair that should have none.
+"""Surface of the scene within the object's hull that is no part of it: a cushion on a chair that should have none.
 
-Objects that stand close by have surface near the object too, but it faces the object's own surface, which the scene
-shows as well. Something that lies on the object covers the object's surface, or its surface faces away from it.
+What stands close by, lies on top or carries the object touches it from outside of its convex hull: it says nothing
+against the object. Within the hull, another object's surface may stand too (a chair under a table), but it faces the
+object's own surface, which the scene shows as well. What lies on the object covers the object's surface, or its own
+surface faces away from it.
 """
 
 from __future__ import annotations
@@ -10,41 +12,36 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.residuals import DistanceModel, SurfacePair
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.residuals import SurfacePair
 from regnf_core.surface.projection import newton_step
 
 
-def unexplained_share(held_out: SurfacePair, T: Sim3, offset: Tensor, options: RobustOptions) -> float:
-    """The share 0..1 of unexplained surface among the scene samples near the object.
+def unexplained_samples(held_out: SurfacePair, T: Sim3, beyond: Tensor) -> Tensor:
+    """(H, N) bool: which scene samples are unexplained at poses T (H,) between the working frames.
 
-    T: a single pose between the working frames · offset: of the surfaces, object diameters, a single number. A sample
-    outside of the object's surface by more than twice the inlier distance is unexplained, unless it faces that surface
-    and the scene shows it.
+    beyond: (H, N) bool, samples outside of the object's surface, within its hull. They are unexplained unless they face
+    that surface and the scene shows it.
     """
-    A, obj = held_out.scene_samples, held_out.obj
-    s, R, t = (part.to(A.points) for part in (T.scale, T.rotation, T.translation))
-    places = s * (A.points @ R.mT) + t
-    value, gradient = obj.value_and_gradient(places)
-    height = value - s * A.values - offset.to(value)
-    near = height.abs() <= EVIDENCE.near
-    if not bool(near.any()):
-        return 0.0
-    beyond = near & (height > EVIDENCE.beyond * options.inlier_distance)
-    beneath = places[beyond] - newton_step(value[beyond], gradient[beyond], EVIDENCE.min_slope)
-    slope = gradient[beyond].square().sum(-1).clamp_min(EVIDENCE.min_slope**2).sqrt()
-    cosine_times_slope = ((A.normals[beyond] @ R.mT) * gradient[beyond]).sum(-1)
-    unexplained = cosine_times_slope >= EVIDENCE.facing_cosine * slope
-    unexplained |= _covered(held_out.scene, A, ((beneath - t) @ R) / s, options.inlier_distance / float(s))
-    return float(unexplained.sum() / near.sum())
+    A = held_out.scene_samples
+    pose, sample = beyond.nonzero(as_tuple=True)
+    unexplained = torch.zeros_like(beyond)
+    if len(pose) == 0:
+        return unexplained
+    T = T.to(A.points)[pose]
+    places = T.apply(A.points[sample][:, None])[:, 0]
+    value, gradient = held_out.obj.value_and_gradient(places)
+    slope = gradient.square().sum(-1).clamp_min(EVIDENCE.min_slope**2).sqrt()
+    turned = (T.rotation @ A.normals[sample][..., None])[..., 0]
+    away = (turned * gradient).sum(-1) >= EVIDENCE.facing_cosine * slope
+    beneath = places - newton_step(value, gradient, EVIDENCE.min_slope)
+    unexplained[pose, sample] = away | _covered(held_out, T, T.inverse().apply(beneath[:, None])[:, 0])
+    return unexplained
 
 
-def _covered(scene: DistanceModel, A: Samples, points: Tensor, distance: float) -> Tensor:
-    """(M,) bool: points (M, 3) of the scene's working frame that lie within matter, or were not observed."""
-    if len(points) == 0:
-        return torch.zeros(0, dtype=torch.bool)
-    value, _ = scene.value_and_gradient(points)
-    covered = value < -distance
-    return covered if A.unobserved is None else covered | A.unobserved(points, value)
+def _covered(held_out: SurfacePair, T: Sim3, points: Tensor) -> Tensor:
+    """(K,) bool: points (K, 3) of the scene's working frame that lie within matter, or were not observed."""
+    value, _ = held_out.scene.value_and_gradient(points)
+    covered: Tensor = T.scale * value < -EVIDENCE.close
+    unobserved = held_out.scene_samples.unobserved
+    return covered if unobserved is None else covered | unobserved(points, value)

@@ -37,7 +37,7 @@ def observed(scene: AnalyticField, part: tuple[list[float], list[float]]) -> Obs
 
 def test_an_invented_part_hinders_only_those_who_believe_it() -> None:
     scene = over_closed(_UNDER_THE_SEAT)
-    assert register(scene, chair(), detection(), ROBUST, clouds=False).verdict == "rejected"
+    believed = register(scene, chair(), detection(), ROBUST, clouds=False)
     T = random_pose(3, 2.5)
     moved = TransformedField(observed(scene, _UNDER_THE_SEAT), T.inverse())
     box = detection()
@@ -46,6 +46,8 @@ def test_an_invented_part_hinders_only_those_who_believe_it() -> None:
     assert result.verdict == "registered"
     assert placement_error(result, chair_pose() @ T.inverse()) < 0.01
     assert 0.2 < result.metrics["occluded_share_object"] < 0.7
+    assert believed.metrics["verdict_margin"] < 0.1
+    assert believed.metrics["probability"] < result.metrics["probability"]
 
 
 def test_matter_that_was_seen_tells_a_look_alike() -> None:

@@ -1,0 +1,115 @@
+"""Poses with what the held-out samples tell of them, and whether they are right: what the verdict's model learns from.
+
+For every case of a world: the poses that a registration chose among, the best pose that a refinement from the truth
+leads to, and, for another object registered in the same box, the poses that it chose among, which are all wrong.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.worlds.cases import WorldCase, cases_of
+from benchmarks.worlds.stages import NearestTruth, Recording, recorded
+from regnf_core import RegistrationOptions, RegnfError, Sim3, register
+from regnf_core.geometry.points import NearestNeighbors, diameter
+from regnf_core.robust import pipeline
+from regnf_core.robust.problem import RegistrationProblem
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
+from regnf_core.robust.verdict.evaluation import rival_numbers
+from regnf_core.robust.verdict.evidence import gather_evidence
+from regnf_core.robust.verdict.pose_features import pose_features
+
+Row = dict[str, Any]
+_OPTIONS = RegistrationOptions(preset="robust")
+_POINTS = 4000
+_SAME_SHAPE = 0.03
+"""Diameters. An object whose surface lies that close to the right one's, nearly everywhere, is no wrong object."""
+
+
+def evidence_of_world(home: Path, others: Sequence[Path], observed: bool, limit: int) -> list[Row]:
+    """The rows of the first ``limit`` cases of a world's folder. others: worlds to draw wrong objects from."""
+    draw = random.Random(home.name)
+    rows: list[Row] = []
+    for known in list(cases_of(home, observed))[:limit]:
+        facts = {**known.facts, "observed": observed}
+        rows += [{**facts, "model": known.facts["object"], **row} for row in _rows(known, known)]
+        other = _another(known, others, draw)
+        if other is not None:
+            rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(known, other)]
+    return rows
+
+
+def _another(known: WorldCase, others: Sequence[Path], draw: random.Random) -> WorldCase | None:
+    """A case with an object of another name, from one of the other worlds."""
+    if not others:
+        return None
+    kind = known.facts["object"].split("_")[0]
+    found = [one for one in cases_of(draw.choice(others)) if one.facts["object"].split("_")[0] != kind]
+    return draw.choice(found) if found else None
+
+
+def _rows(known: WorldCase, asked: WorldCase) -> Iterator[Row]:
+    """One row a pose. known: the case that the box is of · asked: the one whose object is looked for in it."""
+    with recorded() as kept:
+        try:
+            result = register(known.case.scene, asked.case.obj, known.case.detection, _OPTIONS, clouds=False)
+        except RegnfError:
+            return
+    if kept.problem is None or (asked is not known and _same_shape(known, asked, result.T_object_scene)):
+        return
+    last = min(range(len(kept.evaluations)), key=lambda number: kept.evaluations[number].rank)
+    for number, candidates in enumerate(kept.refined):
+        winner = kept.evaluations[number].winner if number == last else None
+        yield from _described(kept.problem, candidates, known if asked is known else None, winner)
+    if asked is known:
+        yield from _described(kept.problem, _from_truth(kept, known), known, None)
+
+
+def _from_truth(kept: Recording, known: WorldCase) -> PoseCandidates:
+    problem = kept.problem
+    assert problem is not None
+    assert known.case.truth is not None
+    start = problem.in_working_frames(known.case.truth)[None]
+    return pipeline.refine_poses(problem, start, torch.Generator().manual_seed(0))[torch.tensor([0])]
+
+
+def _described(
+    problem: RegistrationProblem, candidates: PoseCandidates, known: WorldCase | None, winner: int | None
+) -> Iterator[Row]:
+    """Rows of these candidates. known: what they should be; None: all are wrong · winner: the chosen one's number."""
+    assert candidates.offsets is not None
+    features = pose_features(problem, candidates.T, candidates.offsets)
+    evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, _OPTIONS.robust)
+    errors = _errors(problem, candidates.T, known)
+    rivals = rival_numbers(problem, candidates, evidence, _OPTIONS.robust.rival_margin)
+    for number in range(len(candidates)):
+        yield {
+            "mssd": errors[number],
+            "listed_mssd": min(errors[one] for one in (number, *rivals)),
+            "rivals": len(rivals),
+            "winner": number == winner,
+            "score": float(evidence.scores[number]),
+            "features": {name: float(values[number]) for name, values in features.items()},
+        }
+
+
+def _errors(problem: RegistrationProblem, T: Sim3, known: WorldCase | None) -> list[float]:
+    """MSSD of each pose, diameters; of a wrong object 9."""
+    if known is None or known.case.truth is None:
+        return [9.0] * len(T)
+    found: list[float] = NearestTruth(problem, known.case.truth, known.points, known.case.symmetries).errors(T).tolist()
+    return found
+
+
+def _same_shape(known: WorldCase, asked: WorldCase, T: Sim3) -> bool:
+    """Whether the object that was asked for coincides with the right one where it was found."""
+    assert known.case.truth is not None
+    there = known.case.truth.inverse().apply(known.points[:_POINTS].double()).float()
+    found = T.inverse().apply(asked.points[:_POINTS].double()).float()
+    far = [NearestNeighbors(one).query(other)[0].quantile(0.95) for one, other in ((there, found), (found, there))]
+    return float(max(far)) <= _SAME_SHAPE * diameter(there)

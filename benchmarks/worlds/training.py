@@ -1,0 +1,161 @@
+"""The probability model of the verdict, trained on evidence from random worlds: ``python -m benchmarks.worlds train``.
+
+Logistic regression on monotone ramps: each feature's range is cut at quantiles, and each piece has a ramp whose weight
+is at least 0, so the sum is monotone in every feature. Worlds are left out in turn to see what the model says of rooms
+that it does not know; what it says of them is then made right on average (Platt's scaling on the left-out logits).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from benchmarks.robust.judging import SUCCESS
+from benchmarks.worlds.calibration import calibration_table
+from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+
+Array = NDArray[np.float64]
+
+PIECES = 5
+"""Ramps for each feature, between its quantiles."""
+PENALTY = 3e-4
+"""Of the squared weights."""
+
+
+OF_OTHERS = 0.5
+"""Weight of poses that no registration chose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Poses with what is known of them: features (N, F), in the order of SPEAKS_FOR · right (N,) 0 or 1 · weight (N,) ·
+    world (N,): the room, by which poses belong together."""
+
+    features: Array
+    right: Array
+    weight: Array
+    world: NDArray[Any]
+
+    def __getitem__(self, index: Any) -> Evidence:
+        return Evidence(self.features[index], self.right[index], self.weight[index], self.world[index])
+
+
+@dataclass(frozen=True, eq=False)
+class Ramps:
+    """knots: (F, K) of each feature, turned so that more is better. weights: (F, K - 1) at least 0."""
+
+    knots: Array
+    weights: Array
+    bias: float
+
+    def logit(self, features: Array) -> Array:
+        """(N,) log odds of rows (N, F)."""
+        return self.bias + np.asarray(_design(features, self.knots) @ self.weights.ravel())
+
+    def scaled(self, slope: float, shift: float) -> Ramps:
+        return Ramps(self.knots, slope * self.weights, slope * self.bias + shift)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As ``probability.json`` keeps it: features that do not count are left out."""
+        terms = {}
+        for name, knots, weights in zip(SPEAKS_FOR, self.knots, self.weights, strict=True):
+            if weights.sum() < 1e-3:
+                continue
+            values = np.concatenate([[-weights.sum()], np.cumsum(weights) - weights.sum()])
+            if not SPEAKS_FOR[name]:
+                knots, values = -knots[::-1], values[::-1]
+            terms[name] = {"knots": _rounded(knots), "values": _rounded(values)}
+        return {"bias": round(self.bias, 4), "terms": terms}
+
+
+def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
+    """The model from the rows of :mod:`benchmarks.worlds.evidence`, as its file keeps it, and a table of how well its
+    probabilities hold in worlds that were left out."""
+    used = [row for row in rows if not _told_apart_by_rivals(row)]
+    evidence = Evidence(
+        np.array([[row["features"][name] for name in SPEAKS_FOR] for row in used]),
+        np.array([float(row["mssd"] <= SUCCESS) for row in used]),
+        np.array([1.0 if row["winner"] else OF_OTHERS for row in used]),
+        np.array([row["world"].split("-")[1] for row in used]),
+    )
+    model, left_out = train(evidence)
+    return model.to_dict(), calibration_table(used, left_out)
+
+
+def _told_apart_by_rivals(row: dict[str, Any]) -> bool:
+    """A wrong pose that is listed together with a right one: the verdict `ambiguous` says so, not the probability."""
+    return bool(row["mssd"] > SUCCESS >= row["listed_mssd"])
+
+
+def train(evidence: Evidence) -> tuple[Ramps, Array]:
+    """The model, and the log odds (N,) that it gives each row when the row's world is left out."""
+    left_out = np.zeros(len(evidence.right))
+    for world in np.unique(evidence.world):
+        of_world = evidence.world == world
+        left_out[of_world] = _fit(evidence[~of_world]).logit(evidence.features[of_world])
+    slope, shift = _platt(left_out, evidence)
+    return _fit(evidence).scaled(slope, shift), slope * left_out + shift
+
+
+def _fit(evidence: Evidence) -> Ramps:
+    turned = _turned(evidence.features)
+    knots = np.stack([_knots(column) for column in turned.T])
+    design = _design(evidence.features, knots)
+    start = np.zeros(design.shape[1] + 1)
+    bounds = [(0.0, None)] * design.shape[1] + [(None, None)]
+    found = minimize(_loss, start, (design, evidence), jac=True, bounds=bounds, method="L-BFGS-B")
+    return Ramps(knots, found.x[:-1].reshape(len(knots), -1), float(found.x[-1]))
+
+
+def _loss(p: Array, design: Array, evidence: Evidence) -> tuple[float, Array]:
+    """Weighted mean of the log loss, plus the penalty; and its gradient."""
+    w = evidence.weight / evidence.weight.sum()
+    z = design @ p[:-1] + p[-1]
+    losses = np.logaddexp(0.0, np.where(evidence.right == 1, -z, z))
+    off = w * (1.0 / (1.0 + np.exp(-z)) - evidence.right)
+    value = float(w @ losses + PENALTY * p[:-1] @ p[:-1])
+    return value, np.append(design.T @ off + 2 * PENALTY * p[:-1], off.sum())
+
+
+def _platt(logits: Array, evidence: Evidence) -> tuple[float, float]:
+    """Slope and shift that make the log odds right on average."""
+    design = logits[:, None]
+
+    def loss(p: Array) -> tuple[float, Array]:
+        w = evidence.weight / evidence.weight.sum()
+        z = design[:, 0] * p[0] + p[1]
+        off = w * (1.0 / (1.0 + np.exp(-z)) - evidence.right)
+        return float(w @ np.logaddexp(0.0, np.where(evidence.right == 1, -z, z))), np.array([off @ logits, off.sum()])
+
+    found = minimize(loss, np.array([1.0, 0.0]), jac=True, method="L-BFGS-B")
+    return float(found.x[0]), float(found.x[1])
+
+
+def _turned(features: Array) -> Array:
+    """The features, turned so that more of each is better."""
+    return features * np.array([1.0 if better else -1.0 for better in SPEAKS_FOR.values()])
+
+
+def _knots(column: Array) -> Array:
+    """PIECES + 1 increasing numbers: quantiles, moved apart where they coincide."""
+    knots = np.quantile(column, np.linspace(0.02, 0.98, PIECES + 1))
+    least = 1e-3 * max(float(np.ptp(column)), 1e-6)
+    for i in range(1, len(knots)):
+        knots[i] = max(knots[i], knots[i - 1] + least)
+    return np.asarray(knots)
+
+
+def _design(features: Array, knots: Array) -> Array:
+    """(N, F * PIECES): how far each row is short of the upper end of each piece, 0 to -1."""
+    low, high = knots[:, :-1], knots[:, 1:]
+    short = (high - _turned(features)[:, :, None]) / (high - low)
+    return -np.clip(short, 0.0, 1.0).reshape(len(features), -1)
+
+
+def _rounded(values: Sequence[float] | Array) -> list[float]:
+    return [round(float(value), 5) for value in values]

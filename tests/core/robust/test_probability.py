@@ -1,0 +1,72 @@
+"""The probability model: its terms by hand, monotone in every feature, and the file that is shipped."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+from regnf_core.robust.verdict.probability import ProbabilityModel, probability_model
+
+STORED: dict[str, Any] = {
+    "bias": 2.0,
+    "terms": {
+        "confirmed": {"knots": [0.2, 0.6, 0.8], "values": [-3.0, -1.0, 0.0]},
+        "free": {"knots": [0.0, 0.5], "values": [0.0, -4.0]},
+    },
+}
+
+
+def features(**values: float) -> dict[str, torch.Tensor]:
+    return {name: torch.tensor([value], dtype=torch.float64) for name, value in values.items()}
+
+
+def logit(**values: float) -> float:
+    return float(ProbabilityModel.from_dict(STORED).logit(features(**values))[0])
+
+
+def test_terms_by_hand() -> None:
+    assert logit(confirmed=0.9, free=0.0) == pytest.approx(2.0)
+    assert logit(confirmed=0.4, free=0.0) == pytest.approx(2.0 - 2.0)  # half way between -3 and -1
+    assert logit(confirmed=0.7, free=0.25) == pytest.approx(2.0 - 0.5 - 2.0)
+    assert logit(confirmed=0.0, free=0.9) == pytest.approx(2.0 - 3.0 - 4.0)  # constant beyond the outer knots
+
+
+def test_what_is_not_a_number_is_as_bad_as_can_be() -> None:
+    assert logit(confirmed=math.nan, free=0.0) == pytest.approx(2.0 - 3.0)
+    assert logit(confirmed=0.9, free=math.inf) == pytest.approx(2.0 - 4.0)
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {"confirmed": {"knots": [0.2, 0.6, 0.8], "values": [-1.0, -3.0, 0.0]}},  # more of it must speak for the pose
+        {"free": {"knots": [0.0, 0.5], "values": [-4.0, 0.0]}},  # more of it must speak against the pose
+        {"free": {"knots": [0.5, 0.0], "values": [0.0, -4.0]}},
+    ],
+)
+def test_a_file_whose_terms_are_not_monotone_is_refused(broken: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="not monotone"):
+        ProbabilityModel.from_dict({"bias": 0.0, "terms": broken})
+
+
+@given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
+def test_the_shipped_model_is_monotone(name: str, low: float, step: float) -> None:
+    model = probability_model()
+    others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
+    less, more = model.logit(others | {name: torch.tensor([low, low + step], dtype=torch.float64)}).tolist()
+    assert more >= less if SPEAKS_FOR[name] else more <= less
+
+
+def test_the_shipped_model_uses_what_it_must() -> None:
+    """A pose that is perfect in all respects is likely; one in free space, or without any agreement, is not."""
+    best = {name: torch.tensor([1e3 if better else -1e3], dtype=torch.float64) for name, better in SPEAKS_FOR.items()}
+    worst = {name: -values for name, values in best.items()}
+    model = probability_model()
+    assert float(model.logit(best).sigmoid()) > 0.99
+    assert float(model.logit(worst).sigmoid()) < 1e-4
