@@ -72,7 +72,7 @@ class RegistrationResult:
     object_samples: SurfaceSamples
     metrics: dict[str, float]
     """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
-    field_evaluations, and seconds by phase as seconds_<phase>."""
+    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
     """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""
@@ -87,3 +87,9 @@ class RegistrationResult:
     """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
     """The scene's surface around the detection, for viewers."""
+
+    @property
+    def probability(self) -> float | None:
+        """That the pose is right, 0..1: within 5 % of the object's diameter, or equal to that by the object's symmetry.
+        None from the preset `paper`."""
+        return self.metrics.get("probability")

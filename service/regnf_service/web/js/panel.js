@@ -23,7 +23,9 @@ export function showVerdict(result) {
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;
   const total = totalSeconds(metrics);
+  const { probability } = metrics;
   fillFacts(byId('figures'), [
+    ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), 'that the pose is right')]] : []),
     ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
     ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
       Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],

@@ -1,0 +1,82 @@
+"""The training of the verdict's model: a known law is found again, terms stay monotone, and the table counts right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+from benchmarks.worlds.calibration import auroc, calibration_table
+from benchmarks.worlds.training import Evidence, train, trained
+from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+from regnf_core.robust.verdict.probability import ProbabilityModel
+
+NAMES = list(SPEAKS_FOR)
+
+
+def drawn(count: int, seed: int) -> tuple[Evidence, np.ndarray]:
+    """Poses whose log odds follow ``confirmed`` and ``free``; the other features say nothing."""
+    draw = np.random.default_rng(seed)
+    features = draw.uniform(0.0, 1.0, (count, len(NAMES)))
+    logit = 6.0 * features[:, NAMES.index("confirmed")] - 4.0 * features[:, NAMES.index("free")] - 1.0
+    right = (draw.uniform(size=count) < 1.0 / (1.0 + np.exp(-logit))).astype(float)
+    return Evidence(features, right, np.ones(count), np.arange(count) % 7), logit
+
+
+def test_a_known_law_is_found_again() -> None:
+    evidence, _ = drawn(3000, 0)
+    model, left_out = train(evidence)
+    fresh, logit = drawn(2000, 1)
+    found = model.logit(fresh.features)
+    assert spearmanr(found, logit).statistic > 0.97
+    assert abs(float(np.mean(1 / (1 + np.exp(-found)))) - float(fresh.right.mean())) < 0.03
+    assert abs(float(np.mean(1 / (1 + np.exp(-left_out)))) - float(evidence.right.mean())) < 0.005
+
+
+def test_the_stored_model_says_the_same() -> None:
+    evidence, _ = drawn(800, 2)
+    model, _ = train(evidence)
+    stored = ProbabilityModel.from_dict(model.to_dict())
+    features = {name: torch.from_numpy(evidence.features[:, i]) for i, name in enumerate(NAMES)}
+    np.testing.assert_allclose(stored.logit(features).numpy(), model.logit(evidence.features), atol=0.03)
+
+
+def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
+    evidence, _ = drawn(2000, 3)
+    turned = evidence.features.copy()
+    turned[:, NAMES.index("hidden")] = evidence.right + 0.01 * turned[:, NAMES.index("hidden")]
+    model, _ = train(Evidence(turned, evidence.right, evidence.weight, evidence.world))
+    assert "hidden" not in model.to_dict()["terms"]  # more that is hidden must not make a pose likelier
+
+
+def test_ambiguity_is_no_error_of_the_probability() -> None:
+    rows = [
+        {
+            "features": dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3)),
+            "mssd": 0.01 if number % 3 else 0.6,
+            "listed_mssd": 0.01,
+            "winner": True,
+            "world": f"tsdf-{number % 4}-long",
+        }
+        for number in range(30)
+    ]
+    _, table = trained([*rows, {**rows[0], "listed_mssd": 0.6, "world": "tsdf-9-long"}])
+    assert table.startswith("21 registrations of 5 worlds, 20 with a right pose.")
+
+
+def test_the_table_counts_what_was_chosen() -> None:
+    rows = [
+        {"winner": True, "mssd": 0.01, "world": "a"},
+        {"winner": True, "mssd": 0.07, "world": "a"},
+        {"winner": True, "mssd": 0.5, "world": "b"},
+        {"winner": False, "mssd": 0.01, "world": "b"},
+    ]
+    table = calibration_table(rows, np.array([4.0, 3.0, -4.0, 5.0]))
+    assert "3 registrations of 2 worlds, 1 with a right pose. AUROC 1.0000" in table
+    assert "| 0.9 | 1 of 1 | 5 % | 1 of 2 | 97.5 % | 0 |" in table
+
+
+@pytest.mark.parametrize(("scores", "expected"), [([1.0, 2.0, 3.0, 4.0], 1.0), ([4.0, 1.0, 1.0, 2.0], 0.375)])
+def test_auroc_by_hand(scores: list[float], expected: float) -> None:
+    assert auroc(np.array(scores), np.array([False, False, True, True])) == pytest.approx(expected)
