@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 PIECES = 5
 """Ramps for each feature, between its quantiles."""
-PENALTY = 3e-4
+PENALTY = 1e-3
 """Of the squared weights."""
 
 
