@@ -8,8 +8,12 @@ SAMPLES = 16_384
 """Points that a field is checked at."""
 TRIAL_POINTS = 1_024
 """Points that each of several readings is tried at, with its gradient."""
-FINAL_POINTS, FINALISTS = 8_192, 12
+FINAL_POINTS, FINALISTS = 8_192, 24
 """Points of the second round, and how many readings may come into it."""
+MAX_TRIED = 64
+"""Readings that are all tried; of more, the most usual ones and as many next to the best of those."""
+READINGS_BESIDE = 11
+"""Readings that are tried beside the chosen one."""
 NEAREST_SHARE = 16
 ASKED_AGAIN = 64
 STEPS = 8
@@ -38,6 +42,6 @@ def calls_of_check(samples: int) -> Calls:
 
 
 def calls_of_trials(readings: int) -> Calls:
-    """What the choice among so many readings evaluates at most: both rounds, and two interpolations."""
-    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + 2)
-    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS), (TRIAL_POINTS,) * (readings + 1) + final)
+    """What the choice among so many readings evaluates at most: both rounds, those beside, two interpolations."""
+    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + READINGS_BESIDE + 3)
+    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS), (TRIAL_POINTS,) * (min(readings, 2 * MAX_TRIED) + 1) + final)

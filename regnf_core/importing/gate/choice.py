@@ -1,6 +1,7 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the others
+Readings whose levels do clearly less for the gradient than the best's are out; where no level tells, those that are
+clearly farther from a distance. Those left that are one function need no choice. Of the others
 the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident. What stays open
 is refused, with the line to add to the description for each.
 """
@@ -15,24 +16,16 @@ from functools import partial
 from typing import Any
 
 from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, TRIAL_POINTS
+from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, MAX_TRIED, TRIAL_POINTS
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
-from regnf_core.importing.gate.evidence import Evidence, Trial
+from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, Evidence, Trial
 from regnf_core.importing.gate.interpolation import told_interpolation
 from regnf_core.importing.gate.plausibility import without_new_code
+from regnf_core.importing.gate.readings_beside import readings_beside
 from regnf_core.schema.hash_grid_config import Interpolation
 
 _SHOWN = MOST_CANDIDATES
-_CLEARLY, _LEAST = 0.1, 0.01
-"""In the first round a reading is out that fits worse by this share of the best's misfit, and by this much at least."""
-_TELLING = 0.4
-"""A best reading that is itself farther from a distance speaks against no other: the least noisy may be wrong."""
-_FINALLY = 0.04
-"""The same in the second round, at more points."""
-_ACCIDENT = 0.5 * math.log(2.0)
-"""Usual numbers are powers of two: among layouts spread by less than this (log of the finest resolution), one of them
-is no accident."""
 
 
 def choose_reading(converted: ConvertedField) -> ConvertedField:
@@ -55,39 +48,73 @@ def choose_reading(converted: ConvertedField) -> ConvertedField:
 
 def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
     evidence = Evidence(readings[0], TRIAL_POINTS)
-    trials = [evidence.of(reading) for reading in readings]
-    best = min(trials, key=lambda trial: trial.mean)
-    speaks = best.mean < _TELLING
-    left = [trial for trial in trials if not speaks or not best.is_better(trial, _CLEARLY, _LEAST)]
+    trials = _tried(readings, evidence)
+    best = _best(trials)
     finest = Evidence(best.reading, FINAL_POINTS)
-    if speaks and len(left) > 1 and not all(trial.is_same(best) for trial in left):
-        left = _second_round(left, finest)
-    chosen = _settled(left)
+    if len(trials) == len(readings) and all(trial.is_same(best) for trial in trials):
+        chosen = min(trials, key=lambda trial: trial.reading.tier)
+    elif best.is_telling:
+        chosen = _proven(trials, best, finest)
+    elif len(trials) == len(readings) and best.is_distance and not _standing(trials, best):
+        chosen = best
+    else:
+        raise _ambiguous([trial.reading for trial in sorted(trials, key=lambda trial: trial.reading.tier)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
     if chosen.reading.interpolation == "open" and chosen.distance is not None:
         return _interpolated(chosen.reading, finest, why)
     return chosen.reading, why
 
 
-def _second_round(trials: Sequence[Trial], finest: Evidence) -> list[Trial]:
-    """Those of ``trials`` that are as good as the best of them at more points. The least usual ones are not asked."""
-    finalists = sorted(trials, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
-    again = [finest.of(trial.reading) for trial in finalists]
-    best = min(again, key=lambda trial: trial.mean)
-    return [trial for trial in again if not best.is_better(trial, _FINALLY)]
+def _tried(readings: Sequence[Reading], evidence: Evidence) -> list[Trial]:
+    """Trials of the most usual readings, and of the others that lie next to the best of them, where it tells."""
+    trials = [evidence.of(reading) for reading in readings[:MAX_TRIED]]
+    best = _best(trials)
+    if not best.is_telling:
+        return trials
+    rest = [reading for reading in readings[MAX_TRIED:] if _group(reading) == _group(best.reading)]
+    near = sorted(rest, key=lambda reading: abs((reading.scale or 0.0) - (best.reading.scale or 0.0)))
+    return trials + [evidence.of(reading) for reading in near[:MAX_TRIED]]
 
 
-def _settled(left: Sequence[Trial]) -> Trial:
-    """The one of the trials left that stands, or a refusal."""
-    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
-    others = [trial for trial in left if not trial.is_same(usual)]
-    if not others:
-        return usual
-    rivals = [trial for trial in others if trial.reading.tier <= usual.reading.tier]
-    scales = [trial.reading.scale for trial in left if trial.reading.scale is not None]
-    if rivals or usual.reading.tier > 0 or len(scales) < len(left) or max(scales) - min(scales) > _ACCIDENT:
-        raise _ambiguous([trial.reading for trial in (usual, *others)])
-    return usual
+def _best(trials: Sequence[Trial]) -> Trial:
+    """The best supported one; where no levels tell, the one nearest to a distance."""
+    best = max(trials, key=lambda trial: (trial.is_telling, trial.support))
+    return best if best.is_telling else min(trials, key=lambda trial: trial.mean)
+
+
+def _group(reading: Reading) -> object:
+    grid = reading.description.get("hash") or {}
+    names = ("levels", "features_per_level", "log2_table_size", "base_resolution")
+    return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
+
+
+def _proven(trials: Sequence[Trial], best: Trial, finest: Evidence) -> Trial:
+    """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
+    rivals = _standing(trials, best)
+    if len(rivals) > FINALISTS:
+        raise _ambiguous([trial.reading for trial in (best, *_usual_first(rivals))])
+    again = [finest.of(trial.reading) for trial in (best, *rivals)]
+    chosen = max(again, key=lambda trial: trial.support_over(again[0]) + trial.usual_over(again[0]))
+    beside = [finest.of(reading) for reading in readings_beside(chosen.reading)]
+    standing = _standing((*again, *beside), chosen)
+    if not standing and chosen.support < CLEAR_SUPPORT:
+        standing = _others(trials, best)
+    if standing:
+        raise _ambiguous([trial.reading for trial in (chosen, *_usual_first(standing))])
+    return chosen
+
+
+def _standing(trials: Sequence[Trial], best: Trial) -> list[Trial]:
+    """Those of ``trials`` that are another function than the ``best`` and not beaten by it."""
+    return [trial for trial in _others(trials, best) if not best.beats(trial)]
+
+
+def _others(trials: Sequence[Trial], best: Trial) -> list[Trial]:
+    return [trial for trial in trials if not trial.is_same(best)]
+
+
+def _usual_first(trials: Sequence[Trial]) -> list[Trial]:
+    return sorted(trials, key=lambda trial: (trial.reading.tier, -trial.support))
 
 
 def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple[Reading, list[str]]:
@@ -102,7 +129,7 @@ def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple
         asked = [_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)]
         # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
         raise _ambiguous(asked, whole=True)
-    more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
+    more = f"{told} interpolation: under it the levels correct one another within their cells"
     return _with_interpolation(reading, told), [*why, more]
 
 

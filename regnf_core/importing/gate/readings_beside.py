@@ -1,0 +1,54 @@
+"""Readings whose levels are a little coarser or finer than another's, to see whether the evidence peaks there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+
+from regnf_core.errors import FieldFormatError
+from regnf_core.importing.families.converted import Reading
+from regnf_core.importing.families.grid_field import finest_of
+from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig
+
+_FINEST = (-0.24, -0.12, -0.06, math.log(2000 / 2048), 0.06, 0.12, 0.24)
+"""How far the finest resolutions lie from the reading's own, as natural logarithms. Next to a power of two is the round
+number below it."""
+_COARSEST = (-0.24, -0.12, 0.12, 0.24)
+"""The same of the coarsest resolutions, the finest one being kept."""
+
+
+def readings_beside(reading: Reading) -> Iterator[Reading]:
+    """The same reading with other growths or other coarsest resolutions, as far as the table has the size for them."""
+    grid = HashGridConfig(**reading.description["hash"])
+    if grid.levels == 1 or grid.resolutions is not None or grid.strides is not None:
+        return
+    steps = grid.levels - 1
+    others = [replace(grid, per_level_scale=grid.per_level_scale * math.exp(more / steps)) for more in _FINEST]
+    top = grid.base_resolution * grid.per_level_scale**steps
+    for more in _COARSEST:
+        base = max(1, round(grid.base_resolution * math.exp(more)))
+        others.append(replace(grid, base_resolution=base, per_level_scale=(top / base) ** (1.0 / steps)))
+    for other in others:
+        if other.base_resolution == grid.base_resolution and other.per_level_scale == grid.per_level_scale:
+            continue
+        made = _of_size(other, grid.entries) if 1.0 <= other.per_level_scale <= MAX_GROWTH else None
+        if made is not None:
+            said = {"base_resolution": made.base_resolution, "top_resolution": round(math.exp(finest_of(made)))}
+            yield _said(reading, made, said)
+
+
+def _of_size(grid: HashGridConfig, entries: int) -> HashGridConfig | None:
+    try:
+        return grid.with_entry_count(entries)
+    except FieldFormatError:
+        return None
+
+
+def _said(reading: Reading, grid: HashGridConfig, said: dict[str, int]) -> Reading:
+    """``reading`` with this grid, and with what to say of it in a description."""
+    parts = {name: value for name, value in reading.say.get("hash", {}).items() if name != "per_level_scale"}
+    name = f"{reading.name}, {said['base_resolution']} to {said['top_resolution']} nodes"
+    say = {**reading.say, "hash": {**parts, **said}}
+    described = {**reading.description, "hash": asdict(grid)}
+    return replace(reading, name=name, say=say, description=described, scale=finest_of(grid), tier=reading.tier + 1)
