@@ -1,9 +1,9 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-Readings whose levels do clearly less for the gradient than the best's are out; where no level tells, those that are
-clearly farther from a distance. Those left that are one function need no choice. Of the others
-the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident. What stays open
-is refused, with the line to add to the description for each.
+The reading is taken whose levels do the most for the gradient, if it beats every other function that the tensors may
+stand for, one by one at the same points, and those beside it, which may not be listed. Where no levels tell, only
+readings of the same resolutions are weighed against each other. What stays open is refused, with the line to add to
+the description for each.
 """
 
 from __future__ import annotations

@@ -77,7 +77,8 @@ class PartsOfGradient:
 
 def norm_misfit(gradient: Tensor) -> Tensor:
     """How far the norm of ``gradient`` (..., 3) is from 1: the absolute value of its logarithm (...)."""
-    return gradient.norm(dim=-1).clamp_min(1e-9).log().abs().clamp_max(_MOST)
+    norm = torch.linalg.vector_norm(gradient, dim=-1)
+    return torch.clamp(norm.clamp_min(1e-9).log().abs(), max=_MOST)
 
 
 def parts_of_gradient(field: SdfField, points: Tensor) -> PartsOfGradient | None:
@@ -94,7 +95,7 @@ def parts_of_gradient(field: SdfField, points: Tensor) -> PartsOfGradient | None
         return None
     if encoding is None:
         return None
-    chunks = [function.gradient_by_level(chunk) for chunk in points.split(_CHUNK)]
+    chunks = [function.gradient_by_level(chunk) for chunk in torch.split(points, _CHUNK)]
     distance, rest, levels = zip(*chunks, strict=True)
     parts = torch.cat(distance), torch.cat(rest), torch.cat(levels, dim=1)
     return PartsOfGradient(*parts, encoding.scales, function.places(points))
