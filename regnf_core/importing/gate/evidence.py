@@ -69,9 +69,9 @@ class Trial:
         return len(self.levels.gains) == len(other.levels.gains)
 
     def has_resolutions_of(self, other: Trial) -> bool:
-        """Whether both differ at most in how rows are counted: misread, one is as noisy as the other."""
+        """Whether both differ at most in how rows are counted, or have no grid: misread, one is as noisy as the other."""
         if self.levels is None or other.levels is None:
-            return False
+            return self.levels is other.levels
         return torch.equal(self.levels.scales, other.levels.scales)
 
     def support_over(self, other: Trial) -> float:
@@ -94,10 +94,13 @@ class Trial:
         """Whether the levels speak clearly for this reading and not for ``other``.
 
         The misfit alone speaks only where both have the same resolutions. Readings of other numbers of levels have no
-        levels in common: then more must speak for this one, and the misfit may not speak for ``other``.
+        levels in common: then more must speak for this one, and the misfit may not speak for ``other``. A reading
+        without a grid is the simplest one: it stands where a grid's levels say nothing and only worsen the misfit.
         """
         if other.misfit is None:
             return self.misfit is not None
+        if self.levels is None and other.levels is not None:
+            return other.support < LEAST_SUPPORT and self.is_better(other, _CLEARLY, _LEAST)
         if self.has_resolutions_of(other) and self.is_better(other, _CLEARLY, _LEAST):
             return True
         if self.has_levels_of(other):
