@@ -10,10 +10,12 @@ TRIAL_POINTS = 1_024
 """Points that each of several readings is tried at, with its gradient."""
 FINAL_POINTS, FINALISTS = 8_192, 24
 """Points of the second round, and how many readings may come into it."""
+LAST_POINTS, LAST_FINALISTS = 32_768, 6
+"""The same of the third round, for what the second one leaves open. The interpolation is told at as many points."""
 MAX_TRIED = 64
 """Readings that are all tried; of more, the most usual ones and as many next to the best of those."""
-READINGS_BESIDE = 11
-"""Readings that are tried beside the chosen one."""
+READINGS_BESIDE, MAX_CLIMBS = 40, 3
+"""Readings that are tried beside the best one, and how often from there on to a better one."""
 NEAREST_SHARE = 16
 ASKED_AGAIN = 64
 STEPS = 8
@@ -42,6 +44,8 @@ def calls_of_check(samples: int) -> Calls:
 
 
 def calls_of_trials(readings: int) -> Calls:
-    """What the choice among so many readings evaluates at most: both rounds, those beside, two interpolations."""
-    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + READINGS_BESIDE + 3)
-    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS), (TRIAL_POINTS,) * (min(readings, 2 * MAX_TRIED) + 1) + final)
+    """What the choice among so many readings evaluates at most: three rounds, those beside, two interpolations."""
+    first = (TRIAL_POINTS,) * (min(readings, 2 * MAX_TRIED) + 1)
+    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + MAX_CLIMBS * READINGS_BESIDE + 3)
+    last = (LAST_POINTS,) * (LAST_FINALISTS + 3)
+    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS, 8 * LAST_POINTS), first + final + last)

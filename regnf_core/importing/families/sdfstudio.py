@@ -166,9 +166,10 @@ def _readings(
     readings: list[Reading] = []
     is_trained = bool(np.abs(table).max() > _UNTRAINED)
     if overrides.use_grid is not False and _uses_columns(layers, plain, None):
-        readings += space_readings(
+        layouts = space_readings(
             table, spaces, layers.tensors(), entries, "open" if overrides.hash.interpolation is None else "known"
         )
+        readings += layouts if is_trained else layouts[:1]  # of noise one layout is as good as another
     may_be_unused = overrides.use_grid is not True and not is_trained
     if not readings or may_be_unused:  # columns of zeros never see the grid, whatever is said
         unused = asdict(spaces[0].written()[0].grid)

@@ -1,9 +1,9 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-The reading is taken whose levels do the most for the gradient, if it beats every other function that the tensors may
-stand for, one by one at the same points, and those beside it, which may not be listed. Where no levels tell, only
-readings of the same resolutions are weighed against each other. What stays open is refused, with the line to add to
-the description for each.
+The reading is looked for whose levels do the most for the gradient, from the listed ones on to those beside the best.
+It is taken if it beats every other function that the tensors may stand for, one by one at the same points, and those
+beside it. Where no levels tell, only readings of the same resolutions, or without a grid, are weighed against each
+other. What stays open is refused, with the line to add to the description for each.
 """
 
 from __future__ import annotations
@@ -16,16 +16,25 @@ from functools import partial
 from typing import Any
 
 from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, MAX_TRIED, TRIAL_POINTS
+from regnf_core.importing.cost.calls import (
+    FINAL_POINTS,
+    FINALISTS,
+    LAST_FINALISTS,
+    LAST_POINTS,
+    MAX_CLIMBS,
+    MAX_TRIED,
+    TRIAL_POINTS,
+)
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
 from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, Evidence, Trial
 from regnf_core.importing.gate.interpolation import told_interpolation
 from regnf_core.importing.gate.plausibility import without_new_code
-from regnf_core.importing.gate.readings_beside import readings_beside
+from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
 from regnf_core.schema.hash_grid_config import Interpolation
 
 _SHOWN = MOST_CANDIDATES
+_KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 
 
 def choose_reading(converted: ConvertedField) -> ConvertedField:
@@ -50,18 +59,17 @@ def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
     evidence = Evidence(readings[0], TRIAL_POINTS)
     trials = _tried(readings, evidence)
     best = _best(trials)
-    finest = Evidence(best.reading, FINAL_POINTS)
     if len(trials) == len(readings) and all(trial.is_same(best) for trial in trials):
-        chosen = min(trials, key=lambda trial: trial.reading.tier)
+        chosen = min(trials, key=lambda trial: (trial.reading.tier, trial.levels is not None))
     elif best.is_telling:
-        chosen = _proven(trials, best, finest)
+        chosen = _proven(trials, best)
     elif len(trials) == len(readings) and best.is_distance and not _standing(trials, best):
         chosen = best
     else:
         raise _ambiguous([trial.reading for trial in sorted(trials, key=lambda trial: trial.reading.tier)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
     if chosen.reading.interpolation == "open" and chosen.distance is not None:
-        return _interpolated(chosen.reading, finest, why)
+        return _interpolated(chosen.reading, Evidence(best.reading, LAST_POINTS), why)
     return chosen.reading, why
 
 
@@ -88,20 +96,48 @@ def _group(reading: Reading) -> object:
     return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
 
 
-def _proven(trials: Sequence[Trial], best: Trial, finest: Evidence) -> Trial:
+def _proven(trials: Sequence[Trial], best: Trial) -> Trial:
     """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
-    rivals = _standing(trials, best)
-    if len(rivals) > FINALISTS:
-        raise _ambiguous([trial.reading for trial in (best, *_usual_first(rivals))])
-    again = [finest.of(trial.reading) for trial in (best, *rivals)]
-    chosen = max(again, key=lambda trial: trial.support_over(again[0]) + trial.usual_over(again[0]))
-    beside = [finest.of(reading) for reading in readings_beside(chosen.reading)]
-    standing = _standing((*again, *beside), chosen)
+    finest = Evidence(best.reading, FINAL_POINTS)
+    again = [finest.of(trial.reading) for trial in (best, *_nearest(_standing(trials, best), best, FINALISTS))]
+    chosen, tried = _climbed(again, finest)
+    standing = _nearest(_standing(tried, chosen), chosen, LAST_FINALISTS)
+    if standing:
+        last, kind = Evidence(best.reading, LAST_POINTS), _likelier_interpolation(chosen, finest)
+        chosen, *rest = [last.of(_compared(trial.reading, kind)) for trial in (chosen, *standing)]
+        standing = _standing(rest, chosen)
     if not standing and chosen.support < CLEAR_SUPPORT:
         standing = _others(trials, best)
-    if standing:
+    if standing or not chosen.reading.is_written:
         raise _ambiguous([trial.reading for trial in (chosen, *_usual_first(standing))])
     return chosen
+
+
+def _climbed(trials: Sequence[Trial], evidence: Evidence) -> tuple[Trial, list[Trial]]:
+    """From the best of ``trials`` on to better ones beside it, listed or not, until there are none; and all tried.
+
+    Raises AmbiguousError: there are still better ones.
+    """
+    tried = list(trials)
+    best = _most_supported(tried, tried[0])
+    for _ in range(MAX_CLIMBS):
+        near = (*readings_written_near(best.reading), *readings_beside(best.reading))
+        tried += [evidence.of(reading) for reading in near if not any(t.reading.is_grid_of(reading) for t in tried)]
+        better = _most_supported(tried, best)
+        if better is best:
+            return best, tried
+        best = better
+    raise _ambiguous([trial.reading for trial in _nearest(tried, best, LAST_FINALISTS)])
+
+
+def _most_supported(trials: Sequence[Trial], best: Trial) -> Trial:
+    """The one of ``trials`` that is most ahead of ``best``, or ``best``."""
+    return max((best, *trials), key=lambda trial: trial.support_over(best) + trial.usual_over(best))
+
+
+def _nearest(rivals: Sequence[Trial], best: Trial, most: int) -> list[Trial]:
+    """The rivals that come nearest to the ``best`` one: who is behind these is behind it, too."""
+    return sorted(rivals, key=lambda rival: best.support_over(rival) + best.usual_over(rival))[:most]
 
 
 def _standing(trials: Sequence[Trial], best: Trial) -> list[Trial]:
@@ -117,20 +153,35 @@ def _usual_first(trials: Sequence[Trial]) -> list[Trial]:
     return sorted(trials, key=lambda trial: (trial.reading.tier, -trial.support))
 
 
+def _likelier_interpolation(trial: Trial, evidence: Evidence) -> Interpolation | None:
+    """The interpolation under which layouts are compared: the better supported one, unless it is known."""
+    if trial.reading.interpolation == "known":
+        return None
+    linear, smooth = (evidence.of(_with_interpolation(trial.reading, kind)) for kind in _KINDS)
+    return "linear" if linear.support_over(smooth) > 0.0 else "smoothstep"
+
+
 def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple[Reading, list[str]]:
     """``reading`` with the interpolation that the evidence tells, or a refusal."""
-    kinds: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
-    linear, smooth = (evidence.of(_with_interpolation(reading, kind)) for kind in kinds)
+    linear, smooth = (evidence.of(_with_interpolation(reading, kind)) for kind in _KINDS)
     if linear.is_same(smooth):
         return reading, why
     told = told_interpolation(linear, smooth)
     if told is None:
         habit = reading.description["hash"]["interpolation"]
-        asked = [_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)]
+        asked = [_with_interpolation(reading, kind) for kind in sorted(_KINDS, key=lambda kind: kind != habit)]
         # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
         raise _ambiguous(asked, whole=True)
     more = f"{told} interpolation: under it the levels correct one another within their cells"
     return _with_interpolation(reading, told), [*why, more]
+
+
+def _compared(reading: Reading, kind: Interpolation | None) -> Reading:
+    """``reading`` as it is compared with others: under the likelier interpolation where that is open."""
+    if kind is None:
+        return reading
+    grid = {**reading.description["hash"], "interpolation": kind}
+    return replace(reading, description={**reading.description, "hash": grid})
 
 
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:

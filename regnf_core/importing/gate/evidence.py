@@ -69,7 +69,7 @@ class Trial:
         return len(self.levels.gains) == len(other.levels.gains)
 
     def has_resolutions_of(self, other: Trial) -> bool:
-        """Whether both differ at most in how rows are counted, or have no grid: misread, one is as noisy as the other."""
+        """Whether both differ at most in how rows are counted, or have no grid: misread, they are equally noisy."""
         if self.levels is None or other.levels is None:
             return self.levels is other.levels
         return torch.equal(self.levels.scales, other.levels.scales)
@@ -93,9 +93,10 @@ class Trial:
     def beats(self, other: Trial) -> bool:
         """Whether the levels speak clearly for this reading and not for ``other``.
 
-        The misfit alone speaks only where both have the same resolutions. Readings of other numbers of levels have no
-        levels in common: then more must speak for this one, and the misfit may not speak for ``other``. A reading
-        without a grid is the simplest one: it stands where a grid's levels say nothing and only worsen the misfit.
+        The misfit alone speaks only where both have the same resolutions: a misread grid of low resolution has less of
+        it than the right one. Readings of other numbers of levels have no levels in common: then more must speak for
+        this one. A reading without a grid is the simplest one: it stands where a grid's levels say nothing and only
+        worsen the misfit.
         """
         if other.misfit is None:
             return self.misfit is not None
@@ -105,7 +106,7 @@ class Trial:
             return True
         if self.has_levels_of(other):
             return self.support_over(other) + self.usual_over(other) > LEAST_SUPPORT
-        return self.support_over(other) > CLEAR_SUPPORT and not other.is_better(self, _CLEARLY, _LEAST)
+        return self.support_over(other) > CLEAR_SUPPORT
 
     def is_better(self, other: Trial, share: float, least: float = 0.0) -> bool:
         """Whether this one fits better than ``other`` by more than chance, ``share`` of its misfit and ``least``."""

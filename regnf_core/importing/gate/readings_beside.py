@@ -1,4 +1,4 @@
-"""Readings whose levels are a little coarser or finer than another's, to see whether the evidence peaks there."""
+"""Readings whose levels are a little coarser or finer than another's, to see where the evidence peaks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import Reading
 from regnf_core.importing.families.grid_field import finest_of
+from regnf_core.importing.families.grid_search import grid_name
 from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig
 
 _FINEST = (-0.24, -0.12, -0.06, math.log(2000 / 2048), 0.06, 0.12, 0.24)
@@ -16,6 +17,8 @@ _FINEST = (-0.24, -0.12, -0.06, math.log(2000 / 2048), 0.06, 0.12, 0.24)
 number below it."""
 _COARSEST = (-0.24, -0.12, 0.12, 0.24)
 """The same of the coarsest resolutions, the finest one being kept."""
+_REACH = 0.12
+"""How far the finest resolutions lie at most that are tried because somebody would write them."""
 
 
 def readings_beside(reading: Reading) -> Iterator[Reading]:
@@ -35,7 +38,26 @@ def readings_beside(reading: Reading) -> Iterator[Reading]:
         made = _of_size(other, grid.entries) if 1.0 <= other.per_level_scale <= MAX_GROWTH else None
         if made is not None:
             said = {"base_resolution": made.base_resolution, "top_resolution": round(math.exp(finest_of(made)))}
-            yield _said(reading, made, said)
+            yield replace(_said(reading, made, said), tier=reading.tier + 1, is_written=False)
+
+
+def readings_written_near(reading: Reading) -> Iterator[Reading]:
+    """The same reading with the finest resolutions of two digits, or of five binary digits, near to its own."""
+    grid = HashGridConfig(**reading.description["hash"])
+    if grid.levels == 1 or grid.resolutions is not None or grid.strides is not None:
+        return
+    top = grid.base_resolution * grid.per_level_scale ** (grid.levels - 1)
+    lowest, highest = math.ceil(top * math.exp(-_REACH)), math.floor(top * math.exp(_REACH))
+    units = 10 ** max(0, len(str(highest)) - 2), 1 << max(0, highest.bit_length() - 5)
+    for number in range(lowest, highest + 1):
+        power = number & (number - 1) == 0
+        if all(number % unit for unit in units):
+            continue
+        growth = (number / grid.base_resolution) ** (1.0 / (grid.levels - 1))
+        made = _of_size(replace(grid, per_level_scale=growth), grid.entries) if growth >= 1.0 else None
+        if made is not None:
+            said = {"base_resolution": grid.base_resolution, "top_resolution": number}
+            yield replace(_said(reading, made, said), tier=reading.tier + (not power), is_written=True)
 
 
 def _of_size(grid: HashGridConfig, entries: int) -> HashGridConfig | None:
@@ -48,7 +70,6 @@ def _of_size(grid: HashGridConfig, entries: int) -> HashGridConfig | None:
 def _said(reading: Reading, grid: HashGridConfig, said: dict[str, int]) -> Reading:
     """``reading`` with this grid, and with what to say of it in a description."""
     parts = {name: value for name, value in reading.say.get("hash", {}).items() if name != "per_level_scale"}
-    name = f"{reading.name}, {said['base_resolution']} to {said['top_resolution']} nodes"
     say = {**reading.say, "hash": {**parts, **said}}
     described = {**reading.description, "hash": asdict(grid)}
-    return replace(reading, name=name, say=say, description=described, scale=finest_of(grid), tier=reading.tier + 1)
+    return replace(reading, name=grid_name(grid), say=say, description=described, scale=finest_of(grid))
