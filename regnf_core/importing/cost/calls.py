@@ -8,14 +8,18 @@ SAMPLES = 16_384
 """Points that a field is checked at."""
 TRIAL_POINTS = 1_024
 """Points that each of several readings is tried at, with its gradient."""
-FINAL_POINTS, FINALISTS = 8_192, 24
-"""Points of the second round, and how many readings may come into it."""
-LAST_POINTS, LAST_FINALISTS = 32_768, 6
+MAX_TRIED, TRIED_NEAR = 64, 32
+"""Readings that are all tried; of more, the most usual ones and so many next to the best of those."""
+CLIMB_POINTS, MAX_CLIMBS = 2_048, 3
+"""Points at which better readings are looked for beside the best one, and how often from there on."""
+WRITTEN_NEAR, READINGS_BESIDE = 13, 11
+"""Readings that are tried beside the best one: of numbers that somebody would write, and of others."""
+FINAL_POINTS, FINALISTS = 8_192, 8
+"""Points of the second round, and how many rivals may come into it."""
+LAST_POINTS, LAST_FINALISTS = 32_768, 3
 """The same of the third round, for what the second one leaves open. The interpolation is told at as many points."""
-MAX_TRIED = 64
-"""Readings that are all tried; of more, the most usual ones and as many next to the best of those."""
-READINGS_BESIDE, MAX_CLIMBS = 40, 3
-"""Readings that are tried beside the best one, and how often from there on to a better one."""
+SHARES = (1, 2, 4, 8)
+"""Of a field whose trials would take too long, every round has a half, a quarter or an eighth of the points."""
 NEAREST_SHARE = 16
 ASKED_AGAIN = 64
 STEPS = 8
@@ -43,9 +47,13 @@ def calls_of_check(samples: int) -> Calls:
     return Calls((samples, ASKED_AGAIN, FACES * (samples // FACE_SHARE)), (nearest,) * (STEPS + 1))
 
 
-def calls_of_trials(readings: int) -> Calls:
-    """What the choice among so many readings evaluates at most: three rounds, those beside, two interpolations."""
-    first = (TRIAL_POINTS,) * (min(readings, 2 * MAX_TRIED) + 1)
-    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + MAX_CLIMBS * READINGS_BESIDE + 3)
+def calls_of_trials(readings: int, share: int = 1) -> Calls:
+    """What the choice among so many readings evaluates at most, at one ``share``-th of the points."""
+    first = (TRIAL_POINTS,) * (min(readings, MAX_TRIED + TRIED_NEAR) + 1)
+    climbs = (CLIMB_POINTS,) * (MAX_CLIMBS * (WRITTEN_NEAR + READINGS_BESIDE) + 1)
+    final = (FINAL_POINTS,) * (min(readings, FINALISTS) + LAST_FINALISTS + READINGS_BESIDE + 3)
     last = (LAST_POINTS,) * (LAST_FINALISTS + 3)
-    return Calls((4 * TRIAL_POINTS, 4 * FINAL_POINTS, 8 * LAST_POINTS), first + final + last)
+    values = tuple(
+        4 * points // share for points in (TRIAL_POINTS, CLIMB_POINTS, FINAL_POINTS, LAST_POINTS, LAST_POINTS)
+    )
+    return Calls(values, tuple(points // share for points in first + climbs + final + last))

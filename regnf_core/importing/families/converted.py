@@ -33,6 +33,10 @@ class Reading:
     is_written: bool = True
     """Whether somebody would put its numbers into a configuration; others are only compared with."""
 
+    def has_sines_of(self, other: Reading) -> bool:
+        """Whether both divide the first layer's columns alike."""
+        return self.description.get("positional_encoding") == other.description.get("positional_encoding")
+
     def is_grid_of(self, other: Reading) -> bool:
         """Whether both have the same grid, but for the growth's last digits."""
         mine, others = (dict(reading.description.get("hash") or {}) for reading in (self, other))

@@ -13,10 +13,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.importing.cost.calls import (
+    CLIMB_POINTS,
     FINAL_POINTS,
     FINALISTS,
     LAST_FINALISTS,
@@ -24,6 +26,8 @@ from regnf_core.importing.cost.calls import (
     MAX_CLIMBS,
     MAX_TRIED,
     TRIAL_POINTS,
+    TRIED_NEAR,
+    WRITTEN_NEAR,
 )
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
@@ -37,15 +41,17 @@ _SHOWN = MOST_CANDIDATES
 _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 
 
-def choose_reading(converted: ConvertedField) -> ConvertedField:
+def choose_reading(converted: ConvertedField, share: int = 1) -> ConvertedField:
     """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
+
+    share: the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """
     if not converted.readings:
         return converted
     with without_new_code():
-        chosen, why = _choose(converted.readings)
+        chosen, why = _choose(converted.readings, share)
     return replace(
         converted,
         why=(*converted.why, *why),
@@ -55,21 +61,21 @@ def choose_reading(converted: ConvertedField) -> ConvertedField:
     )
 
 
-def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
-    evidence = Evidence(readings[0], TRIAL_POINTS)
+def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]]:
+    evidence = Evidence(readings[0], TRIAL_POINTS // share)
     trials = _tried(readings, evidence)
     best = _best(trials)
     if len(trials) == len(readings) and all(trial.is_same(best) for trial in trials):
         chosen = min(trials, key=lambda trial: (trial.reading.tier, trial.levels is not None))
     elif best.is_telling:
-        chosen = _proven(trials, best)
+        chosen = _proven(trials, best, share)
     elif len(trials) == len(readings) and best.is_distance and not _standing(trials, best):
         chosen = best
     else:
         raise _ambiguous([trial.reading for trial in sorted(trials, key=lambda trial: trial.reading.tier)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
     if chosen.reading.interpolation == "open" and chosen.distance is not None:
-        return _interpolated(chosen.reading, Evidence(best.reading, LAST_POINTS), why)
+        return _interpolated(chosen.reading, Evidence(best.reading, LAST_POINTS // share), why)
     return chosen.reading, why
 
 
@@ -81,7 +87,7 @@ def _tried(readings: Sequence[Reading], evidence: Evidence) -> list[Trial]:
         return trials
     rest = [reading for reading in readings[MAX_TRIED:] if _group(reading) == _group(best.reading)]
     near = sorted(rest, key=lambda reading: abs((reading.scale or 0.0) - (best.reading.scale or 0.0)))
-    return trials + [evidence.of(reading) for reading in near[:MAX_TRIED]]
+    return trials + [evidence.of(reading) for reading in near[:TRIED_NEAR]]
 
 
 def _best(trials: Sequence[Trial]) -> Trial:
@@ -96,14 +102,19 @@ def _group(reading: Reading) -> object:
     return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
 
 
-def _proven(trials: Sequence[Trial], best: Trial) -> Trial:
+def _proven(trials: Sequence[Trial], best: Trial, share: int) -> Trial:
     """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
-    finest = Evidence(best.reading, FINAL_POINTS)
-    again = [finest.of(trial.reading) for trial in (best, *_nearest(_standing(trials, best), best, FINALISTS))]
-    chosen, tried = _climbed(again, finest)
-    standing = _nearest(_standing(tried, chosen), chosen, LAST_FINALISTS)
+    tier = min(trial.reading.tier for trial in trials if trial.reading.has_sines_of(best.reading))
+    found = _climbed(best.reading, tier, Evidence(best.reading, CLIMB_POINTS // share))
+    finest = Evidence(best.reading, FINAL_POINTS // share)
+    rivals = [trial.reading for trial in _nearest(_standing(trials, best), best, FINALISTS)]
+    rivals = [rival for rival in rivals if not any(rival.is_grid_of(reading) for reading in found)]
+    again = [finest.of(reading) for reading in (*found, *rivals)]
+    chosen = _most_supported(again, again[0])
+    beside = [finest.of(reading) for reading in readings_beside(chosen.reading, tier)]
+    standing = _nearest(_standing((*again, *beside), chosen), chosen, LAST_FINALISTS)
     if standing:
-        last, kind = Evidence(best.reading, LAST_POINTS), _likelier_interpolation(chosen, finest)
+        last, kind = Evidence(best.reading, LAST_POINTS // share), _likelier_interpolation(chosen, finest)
         chosen, *rest = [last.of(_compared(trial.reading, kind)) for trial in (chosen, *standing)]
         standing = _standing(rest, chosen)
     if not standing and chosen.support < CLEAR_SUPPORT:
@@ -113,19 +124,20 @@ def _proven(trials: Sequence[Trial], best: Trial) -> Trial:
     return chosen
 
 
-def _climbed(trials: Sequence[Trial], evidence: Evidence) -> tuple[Trial, list[Trial]]:
-    """From the best of ``trials`` on to better ones beside it, listed or not, until there are none; and all tried.
+def _climbed(reading: Reading, tier: int, evidence: Evidence) -> list[Reading]:
+    """The better supported reading to which ``reading`` leads over those beside it, and the nearest to that.
 
     Raises AmbiguousError: there are still better ones.
     """
-    tried = list(trials)
-    best = _most_supported(tried, tried[0])
+    best = evidence.of(reading)
+    tried = [best]
     for _ in range(MAX_CLIMBS):
-        near = (*readings_written_near(best.reading), *readings_beside(best.reading))
-        tried += [evidence.of(reading) for reading in near if not any(t.reading.is_grid_of(reading) for t in tried)]
+        near = (*islice(readings_written_near(best.reading, tier), WRITTEN_NEAR), *readings_beside(best.reading, tier))
+        tried += [evidence.of(other) for other in near if not any(t.reading.is_grid_of(other) for t in tried)]
         better = _most_supported(tried, best)
         if better is best:
-            return best, tried
+            written = [trial for trial in tried if trial.reading.is_written and trial is not best]
+            return [best.reading, *(trial.reading for trial in _nearest(written, best, LAST_FINALISTS))]
         best = better
     raise _ambiguous([trial.reading for trial in _nearest(tried, best, LAST_FINALISTS)])
 

@@ -21,8 +21,11 @@ _REACH = 0.12
 """How far the finest resolutions lie at most that are tried because somebody would write them."""
 
 
-def readings_beside(reading: Reading) -> Iterator[Reading]:
-    """The same reading with other growths or other coarsest resolutions, as far as the table has the size for them."""
+def readings_beside(reading: Reading, tier: int) -> Iterator[Reading]:
+    """The same reading with other growths or other coarsest resolutions, as far as the table has the size for them.
+
+    tier: of the most usual numbers there are.
+    """
     grid = HashGridConfig(**reading.description["hash"])
     if grid.levels == 1 or grid.resolutions is not None or grid.strides is not None:
         return
@@ -38,26 +41,28 @@ def readings_beside(reading: Reading) -> Iterator[Reading]:
         made = _of_size(other, grid.entries) if 1.0 <= other.per_level_scale <= MAX_GROWTH else None
         if made is not None:
             said = {"base_resolution": made.base_resolution, "top_resolution": round(math.exp(finest_of(made)))}
-            yield replace(_said(reading, made, said), tier=reading.tier + 1, is_written=False)
+            yield replace(_said(reading, made, said), tier=tier + 2, is_written=False)
 
 
-def readings_written_near(reading: Reading) -> Iterator[Reading]:
-    """The same reading with the finest resolutions of two digits, or of five binary digits, near to its own."""
+def readings_written_near(reading: Reading, tier: int) -> Iterator[Reading]:
+    """The same reading with the finest resolutions of two digits, or of five binary ones, nearest to its own first.
+
+    tier: of the most usual numbers there are.
+    """
     grid = HashGridConfig(**reading.description["hash"])
     if grid.levels == 1 or grid.resolutions is not None or grid.strides is not None:
         return
     top = grid.base_resolution * grid.per_level_scale ** (grid.levels - 1)
     lowest, highest = math.ceil(top * math.exp(-_REACH)), math.floor(top * math.exp(_REACH))
     units = 10 ** max(0, len(str(highest)) - 2), 1 << max(0, highest.bit_length() - 5)
-    for number in range(lowest, highest + 1):
+    written = [number for number in range(lowest, highest + 1) if any(number % unit == 0 for unit in units)]
+    for number in sorted(written, key=lambda number: abs(math.log(number / top))):
         power = number & (number - 1) == 0
-        if all(number % unit for unit in units):
-            continue
         growth = (number / grid.base_resolution) ** (1.0 / (grid.levels - 1))
         made = _of_size(replace(grid, per_level_scale=growth), grid.entries) if growth >= 1.0 else None
         if made is not None:
             said = {"base_resolution": grid.base_resolution, "top_resolution": number}
-            yield replace(_said(reading, made, said), tier=reading.tier + (not power), is_written=True)
+            yield replace(_said(reading, made, said), tier=tier + (not power), is_written=True)
 
 
 def _of_size(grid: HashGridConfig, entries: int) -> HashGridConfig | None:
