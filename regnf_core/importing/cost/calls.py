@@ -19,7 +19,8 @@ FINAL_POINTS, FINALISTS = 8_192, 8
 LAST_POINTS, LAST_FINALISTS = 32_768, 3
 """The same of the third round, for what the second one leaves open. The interpolation is told at as many points."""
 SHARES = (1, 2, 4, 8)
-"""Of a field whose trials would take too long, every round has a half, a quarter or an eighth of the points."""
+"""Of a field whose trials would take too long, all rounds but the first have a half, a quarter or an eighth of the
+points."""
 NEAREST_SHARE = 16
 ASKED_AGAIN = 64
 STEPS = 8
@@ -48,12 +49,12 @@ def calls_of_check(samples: int) -> Calls:
 
 
 def calls_of_trials(readings: int, share: int = 1) -> Calls:
-    """What the choice among so many readings evaluates at most, at one ``share``-th of the points."""
+    """What the choice among so many readings evaluates at most; after the first round at one ``share``-th of the
+    points."""
     first = (TRIAL_POINTS,) * (min(readings, MAX_TRIED + TRIED_NEAR) + 1)
     climbs = (CLIMB_POINTS,) * (MAX_CLIMBS * (WRITTEN_NEAR + READINGS_BESIDE) + 1)
     final = (FINAL_POINTS,) * (min(readings, FINALISTS) + LAST_FINALISTS + READINGS_BESIDE + 3)
     last = (LAST_POINTS,) * (LAST_FINALISTS + 3)
-    values = tuple(
-        4 * points // share for points in (TRIAL_POINTS, CLIMB_POINTS, FINAL_POINTS, LAST_POINTS, LAST_POINTS)
-    )
-    return Calls(values, tuple(points // share for points in first + climbs + final + last))
+    values = tuple(4 * points // share for points in (CLIMB_POINTS, FINAL_POINTS, LAST_POINTS, LAST_POINTS))
+    gradients = tuple(points // share for points in climbs + final + last)
+    return Calls((4 * TRIAL_POINTS, *values), first + gradients)

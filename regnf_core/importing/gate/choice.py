@@ -44,7 +44,7 @@ _KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 def choose_reading(converted: ConvertedField, share: int = 1) -> ConvertedField:
     """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
 
-    share: the readings are tried at one ``share``-th of the points.
+    share: after the first round the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """
@@ -62,7 +62,7 @@ def choose_reading(converted: ConvertedField, share: int = 1) -> ConvertedField:
 
 
 def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]]:
-    evidence = Evidence(readings[0], TRIAL_POINTS // share)
+    evidence = Evidence(readings[0], TRIAL_POINTS)
     trials = _tried(readings, evidence)
     best = _best(trials)
     if len(trials) == len(readings) and all(trial.is_same(best) for trial in trials):
