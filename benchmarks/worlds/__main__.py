@@ -29,7 +29,7 @@ from benchmarks.worlds import tables, training  # noqa: E402
 from benchmarks.worlds.evidence import evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.recipe import SCENES  # noqa: E402
-from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
+from benchmarks.worlds.running import Way, register_world  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
 from regnf_data.worlds.walks import LENGTHS  # noqa: E402
 
@@ -66,7 +66,7 @@ def _register(arguments: argparse.Namespace) -> None:
     way = Way(arguments.registration_seed, not arguments.without_observation, not arguments.quick)
     done = 0
     with arguments.output.open("a") as file:
-        for runs in _in_parallel(partial(_runs_of, way), homes, arguments.workers):
+        for runs in _in_parallel(partial(register_world, way=way), homes, arguments.workers):
             for run in runs:
                 file.write(json.dumps(run) + "\n")
             file.flush()
@@ -86,20 +86,14 @@ def _homes(arguments: argparse.Namespace) -> list[Path]:
 
 def _evidence(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
-    known = {path.parent for path in arguments.folder.glob(f"*/{WORLD}")}
-    work = partial(_evidence_of, sorted(known), not arguments.without_observation, arguments.cases)
+    known = sorted(path.parent for path in arguments.folder.glob(f"*/{WORLD}"))
+    way = {"observed": not arguments.without_observation, "limit": arguments.cases}
+    work = partial(evidence_of_world, known=known, **way)
     with arguments.output.open("a") as file:
         for rows in _in_parallel(work, homes, arguments.workers):
             file.writelines(json.dumps(row) + "\n" for row in rows)
             file.flush()
             _say(f"{rows[0]['world'] if rows else 'a world'}: {len(rows)} poses")
-
-
-def _evidence_of(known: list[Path], observed: bool, cases: int, home: Path) -> list[Run]:
-    """The evidence of a world. Wrong objects come from the other worlds of its part."""
-    seed = int(home.name.split("-")[1])
-    others = [one for one in known if part_of_world(int(one.name.split("-")[1])) == part_of_world(seed)]
-    return evidence_of_world(home, [one for one in others if one.name.split("-")[1] != str(seed)], observed, cases)
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -109,10 +103,6 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.table is not None:
         arguments.table.write_text(table)
     _say(table)
-
-
-def _runs_of(way: Way, home: Path) -> list[Run]:
-    return register_world(home, way)
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -125,6 +115,8 @@ def _report(arguments: argparse.Namespace) -> None:
 
 
 def _in_parallel(work, tasks, workers) -> Iterator:  # type: ignore[no-untyped-def, type-arg]
+    """What ``work`` makes of each task, as it comes. With several workers, it must not be a function of this module:
+    a new process does not load the module that a command starts from."""
     if workers <= 1:
         yield from map(work, tasks)
         return

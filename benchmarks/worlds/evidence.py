@@ -23,6 +23,7 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.verdict.evaluation import rival_numbers
 from regnf_core.robust.verdict.evidence import gather_evidence
 from regnf_core.robust.verdict.pose_features import pose_features
+from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
 _OPTIONS = RegistrationOptions(preset="robust")
@@ -31,17 +32,25 @@ _SAME_SHAPE = 0.03
 """Diameters. An object whose surface lies that close to the right one's, nearly everywhere, is no wrong object."""
 
 
-def evidence_of_world(home: Path, others: Sequence[Path], observed: bool, limit: int) -> list[Row]:
-    """The rows of the first ``limit`` cases of a world's folder. others: worlds to draw wrong objects from."""
+def evidence_of_world(home: Path, known: Sequence[Path], observed: bool, limit: int) -> list[Row]:
+    """The rows of the first ``limit`` cases of a world's folder. known: all folders; wrong objects come from the other
+    worlds of its part."""
     draw = random.Random(home.name)
+    others = [
+        one for one in known if _seed(one) != _seed(home) and part_of_world(_seed(one)) == part_of_world(_seed(home))
+    ]
     rows: list[Row] = []
-    for known in list(cases_of(home, observed))[:limit]:
-        facts = {**known.facts, "observed": observed}
-        rows += [{**facts, "model": known.facts["object"], **row} for row in _rows(known, known)]
-        other = _another(known, others, draw)
+    for case in list(cases_of(home, observed))[:limit]:
+        facts = {**case.facts, "observed": observed}
+        rows += [{**facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
+        other = _another(case, others, draw)
         if other is not None:
-            rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(known, other)]
+            rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
     return rows
+
+
+def _seed(home: Path) -> int:
+    return int(home.name.split("-")[1])
 
 
 def _another(known: WorldCase, others: Sequence[Path], draw: random.Random) -> WorldCase | None:
