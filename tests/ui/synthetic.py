@@ -210,6 +210,7 @@ def _result(T_scene_object: Array, initial: Array, artifacts: dict[str, bytes]) 
             "residual_rms": 0.00412,
             "inlier_share_scene": 0.962,
             "inlier_share_object": 0.931,
+            "probability": 0.973,
             "iterations": float(ITERATIONS),
             "field_evaluations": 1_843_200.0,
             **{f"seconds_{phase}": value for phase, value in PHASE_SECONDS.items()},
