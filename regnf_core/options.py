@@ -140,7 +140,7 @@ class RobustOptions:
     max_occluded_share: _Ratio = 0.75
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only."""
-    min_probability: Annotated[float, Gt(0), Le(1)] = 0.85
+    min_probability: Annotated[float, Gt(0), Le(1)] = 0.9
     """A pose whose surfaces agree less than the options above ask for is accepted all the same if its probability of
     being right (0..1), estimated from all evidence together, is at least this. Increase it for fewer wrong poses; at 1
     no pose is accepted in this way."""
