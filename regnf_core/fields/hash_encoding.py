@@ -108,16 +108,6 @@ class HashEncoding:
             values = torch.lerp(values[0], values[1], weight)
         return self._by_point(values), torch.stack([self._by_point(d) for d in derivatives])
 
-    @property
-    def scales(self) -> Tensor:
-        """Cells along an edge of the cube, of each active level (A,)."""
-        return self._scales.flatten()
-
-    def by_level(self, values: Tensor) -> Tensor:
-        """Sums (A, N, 3) over the features of each level, of values (3, N, width)."""
-        levels = values.view(3, values.shape[1], self.active_levels, self.config.features_per_level)
-        return levels.sum(dim=-1).permute(2, 1, 0)
-
     def _locate(self, unit_points: Tensor) -> _Cells:
         position = torch.addcmul(unit_points.new_tensor(0.5), unit_points.T.unsqueeze(1), self._scales)  # (3, A, N)
         cell = position.floor()

@@ -83,29 +83,6 @@ class NeusFactoFunction:
             gradient = pull_back_linf(points, gradient)
         return distance, gradient
 
-    def gradient_by_level(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Value (N,) at points (N, 3), its gradient (N, 3) but for the grid's part, and each level's part (A, N, 3)."""
-        if self.hash_encoding is None:
-            raise ValueError("a function without a hash grid")
-        z, grid_points = self._coordinates(points)
-        parts = [z]
-        if self.positional_encoding is not None:
-            parts.append(self.positional_encoding.encode(z))
-        encoded, jacobian = self.hash_encoding.encode_with_derivative(self._to_unit(grid_points))
-        distance, by_feature = self.mlp.with_gradient(torch.cat((*parts, encoded), dim=-1))
-        by_part = torch.split(by_feature, [*(part.shape[1] for part in parts), encoded.shape[1]], dim=-1)
-        rest = by_part[0]
-        if self.positional_encoding is not None:
-            rest = rest + self.positional_encoding.pull_back(parts[1], by_part[1])
-        levels = self.hash_encoding.by_level(jacobian * by_part[-1]) / (2.0 * self.grid_radius)
-        if self.contraction != "none":
-            levels = torch.stack([pull_back_linf(points, level) for level in levels])
-        return distance, pull_back_linf(points, rest) if self.contraction == "linf" else rest, levels
-
-    def places(self, points: Tensor) -> Tensor:
-        """Where the points (N, 3) lie in the grid's cube, from 0 to 1 (N, 3)."""
-        return self._to_unit(self._coordinates(points)[1])
-
     def _coordinates(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The points as the network sees them, and as the hash grid sees them."""
         if self.contraction == "none":

@@ -15,8 +15,8 @@ from regnf_core.importing.families.grid_space import GridSpace
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 _MAX_STRIDES = 3
-MAX_LAYOUTS = 512
-"""Most layouts that are listed."""
+MAX_LAYOUTS = 64
+"""Most layouts that are weighed against each other."""
 
 
 def space_readings(

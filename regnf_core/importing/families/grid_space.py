@@ -18,10 +18,6 @@ _MAX_TOP = 1 << 14
 _MOST_ROUND = 40
 """Finest resolutions of an interval that are listed beside the powers of two, at most."""
 
-_COPIED = tuple(2.0 ** (k / 15) for k in range(4, 11))
-"""Growths from one power of two to another over the usual 16 levels, which are written with other numbers of levels,
-too."""
-
 
 @dataclass(frozen=True)
 class WrittenGrid:
@@ -89,8 +85,7 @@ class GridSpace:
         elif interval.resolutions is not None:
             yield 0, interval.lowest, {"per_level_scale": interval.lowest}
         else:
-            for tier, growth, said in _tops(interval, base):
-                yield tier + (self.writes_growth and tier > 0), growth, said
+            yield from _tops(interval, base)
             if self.writes_growth and (base in _USUAL_BASES or not interval.base_is_free):
                 yield from _short_growths(interval)
 
@@ -122,23 +117,12 @@ def _tops(interval: GridInterval, base: int) -> Iterator[tuple[int, float, dict[
             several = range(-(-lowest // unit) * unit, highest + 1, unit)
             if len(listed) + len(several) <= _MOST_ROUND:
                 listed = {**dict.fromkeys(several, 1 if unit > 1 else 2), **listed}
-        if not any(listed.values()):
-            listed = {**dict.fromkeys(_two_digits(lowest, highest), 1), **listed}
     for top, tier in listed.items():
         yield tier, _growth_to(top, base, interval.levels), {"top_resolution": top}
 
 
-def _two_digits(lowest: int, highest: int) -> list[int]:
-    """Numbers of two digits and zeros, in a range that is too wide for closer ones."""
-    units = (10**k for k in range(len(str(highest)) - 1))
-    return [number for unit in units for number in range(10 * unit, 100 * unit, unit) if lowest <= number <= highest]
-
-
 def _short_growths(interval: GridInterval) -> Iterator[tuple[int, float, dict[str, Any]]]:
     lowest, highest = interval.lowest * (1.0 - _EDGE), min(interval.highest * (1.0 + _EDGE), 2.5)
-    for growth in _COPIED:
-        if lowest <= growth <= highest:
-            yield 0, growth, {"per_level_scale": growth}
     for decimals, tier in ((2, 0), (3, 1), (4, 2)):
         first, last = math.ceil(lowest * 10**decimals), math.floor(highest * 10**decimals)
         if decimals > 2 and interval.base_is_free:

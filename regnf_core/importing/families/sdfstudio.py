@@ -33,7 +33,7 @@ _DEGREES = (6, 4, 8, 10, 5, 7, 9, 3, 2, 1, 0)
 _FACTO = GridHabits((2, 4, 8, 1), "smoothstep")
 _ANGELO = GridHabits((8, 4, 2, 1), "linear")
 _UNTRAINED = 1.01e-4
-"""tiny-cuda-nn begins with features between -1e-4 and 1e-4; one step of training moves them farther."""
+"""tiny-cuda-nn begins with features between -1e-4 and 1e-4."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +166,10 @@ def _readings(
     readings: list[Reading] = []
     is_trained = bool(np.abs(table).max() > _UNTRAINED)
     if overrides.use_grid is not False and _uses_columns(layers, plain, None):
-        layouts = space_readings(
+        readings += space_readings(
             table, spaces, layers.tensors(), entries, "open" if overrides.hash.interpolation is None else "known"
         )
-        readings += layouts if is_trained else layouts[:1]  # of noise one layout is as good as another
-    may_be_unused = overrides.use_grid is not True and not is_trained
+    may_be_unused = overrides.use_grid is not True and (not is_trained or len(layers.weights) > SKIP_LAYER)
     if not readings or may_be_unused:  # columns of zeros never see the grid, whatever is said
         unused = asdict(spaces[0].written()[0].grid)
         description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}

@@ -69,7 +69,7 @@ def convert_file(
     beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
-    from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable
+    from regnf_core.importing.gate.cost_estimate import require_affordable
     from regnf_core.importing.gate.observed import observed
     from regnf_core.importing.gate.placement import placed
     from regnf_core.schema.safe_format import add_to_source, write_safe_field
@@ -78,7 +78,7 @@ def convert_file(
     converted = read.field
     _require_text(converted.description)
     require_affordable(converted, limits)
-    converted = placed(_settled(converted, affordable_share(converted, limits)), read.description)
+    converted = placed(_settled(converted), read.description)
     converted = observed(converted, read, limits, required=beside is not None and beside.cameras is not None)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors, _ROOM)
@@ -184,8 +184,8 @@ def _require_text(description: dict[str, Any]) -> None:
         raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
-def _settled(converted: ConvertedField, share: int) -> ConvertedField:
-    """The one function that the field stands for, where its shapes leave several. share: see calls_of_trials."""
+def _settled(converted: ConvertedField) -> ConvertedField:
+    """The one function that the field stands for, where its shapes leave several."""
     if converted.open_readings:
         from regnf_core.importing.gate.network_form import settle_form  # loads torch
 
@@ -193,7 +193,7 @@ def _settled(converted: ConvertedField, share: int) -> ConvertedField:
     if converted.readings:
         from regnf_core.importing.gate.choice import choose_reading  # loads torch
 
-        converted = choose_reading(converted, share)
+        converted = choose_reading(converted)
     require_told(converted)
     return converted
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.budget import require_room, require_within
-from regnf_core.importing.cost.calls import SAMPLES, SHARES, Calls, calls_of_check, calls_of_trials
+from regnf_core.importing.cost.calls import SAMPLES, Calls, calls_of_check, calls_of_trials
 from regnf_core.importing.cost.mesh_work import mesh_work
 from regnf_core.importing.cost.network_work import network_work
 from regnf_core.importing.cost.onnx_memory import onnx_bytes
@@ -27,8 +27,11 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
     Raises FieldFormatError: IMPORT_TOO_COSTLY beyond the limits on work and memory, and what the description is
     refused for.
     """
-    if converted.readings:
-        seconds = _seconds_with_trials(converted.readings, affordable_share(converted, limits))
+    readings = converted.readings
+    if readings:
+        trials = calls_of_trials(len(readings))
+        seconds = max(_seconds_of_reading(reading, trials) for reading in readings)
+        seconds += max(_seconds_of_reading(reading, calls_of_check(SAMPLES)) for reading in readings)
     else:
         seconds = seconds_of(converted.description, converted.tensors, calls_of_check(SAMPLES))
     require_within(seconds, limits.work_s)
@@ -36,18 +39,6 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
     if isinstance(description, OnnxDescription):
         require_room(onnx_bytes(description, converted.tensors), limits.memory_bytes)
     return seconds
-
-
-def affordable_share(converted: ConvertedField, limits: ImportLimits) -> int:
-    """One of how many parts of the points the readings can be tried at within the limit on work."""
-    within = (share for share in SHARES if _seconds_with_trials(converted.readings, share) <= limits.work_s)
-    return next(within, SHARES[-1])
-
-
-def _seconds_with_trials(readings: Sequence[Reading], share: int) -> float:
-    trials = calls_of_trials(len(readings), share)
-    seconds = max((_seconds_of_reading(reading, trials) for reading in readings), default=0.0)
-    return seconds + max((_seconds_of_reading(reading, calls_of_check(SAMPLES)) for reading in readings), default=0.0)
 
 
 def _seconds_of_reading(reading: Reading, calls: Calls) -> float:
