@@ -83,7 +83,7 @@ def test_swapped_scene_and_object(run: Run, folder: Path) -> None:
 
 def test_the_same_file_twice(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("regnf_cli.register._register_here", lambda *_: {"verdict": "rejected"})
-    monkeypatch.setattr("regnf_cli.register.show_result", lambda _: None)
+    monkeypatch.setattr("regnf_cli.report.show_result", lambda _: None)
     outcome = run("register", "room.safetensors", "room.safetensors", "--detection", "box.json")
     assert outcome.code == 1
     assert "warning: scene and object are the same file, room.safetensors" in outcome.stderr

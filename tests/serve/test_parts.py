@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -124,9 +125,11 @@ def test_the_guarded_command_ends_with_whoever_asked_for_it(kernel_kills: bool) 
             waiting, found = [parent.pid], 0
             while waiting:
                 pid = waiting.pop()
-                if b"sleep" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]:
-                    found = pid
-                waiting += children_of(pid)
+                # a process may end between being listed and being looked at
+                with suppress(FileNotFoundError, ProcessLookupError):
+                    if b"sleep" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]:
+                        found = pid
+                    waiting += children_of(pid)
             return found
 
         command = eventually(sleeper, "the guarded command")
