@@ -1,4 +1,4 @@
-"""A digest of the engine's code: it changes when something is written that may change a result.
+"""A digest of the engine's code and data: it changes when something is written that may change a result.
 
 The modules are found by following imports from where registrations start. Comments, docstrings, type-checking imports
 and the places of modules do not count: an import counts by what the imported module contains, not by its path. So a
@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -54,7 +55,14 @@ def source_digest(root: Path, entries: Sequence[str] = ENTRIES) -> str:
     modules = engine_modules(root, entries)
     digests = {name: module.digest for name, module in modules.items()}
     parts = [[module.digest, sorted(_import_lines(module, digests))] for module in modules.values()]
-    return _digest(sorted(parts))
+    data = _data_beside(root, modules)
+    return _digest([sorted(parts), data] if data else sorted(parts))
+
+
+def _data_beside(root: Path, names: Iterable[str]) -> list[str]:
+    """Digests of the JSON files in the modules' folders: the engine may read them."""
+    folders = {root.joinpath(*name.split(".")[:-1]) for name in names}
+    return sorted(_digest(json.loads(path.read_text("utf-8"))) for folder in folders for path in folder.glob("*.json"))
 
 
 def engine_modules(root: Path, entries: Sequence[str] = ENTRIES) -> dict[str, Module]:

@@ -131,3 +131,15 @@ def test_all_that_a_registration_loads_is_in_the_digest() -> None:
     assert missed - packages <= {"regnf_core.version"}
     assert len([name for name in engine if "fields" in name]) > 15, "every kind of field"
     assert len(engine) > 50
+
+
+def test_data_beside_the_engines_modules_count(tmp_path: Path, before: str) -> None:
+    root = tree(tmp_path / "after")
+    data = root / "core" / "parts" / "numbers.json"
+    data.write_text('{"weight": 1.5}', encoding="utf-8")
+    first = source_digest(root, ENTRY)
+    assert first != before
+    data.write_text('{ "weight":  1.5 }\n', encoding="utf-8")
+    assert source_digest(root, ENTRY) == first  # how it is written says nothing
+    data.write_text('{"weight": 1.6}', encoding="utf-8")
+    assert source_digest(root, ENTRY) not in (first, before)
