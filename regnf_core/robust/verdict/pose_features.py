@@ -138,14 +138,23 @@ def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Gro
     weights = torch.cat(
         [groups.scene_agrees / groups.near.sum(1, keepdim=True).clamp_min(1), groups.object_agrees / m], 1
     )
-    J = r.jacobian.double()
+    J = _about_origin(r.jacobian.double(), T.translation.double()[:, None])
     H = 0.5 * (J * weights.double()[..., None]).mT @ J
-    arm = problem.held_out.object_samples.points.double() - T.translation.double()[:, None]  # (H, M, 3)
-    motion = torch.cat([_cross_matrix(arm).mT, torch.eye(3).double().expand(*arm.shape, 3), arm[..., None]], -1)
-    G = (motion.mT @ motion).mean(1)
+    points = problem.held_out.object_samples.points.double()
+    motion = torch.cat([_cross_matrix(points).mT, torch.eye(3).double().expand(m, 3, 3), points[..., None]], -1)
+    G = (motion.mT @ motion).mean(0)
     inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(7).double()))
     least: Tensor = torch.linalg.eigvalsh(inverse @ H @ inverse.mT)[:, :2]
     return least.clamp_min(0.0).sqrt()
+
+
+def _about_origin(J: Tensor, t: Tensor) -> Tensor:
+    """The Jacobian (H, K, 7) for turns and growth about the object's center instead of about the pose's translation t
+    (H, 1, 3): what moves the object's surface is then well conditioned, however far away the scene's origin is."""
+    shift = J[..., 3:6]
+    turn = J[..., :3] + torch.linalg.cross(t.expand_as(shift), shift)
+    growth = J[..., 6:] + (t * shift).sum(-1, keepdim=True)
+    return torch.cat([turn, shift, growth], -1)
 
 
 def _cross_matrix(v: Tensor) -> Tensor:

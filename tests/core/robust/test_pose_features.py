@@ -100,3 +100,10 @@ def test_nothing_agrees_far_away(problem: RegistrationProblem) -> None:
     assert all(value == value for value in found.values())
     assert found["confirmed"] == 0.0
     assert found["stiffness"] == 0.0
+
+
+def test_a_pose_of_extreme_scale_far_away_has_features_too(problem: RegistrationProblem) -> None:
+    T = truth(problem)
+    for scale, distance in ((1e-6, 1e-6), (1e6, 1e8), (1.0, 1e8)):
+        found = features_at(problem, replace(T, scale=T.scale * scale, translation=T.translation + distance))
+        assert all(value == value for value in found.values())
