@@ -24,6 +24,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=150, help="steps of training")
     parser.add_argument("--trainer", action="append", choices=list(TRAINERS), help="only this one; repeat for more")
     parser.add_argument("--settings", choices=["with", "without", "both"], default="both", help="what is compared")
+    parser.add_argument("--in-this-process", action="store_true", help="import without a process for each file")
     parser.add_argument("--output", type=Path, help="the table to write")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -44,7 +45,7 @@ def _check(arguments: argparse.Namespace, trainers: list[str]) -> None:
         outcomes = []
         for name in trainers:
             for facts in sorted((arguments.folder / name).glob(f"*/{FACTS}"))[: arguments.count]:
-                outcome = compare_run(facts.parent, with_settings)
+                outcome = compare_run(facts.parent, with_settings, arguments.in_this_process)
                 outcomes.append(outcome)
                 _log.info(
                     "%s %s %s %.1e %.1e %s",

@@ -10,6 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+ColorFunction = Callable[[Tensor, Tensor], Tensor]
+"""Colors (N, 3) within [0, 1], R, G, B, at points (N, 3) along unit directions (N, 3)."""
 Function = Callable[[Tensor], Tensor]
 """Distances (N,) at points (N, 3), both in double precision."""
 
@@ -27,6 +29,7 @@ class WrittenRun:
     """Points are compared within [-reach, reach]^3, in the field's own coordinates."""
     description: dict[str, Any] = field(default_factory=dict)
     """What no settings file says and a caller must."""
+    color: ColorFunction | None = None
 
     def reference(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distances (N,) and gradients (N, 3), float64, by autograd."""

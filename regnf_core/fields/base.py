@@ -39,6 +39,12 @@ class SdfField(Protocol):
         ...
 
 
+def field_repr(field: SdfField) -> str:
+    """A field in a line: its class, and where it has meaning."""
+    low, high = ([float(f"{value:.4g}") for value in corner.tolist()] for corner in field.bounds)
+    return f"<{type(field).__name__}, bounds {low} to {high}, {field.device}>"
+
+
 class _SignedDistance(torch.autograd.Function):
     """Signed distance whose backward pass uses the field's own gradient: no graph through the network is kept."""
 

@@ -8,7 +8,7 @@ from typing import Generic, Self, TypeVar
 import torch
 from torch import Tensor
 
-from regnf_core.fields.function_field import SdfFunction
+from regnf_core.fields.function_field import ColoredFunction, SdfFunction
 
 F = TypeVar("F", bound=SdfFunction)
 
@@ -52,6 +52,16 @@ class BoxExtension(Generic[F]):
         # Along an axis that leads out, the nearest point of the box stays where it is.
         gradient = torch.where(beyond == 0.0, gradient, 0.0)
         return value + self.outward * way, gradient + self.outward * away
+
+    @property
+    def has_color(self) -> bool:
+        """Whether :meth:`color` may be asked."""
+        return isinstance(self.function, ColoredFunction) and self.function.has_color
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) of g at points (N, 3); outside, that of the box's nearest point."""
+        assert isinstance(self.function, ColoredFunction)
+        return self.function.color(self._nearest(points), directions)
 
     def _nearest(self, points: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(points, self.low), self.high)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import ColorFunction, has_color, inverse_deviation_of
 
 
 @runtime_checkable
@@ -95,9 +96,14 @@ class UnionField:
     weights: share of the surface samples that each part gets; None shares by area.
     """
 
+    color: ColorFunction
+    """That of the nearest part, where all parts have color."""
+
     def __init__(self, parts: Sequence[SdfField], weights: Sequence[float] | None = None) -> None:
         self.parts = list(parts)
         self.weights = None if weights is None else np.asarray(weights, dtype=np.float64)
+        if all(has_color(part) for part in parts):
+            self.color = self._color
 
     @property
     def bounds(self) -> Tensor:
@@ -109,6 +115,12 @@ class UnionField:
     def device(self) -> torch.device:
         """The first part's device."""
         return self.parts[0].device
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """The smallest of the parts': the sharpness that all have; None where one has none."""
+        known = [inverse for part in self.parts if (inverse := inverse_deviation_of(part)) is not None]
+        return min(known) if len(known) == len(self.parts) else None
 
     def to(self, device: torch.device | str) -> UnionField:
         """The union of the parts on another device."""
@@ -125,10 +137,27 @@ class UnionField:
 
         A part is asked only where its bounding box is nearer than what has been found.
         """
+        distance, gradient, _ = self._nearest(points)
+        return distance, gradient
+
+    def _color(self, points: Tensor, directions: Tensor) -> Tensor:
+        points = points.to(device=self.device, dtype=torch.float32)
+        directions = directions.to(points)
+        nearest = self._nearest(points)[2]
+        color = torch.zeros_like(points)
+        for number, part in enumerate(self.parts):
+            here = nearest == number
+            assert has_color(part)
+            color[here] = part.color(points[here], directions[here])
+        return color
+
+    def _nearest(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Distance (N,), gradient (N, 3) and number (N,) of the nearest part."""
         points = points.to(device=self.device, dtype=torch.float32)
         distance = points.new_full((points.shape[0],), torch.inf)
         gradient = torch.zeros_like(points)
-        for part in self.parts:
+        nearest = torch.zeros(points.shape[0], dtype=torch.int64, device=points.device)
+        for number, part in enumerate(self.parts):
             lower, upper = part.bounds.to(points)
             beyond = torch.maximum(lower - points, points - upper).clamp_min(0.0).norm(dim=-1)
             asked = torch.nonzero(beyond <= distance.clamp_min(0.0)).squeeze(-1)
@@ -136,7 +165,8 @@ class UnionField:
             nearer = here < distance[asked]
             distance[asked[nearer]] = here[nearer]
             gradient[asked[nearer]] = slope[nearer]
-        return distance, gradient
+            nearest[asked[nearer]] = number
+        return distance, gradient, nearest
 
     @property
     def area(self) -> float:

@@ -60,12 +60,26 @@ class GeometryMlp:
 
     def with_gradient(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) of features (N, in) and its gradient (N, in) by them, by reverse accumulation."""
+        h, slopes = self._forward(features)
+        distance = self._linear(len(self.weights) - 1, h, features).squeeze(-1)
+        return distance, self._gradient(slopes, features)
+
+    def last_inputs_and_gradient(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """What the last layer multiplies (N, its columns), of features (N, in), and the distance's gradient (N, in)."""
+        h, slopes = self._forward(features)
+        return self._with_skip(len(self.weights) - 1, h, features), self._gradient(slopes, features)
+
+    def _forward(self, features: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """What the last layer is fed (N, width), and the slopes of the activations before it."""
         h, slopes = features, []
         for layer in range(len(self.weights) - 1):
             a = self._linear(layer, h, features)
             slopes.append(self._function.slope(a))
             h = self._function.value(a)
-        distance = self._linear(len(self.weights) - 1, h, features).squeeze(-1)
+        return h, slopes
+
+    def _gradient(self, slopes: list[Tensor], features: Tensor) -> Tensor:
+        """Of the distance, by the features (N, in)."""
         gradient = self.weights[-1].expand(features.shape[0], -1)
         skipped = None
         if self.skip_at == len(self.weights) - 1:
@@ -74,12 +88,13 @@ class GeometryMlp:
             gradient = (gradient * slopes[layer]) @ self.weights[layer]
             if layer == self.skip_at:
                 gradient, skipped = self._split_skip(gradient, features)
-        return distance, gradient if skipped is None else gradient + skipped
+        return gradient if skipped is None else gradient + skipped
 
     def _linear(self, layer: int, h: Tensor, features: Tensor) -> Tensor:
-        if layer == self.skip_at:
-            h = torch.cat((h, features), dim=-1) / math.sqrt(2.0)
-        return torch.addmm(self.biases[layer], h, self.weights[layer].T)
+        return torch.addmm(self.biases[layer], self._with_skip(layer, h, features), self.weights[layer].T)
+
+    def _with_skip(self, layer: int, h: Tensor, features: Tensor) -> Tensor:
+        return torch.cat((h, features), dim=-1) / math.sqrt(2.0) if layer == self.skip_at else h
 
     @staticmethod
     def _split_skip(gradient: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:

@@ -43,6 +43,17 @@ class GridMlpFunction:
         distance, by_feature = self.mlp.with_gradient(features)
         return distance, (jacobian * by_feature).sum(dim=-1).T / (2.0 * self.radius)
 
+    def gradient_by_level(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Value (N,) at points (N, 3), its gradient (N, 3) but for the grid's part (0), and each level's (A, N, 3)."""
+        features, jacobian = self.encoding.encode_with_derivative(self._to_unit(points))
+        distance, by_feature = self.mlp.with_gradient(features)
+        levels = self.encoding.by_level(jacobian * by_feature) / (2.0 * self.radius)
+        return distance, torch.zeros_like(points), levels
+
+    def places(self, points: Tensor) -> Tensor:
+        """Where the points (N, 3) lie in the grid's cube, from 0 to 1 (N, 3)."""
+        return self._to_unit(points)
+
     def _to_unit(self, points: Tensor) -> Tensor:
         return (points + self.radius) / (2.0 * self.radius)
 

@@ -57,8 +57,10 @@ class _Cells:
 class HashEncoding:
     """Features of points in the unit cube, interpolated in a table of trained entries.
 
-    table: (entries, features_per_level) float32, level-major as ``config`` lays it out. With ``active_levels`` only the
-    coarsest levels are evaluated (a level mask); the output has their features alone.
+    table: (entries, features_per_level) float32, level-major as ``config`` lays it out · strides: (3, A, 1), what a
+    step along an axis adds to a corner's row, or the hash's factor · entries, offsets: (A, 1) of each level's part of
+    the table · dense_levels: the first ones, which are not hashed. With ``active_levels`` only the coarsest levels are
+    evaluated (a level mask); the output has their features alone.
     Raises FieldFormatError (FIELD_SHAPES_MISMATCH) when the table does not fit the config.
     """
 
@@ -74,14 +76,14 @@ class HashEncoding:
         entries, strides = config.level_entries(), config.level_strides()
         active = slice(0, self.active_levels)
         # Resolutions never fall from level to level, so the dense levels come first.
-        self._dense = sum(config.level_is_dense()[active])
+        self.dense_levels = sum(config.level_is_dense()[active])
         offsets = [sum(entries[:level]) for level in range(config.levels)]
-        rows = [(1, nodes, nodes * nodes) for nodes in strides[: self._dense]]
-        rows += [_PRIMES] * (self.active_levels - self._dense)
-        self._strides = torch.tensor(rows, dtype=torch.int64, device=table.device).T.unsqueeze(-1)  # (3, A, 1)
+        rows = [(1, nodes, nodes * nodes) for nodes in strides[: self.dense_levels]]
+        rows += [_PRIMES] * (self.active_levels - self.dense_levels)
+        self.strides = torch.tensor(rows, dtype=torch.int64, device=table.device).T.unsqueeze(-1)  # (3, A, 1)
         self._scales = self._column(torch.tensor(config.scales()[active], dtype=torch.float32))
-        self._entries = self._column(torch.tensor(entries[active]))
-        self._offsets = self._column(torch.tensor(offsets[active]))
+        self.entries = self._column(torch.tensor(entries[active]))
+        self.offsets = self._column(torch.tensor(offsets[active]))
 
     @property
     def width(self) -> int:
@@ -108,15 +110,29 @@ class HashEncoding:
             values = torch.lerp(values[0], values[1], weight)
         return self._by_point(values), torch.stack([self._by_point(d) for d in derivatives])
 
-    def _locate(self, unit_points: Tensor) -> _Cells:
-        position = torch.addcmul(unit_points.new_tensor(0.5), unit_points.T.unsqueeze(1), self._scales)  # (3, A, N)
+    @property
+    def scales(self) -> Tensor:
+        """Cells along an edge of the cube, of each active level (A,)."""
+        return self._scales.flatten()
+
+    def by_level(self, values: Tensor) -> Tensor:
+        """Sums (A, N, 3) over the features of each level, of values (3, N, width)."""
+        levels = values.view(3, values.shape[1], self.active_levels, self.config.features_per_level)
+        return levels.sum(dim=-1).permute(2, 1, 0)
+
+    def cells(self, unit_points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The lower corners (3, A, N) of the cells of points (3, N), float32; the weights towards the upper corners
+        (3, A, N), and their derivative by the point, (3, A, N)."""
+        position = torch.addcmul(unit_points.new_tensor(0.5), unit_points.unsqueeze(1), self._scales)
         cell = position.floor()
         w = position.sub_(cell)
         scales = self._scales.expand_as(w)
         if self.config.interpolation == "smoothstep":
-            weights, slopes = w * w * (3.0 - 2.0 * w), 6.0 * w * (1.0 - w) * scales
-        else:
-            weights, slopes = w, scales
+            return cell, w * w * (3.0 - 2.0 * w), 6.0 * w * (1.0 - w) * scales
+        return cell, w, scales
+
+    def _locate(self, unit_points: Tensor) -> _Cells:
+        cell, weights, slopes = self.cells(unit_points.T)
         return _Cells(self._corner_rows(cell.long()), weights, slopes)
 
     def _corner_rows(self, cell: Tensor) -> Tensor:
@@ -125,17 +141,17 @@ class HashEncoding:
         The original computes in uint32. Its wrap-around is kept: a hashed level has 2^T entries, so only the low T bits
         count, and those are the same in int64; a dense level's sum is cut to 32 bits before the modulo.
         """
-        lower = cell * self._strides
-        both = torch.stack((lower, lower + self._strides), dim=1)  # (3, 2, A, N)
+        lower = cell * self.strides
+        both = torch.stack((lower, lower + self.strides), dim=1)  # (3, 2, A, N)
         x, y, z = both[0][:, None, None], both[1][None, :, None], both[2][None, None, :]
-        d = self._dense
+        d = self.dense_levels
         rows = cell.new_empty(2, 2, 2, *cell.shape[1:])
         dense, hashed = rows[..., :d, :], rows[..., d:, :]
         torch.add(x[..., :d, :], y[..., :d, :] + z[..., :d, :], out=dense)
-        dense.bitwise_and_(_UINT32).remainder_(self._entries[:d])
+        dense.bitwise_and_(_UINT32).remainder_(self.entries[:d])
         torch.bitwise_xor(x[..., d:, :], y[..., d:, :] ^ z[..., d:, :], out=hashed)
-        hashed.bitwise_and_(self._entries[d:] - 1)
-        return rows.add_(self._offsets).view(-1)
+        hashed.bitwise_and_(self.entries[d:] - 1)
+        return rows.add_(self.offsets).view(-1)
 
     def _gather(self, cells: _Cells) -> Tensor:
         rows: Tensor = _GatherRows.apply(self.table, cells.corners)  # type: ignore[no-untyped-call]

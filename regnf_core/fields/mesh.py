@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.fields.base import field_repr
+from regnf_core.fields.color import ColorFunction
 from regnf_core.schema.kinds.mesh import MeshDescription
 
 _INSIDE = 0.5
@@ -43,12 +45,20 @@ class MeshField:
     slower than a small network, see docs/families.md.
     vertices: (V, 3), own frame · faces: (F, 3) indices, normals outward · bounds: (2, 3), lowest and highest corner of
     the region where the field has meaning; None: the mesh's own bounding box · inside_above: the winding number above
-    which a point is inside.
+    which a point is inside · colors: (V, 3) in [0, 1], of the vertices; None: the mesh has no color.
     Raises FieldFormatError (MESH_INVALID) when the arrays do not form a mesh.
     """
 
+    color: ColorFunction
+    """Only where the vertices have colors."""
+
     def __init__(
-        self, vertices: ArrayLike, faces: ArrayLike, bounds: ArrayLike | None = None, inside_above: float = _INSIDE
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        bounds: ArrayLike | None = None,
+        inside_above: float = _INSIDE,
+        colors: NDArray[np.float32] | None = None,
     ) -> None:
         self.vertices: NDArray[np.float64] = np.ascontiguousarray(vertices, dtype=np.float64)
         self.faces: NDArray[np.int64] = np.ascontiguousarray(faces, dtype=np.int64)
@@ -59,6 +69,9 @@ class MeshField:
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise FieldFormatError("a mesh face names a vertex that does not exist", reason="MESH_INVALID")
         self._inside_above = inside_above
+        self.colors = colors
+        if colors is not None:
+            self.color = self._color
         self._bounds = None if bounds is None else torch.as_tensor(np.asarray(bounds, dtype=np.float64))
 
     @classmethod
@@ -84,7 +97,11 @@ class MeshField:
     def transformed(self, matrix: ArrayLike) -> MeshField:
         """The field of the mesh carried by a (4, 4) affine matrix."""
         carry = np.asarray(matrix, dtype=np.float64)
-        return MeshField(self.vertices @ carry[:3, :3].T + carry[:3, 3], self.faces, None, self._inside_above)
+        vertices = self.vertices @ carry[:3, :3].T + carry[:3, 3]
+        return MeshField(vertices, self.faces, None, self._inside_above, self.colors)
+
+    def __repr__(self) -> str:
+        return field_repr(self)
 
     @property
     def bounds(self) -> Tensor:
@@ -132,6 +149,18 @@ class MeshField:
         gradient[touching] = self._normals_and_areas()[0][triangles[touching].reshape(-1)]
         return _as_float32(sign * distance), _as_float32(gradient)
 
+    def _color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """That of the closest point of the mesh, interpolated between the corners of its triangle."""
+        del directions
+        assert self.colors is not None
+        queries = np.ascontiguousarray(points.detach().cpu().numpy(), dtype=np.float64).reshape(-1, 3)
+        if len(queries) == 0:
+            return torch.zeros(0, 3)
+        _, triangles, closest = self._trees[0].squared_distance(self.vertices, self.faces, queries)
+        corners = self.faces[triangles.reshape(-1)]  # (N, 3)
+        shares = _barycentric(closest, self.vertices[corners])
+        return _as_float32(np.einsum("nk,nkc->nc", shares, self.colors[corners]).clip(0.0, 1.0))
+
     def sample_surface(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """``count`` points (count, 3), uniform over the surface's area."""
         areas = self._normals_and_areas()[1]
@@ -159,13 +188,26 @@ class MeshField:
         return cross / np.maximum(norm, 1e-300)[:, None], norm / 2.0
 
 
-def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor]) -> MeshField:
-    """The field of ``description`` with its triangles in ``tensors``.
+def build_mesh(description: MeshDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None) -> MeshField:
+    """The field of ``description`` with its triangles in ``tensors``. colors: (V, 3) of the vertices.
 
     Raises FieldFormatError (MESH_INVALID) for a face that names a vertex that does not exist.
     """
     vertices, faces = tensors["vertices"].cpu().numpy(), tensors["faces"].cpu().numpy()
-    return MeshField(vertices, faces, description.function_bounds, description.inside_above)
+    painted = None if colors is None else colors.float().cpu().numpy()
+    return MeshField(vertices, faces, description.function_bounds, description.inside_above, painted)
+
+
+def _barycentric(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares (N, 3) of the corners (N, 3, 3) of triangles at points (N, 3) on them; of a triangle without area, equal.
+
+    The shares are those of the areas opposite to the corners.
+    """
+    sides = np.roll(corners, -1, axis=1) - points[:, None], np.roll(corners, -2, axis=1) - points[:, None]
+    areas = np.linalg.norm(np.cross(*sides), axis=-1)  # (N, 3)
+    whole = areas.sum(axis=1, keepdims=True)
+    shares: NDArray[np.float64] = np.where(whole > 0.0, areas / np.maximum(whole, 1e-300), 1.0 / 3.0)
+    return shares
 
 
 def _as_float32(values: NDArray[Any]) -> Tensor:

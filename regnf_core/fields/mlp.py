@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.activations import ACTIVATIONS, Activation, leaky_relu
+from regnf_core.fields.color_head import Appearance, ColorHead
 from regnf_core.fields.function_field import FunctionField
 from regnf_core.fields.positional_encoding import PositionalEncoding
 from regnf_core.schema.kinds.mlp import MlpDescription
@@ -66,6 +67,8 @@ class MlpFunction:
     activation: Activation
     positional_encoding: PositionalEncoding | None = None
     output_tanh: int = 0
+    head: ColorHead | None = None
+    """The color, if there is one."""
 
     @property
     def device(self) -> torch.device:
@@ -74,7 +77,13 @@ class MlpFunction:
 
     def to(self, device: torch.device | str) -> MlpFunction:
         """The same function with its parameters on another device."""
-        return replace(self, layers=tuple(layer.to(device) for layer in self.layers))
+        head = None if self.head is None else self.head.to(device)
+        return replace(self, layers=tuple(layer.to(device) for layer in self.layers), head=head)
+
+    @property
+    def has_color(self) -> bool:
+        """Whether :meth:`color` may be asked."""
+        return self.head is not None
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (N,) at points (N, 3)."""
@@ -88,6 +97,17 @@ class MlpFunction:
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (N,) at points (N, 3) and its gradient (N, 3) with respect to them, in closed form."""
+        distance, gradient, _ = self._evaluated(points)
+        return distance, gradient
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) at points (N, 3) along unit directions (N, 3)."""
+        assert self.head is not None
+        _, gradient, hidden = self._evaluated(points)
+        return self.head(Appearance(points, gradient, hidden), directions)
+
+    def _evaluated(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Signed distance (N,), its gradient (N, 3), and what the last layer is given (N, its columns)."""
         inputs = self._inputs(points)
         h, slopes, standards = inputs, [], []
         for layer in self.layers[:-1]:
@@ -106,7 +126,8 @@ class MlpFunction:
                 gradient = layer.norm.pull_back(gradient, *standards.pop())
             seen, gradient = _split(layer, gradient @ layer.weight, inputs)
             by_input = by_input + seen
-        return distance, self._pull_back(inputs, gradient + by_input)
+        last = _with_input(self.layers[-1], h, inputs)
+        return distance, self._pull_back(inputs, gradient + by_input), last
 
     def _inputs(self, points: Tensor) -> Tensor:
         if self.positional_encoding is None:
@@ -127,7 +148,9 @@ class MlpFunction:
         return distance, slope
 
 
-def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> FunctionField[MlpFunction]:
+def build_mlp(
+    description: MlpDescription, tensors: Mapping[str, Tensor], head: ColorHead | None = None
+) -> FunctionField[MlpFunction]:
     """The field of ``description`` with its parameters in ``tensors`` (names as in the safe format), in float32.
 
     Tensors keep their device; they must have passed :meth:`MlpDescription.check_tensors`. Columns of sines and cosines
@@ -142,7 +165,10 @@ def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> Fun
         weight, bias = (tensors[f"layers.{i}.{part}"][rows].float() for part in ("weight", "bias"))
         sees_input = i in description.input_at
         if i == 0 or sees_input:
-            weight = weight[:, : weight.shape[1] - description.input_width + live]
+            unused = description.input_width - live
+            weight = weight[:, : weight.shape[1] - unused]
+            if head is not None and i == count - 1:  # the color sees what this layer sees
+                head = head.with_first(head.weights[0][:, : head.weights[0].shape[1] - unused])
         norm = None
         if i in description.normalized:
             norm = LayerNorm(tensors[f"norms.{i}.weight"].float(), tensors[f"norms.{i}.bias"].float())
@@ -150,14 +176,16 @@ def build_mlp(description: MlpDescription, tensors: Mapping[str, Tensor]) -> Fun
     activation = ACTIVATIONS[description.activation]
     if description.activation == "leaky_relu":
         activation = leaky_relu(description.negative_slope)
-    function = MlpFunction(tuple(layers), activation, positional, description.output_tanh)
+    function = MlpFunction(tuple(layers), activation, positional, description.output_tanh, head)
     return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))
 
 
 def _linear(layer: Layer, h: Tensor, inputs: Tensor) -> Tensor:
-    if layer.sees_input:
-        h = torch.cat((h, inputs), dim=-1)
-    return torch.addmm(layer.bias, h, layer.weight.T)
+    return torch.addmm(layer.bias, _with_input(layer, h, inputs), layer.weight.T)
+
+
+def _with_input(layer: Layer, h: Tensor, inputs: Tensor) -> Tensor:
+    return torch.cat((h, inputs), dim=-1) if layer.sees_input else h
 
 
 def _split(layer: Layer, gradient: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import ColorFunction, has_color, inverse_deviation_of
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.observation_grid import UNSEEN, ObservationGrid
 
@@ -67,9 +68,14 @@ class Observed(Protocol):
 class ObservedField:
     """A field with an observation."""
 
+    color: ColorFunction
+    """Only where the field has color."""
+
     def __init__(self, field: SdfField, observation: Observation) -> None:
         self.field = field
         self.observation: Observation | None = observation
+        if has_color(field):
+            self.color = field.color
 
     @property
     def bounds(self) -> Tensor:
@@ -80,6 +86,11 @@ class ObservedField:
     def device(self) -> torch.device:
         """That of the field."""
         return self.field.device
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """That of the field."""
+        return inverse_deviation_of(self.field)
 
     def to(self, device: torch.device | str) -> ObservedField:
         """The same field with its parameters on another device; the observation stays on the CPU."""

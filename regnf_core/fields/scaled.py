@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import ColorFunction, color_in_unit, has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.geometry.sim3 import Sim3
 
@@ -16,10 +17,15 @@ class ScaledField:
     Coordinates and distances scale together, so the gradient's norm stays what it was.
     """
 
+    color: ColorFunction
+    """Only where the field has color."""
+
     def __init__(self, field: SdfField, scale: float = 1.0, sign: int = 1) -> None:
         self.field = field
         self.scale = scale
         self.sign = sign
+        if has_color(field):
+            self.color = color_in_unit(field, scale)
 
     @property
     def bounds(self) -> Tensor:
@@ -36,6 +42,12 @@ class ScaledField:
         """What was observed, new unit; None where it is not known."""
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(_scaling(1.0 / self.scale))
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """NeuS's s, per new unit; None where the field has none."""
+        inverse = inverse_deviation_of(self.field)
+        return None if inverse is None else inverse / self.scale
 
     def to(self, device: torch.device | str) -> ScaledField:
         """The same field with its parameters on another device."""

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import ColorFunction, color_in_frame, has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.geometry.sim3 import Sim3
 
@@ -16,9 +17,14 @@ class TransformedField:
     The bounds are the axis-aligned box round the field's own bounds, in the new frame.
     """
 
+    color: ColorFunction
+    """Only where the field has color."""
+
     def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:
         self.field = field
         self.T_field_frame = T_field_frame
+        if has_color(field):
+            self.color = color_in_frame(field, T_field_frame)
 
     @property
     def bounds(self) -> Tensor:
@@ -38,6 +44,12 @@ class TransformedField:
         """What was observed, new frame; None where it is not known."""
         seen = observation_of(self.field)
         return None if seen is None else seen.seen_in(self.T_field_frame)
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """NeuS's s, per unit of the new frame; None where the field has none."""
+        inverse = inverse_deviation_of(self.field)
+        return None if inverse is None else inverse * float(self.T_field_frame.scale)
 
     def to(self, device: torch.device | str) -> TransformedField:
         """The same field with its parameters on another device."""

@@ -26,6 +26,18 @@ def interpolate_with_derivative(corners: Tensor, weights: Tensor) -> tuple[Tenso
     return corners, torch.stack(derivatives)
 
 
+def interpolate_colors(corners: Tensor, weights: Tensor) -> Tensor:
+    """Color (N, 3) within the cell from the corners' (8, N, 3), as :func:`interpolate`; black where none has one.
+
+    A corner with a negative number has no color, and the others count.
+    """
+    corners = corners.float()
+    known = (corners >= 0.0).all(-1, keepdim=True)
+    corners = torch.cat((torch.where(known, corners, 0.0), known), dim=-1)
+    mixed = interpolate(corners.view(2, 2, 2, -1, 4), weights[..., None])
+    return (mixed[:, :3] / mixed[:, 3:].clamp_min(1e-9)).clamp(0.0, 1.0)
+
+
 def corner_offsets(device: torch.device) -> Tensor:
     """(8, 3) int64: the corners of a cell, z fastest, in the order that :func:`interpolate` wants them."""
     pair = torch.arange(2, device=device)

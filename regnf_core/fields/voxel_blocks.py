@@ -10,7 +10,12 @@ from torch import Tensor
 
 from regnf_core.fields.cell_index import CellIndex
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
+from regnf_core.fields.trilinear import (
+    corner_offsets,
+    interpolate,
+    interpolate_colors,
+    interpolate_with_derivative,
+)
 from regnf_core.schema.kinds.voxel_blocks import VoxelBlocksDescription
 
 
@@ -31,6 +36,8 @@ class VoxelBlocksFunction:
     origin: Tensor
     voxel_size: float
     outward: float
+    colors: Tensor | None = None
+    """(B, R, R, R, 3); a node with a negative number has none."""
 
     @property
     def device(self) -> torch.device:
@@ -45,7 +52,23 @@ class VoxelBlocksFunction:
             blocks=self.blocks.to(device),
             index=self.index.to(device),
             origin=self.origin.to(device),
+            colors=None if self.colors is None else self.colors.to(device),
         )
+
+    @property
+    def has_color(self) -> bool:
+        """Whether :meth:`color` may be asked."""
+        return self.colors is not None
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) at points (N, 3), trilinear between the nodes that have one; black where none has.
+
+        A node of no block has the color of the nearest node of the blocks nearby.
+        """
+        del directions
+        assert self.colors is not None
+        nodes, weights = self._cells(points)
+        return interpolate_colors(self.colors.view(-1, 3)[self._nearest_numbers(nodes)], weights)
 
     def value(self, points: Tensor) -> Tensor:
         """Value (N,) at points (N, 3)."""
@@ -58,10 +81,14 @@ class VoxelBlocksFunction:
 
     def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The values (2, 2, 2, N) at the corners of the points' cells, and the weights (3, N) of the upper ones."""
+        nodes, weights = self._cells(points)
+        return self._node_values(nodes).view(2, 2, 2, -1), weights
+
+    def _cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The corners (8, N, 3) of the points' cells as nodes, and the weights (3, N) of the upper ones."""
         position = (points - self.origin) / self.voxel_size
         cell = position.floor()
-        nodes = cell.long() + corner_offsets(self.device)[:, None]  # (8, N, 3)
-        return self._node_values(nodes).view(2, 2, 2, -1), (position - cell).T
+        return cell.long() + corner_offsets(self.device)[:, None], (position - cell).T
 
     def _node_values(self, nodes: Tensor) -> Tensor:
         """The values (M, N) of nodes (M, N, 3)."""
@@ -79,16 +106,34 @@ class VoxelBlocksFunction:
         edge = self.values.shape[1]
         local = nodes - edge * self.blocks[row]
         inside = local.clamp(0, edge - 1)
-        x, y, z = inside.unbind(-1)
-        value = self.values.view(-1)[((row * edge + x) * edge + y) * edge + z].float()
+        value = self.values.view(-1)[_number(row, inside, edge)].float()
         away: Tensor = (local - inside).to(value.dtype).norm(dim=-1)
         return value + self.outward * self.voxel_size * away
 
+    def _nearest_numbers(self, nodes: Tensor) -> Tensor:
+        """Where in all blocks' nodes, one after another, those are that are nearest to nodes (M, N, 3): (M, N)."""
+        edge = self.values.shape[1]
+        block = torch.div(nodes, edge, rounding_mode="floor")
+        row, found = self.index.find(block)
+        missing = nodes[~found]
+        if missing.shape[0]:
+            near = self.index.nearest(block[~found])  # (U, K)
+            local = missing[:, None] - edge * self.blocks[near]
+            away = (local - local.clamp(0, edge - 1)).float().norm(dim=-1)
+            row[~found] = near.gather(1, away.argmin(dim=1, keepdim=True))[:, 0]
+        return _number(row, (nodes - edge * self.blocks[row]).clamp(0, edge - 1), edge)
+
+
+def _number(row: Tensor, local: Tensor, edge: int) -> Tensor:
+    """Of nodes (..., 3) of the blocks ``row`` (...), among the nodes of all blocks."""
+    x, y, z = local.unbind(-1)
+    return ((row * edge + x) * edge + y) * edge + z
+
 
 def build_voxel_blocks(
-    description: VoxelBlocksDescription, tensors: Mapping[str, Tensor]
+    description: VoxelBlocksDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None
 ) -> FunctionField[VoxelBlocksFunction]:
-    """The field of ``description`` with its values in ``tensors``.
+    """The field of ``description`` with its values in ``tensors``. colors: (B, R, R, R, 3) of the nodes.
 
     The values keep their device and type; the tensors must have passed :meth:`VoxelBlocksDescription.check_tensors`.
     Raises FieldFormatError (FIELD_INDEX_INVALID).
@@ -96,6 +141,12 @@ def build_voxel_blocks(
     values, blocks = tensors["values"].contiguous(), tensors["blocks"].long()
     origin = torch.tensor(description.origin, dtype=torch.float32, device=values.device)
     function = VoxelBlocksFunction(
-        values, blocks, CellIndex.of(blocks), origin, description.voxel_size, float(description.sign)
+        values,
+        blocks,
+        CellIndex.of(blocks),
+        origin,
+        description.voxel_size,
+        float(description.sign),
+        None if colors is None else colors.contiguous(),
     )
     return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))

@@ -10,7 +10,12 @@ from torch import Tensor
 
 from regnf_core.fields.box_extension import BoxExtension
 from regnf_core.fields.function_field import FunctionField
-from regnf_core.fields.trilinear import corner_offsets, interpolate, interpolate_with_derivative
+from regnf_core.fields.trilinear import (
+    corner_offsets,
+    interpolate,
+    interpolate_colors,
+    interpolate_with_derivative,
+)
 from regnf_core.schema.kinds.voxel_grid import VoxelGridDescription
 
 
@@ -24,6 +29,8 @@ class VoxelGridFunction:
     values: Tensor
     origin: Tensor
     spacing: Tensor
+    colors: Tensor | None = None
+    """(X, Y, Z, 3); a node with a negative number has none."""
 
     @property
     def device(self) -> torch.device:
@@ -33,8 +40,24 @@ class VoxelGridFunction:
     def to(self, device: torch.device | str) -> VoxelGridFunction:
         """The same function with its values on another device."""
         return replace(
-            self, values=self.values.to(device), origin=self.origin.to(device), spacing=self.spacing.to(device)
+            self,
+            values=self.values.to(device),
+            origin=self.origin.to(device),
+            spacing=self.spacing.to(device),
+            colors=None if self.colors is None else self.colors.to(device),
         )
+
+    @property
+    def has_color(self) -> bool:
+        """Whether :meth:`color` may be asked."""
+        return self.colors is not None
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) at points (N, 3), trilinear between the nodes that have one; black where none has."""
+        del directions
+        assert self.colors is not None
+        index, weights = self._cells(points)
+        return interpolate_colors(self.colors.view(-1, 3)[index], weights)
 
     def value(self, points: Tensor) -> Tensor:
         """Value (N,) at points (N, 3)."""
@@ -47,20 +70,25 @@ class VoxelGridFunction:
 
     def _corners(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """The values (2, 2, 2, N) at the corners of the points' cells, and the weights (3, N) of the upper ones."""
+        index, weights = self._cells(points)
+        values = self.values.view(-1).index_select(0, index.view(-1)).float()
+        return values.view(2, 2, 2, -1), weights
+
+    def _cells(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """The corners (8, N) of the points' cells among all nodes, and the weights (3, N) of the upper ones."""
         position = (points - self.origin) / self.spacing
         last = torch.tensor(self.values.shape, device=self.device) - 2
         cell = torch.minimum(position.floor().long().clamp_min(0), last)  # (N, 3)
         _, rows, columns = self.values.shape
         strides = torch.tensor([rows * columns, columns, 1], device=self.device)
         index = (cell * strides).sum(-1) + (corner_offsets(self.device) * strides).sum(-1, keepdim=True)  # (8, N)
-        values = self.values.view(-1).index_select(0, index.view(-1)).float()
-        return values.view(2, 2, 2, -1), (position - cell).T
+        return index, (position - cell).T
 
 
 def build_voxel_grid(
-    description: VoxelGridDescription, tensors: Mapping[str, Tensor]
+    description: VoxelGridDescription, tensors: Mapping[str, Tensor], colors: Tensor | None = None
 ) -> FunctionField[BoxExtension[VoxelGridFunction]]:
-    """The field of ``description`` with its values in ``tensors``, extended beyond the grid.
+    """The field of ``description`` with its values in ``tensors``, extended beyond the grid. colors: of the nodes.
 
     The tensors keep their device and type; they must have passed :meth:`VoxelGridDescription.check_tensors`.
     """
@@ -69,5 +97,6 @@ def build_voxel_grid(
     spacing = torch.tensor(description.spacing, dtype=torch.float64)
     high = origin + spacing * (torch.tensor(values.shape) - 1)
     origin, spacing, high = (corner.to(device=values.device, dtype=torch.float32) for corner in (origin, spacing, high))
-    function = BoxExtension(VoxelGridFunction(values, origin, spacing), origin, high, float(description.sign))
+    colors = None if colors is None else colors.contiguous()
+    function = BoxExtension(VoxelGridFunction(values, origin, spacing, colors), origin, high, float(description.sign))
     return FunctionField(function, torch.tensor(description.function_bounds, dtype=torch.float64))

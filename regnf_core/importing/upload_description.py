@@ -77,6 +77,34 @@ class EncodingDescription:
     sine and the cosine."""
 
 
+Inputs = Literal["all", "no_direction", "no_gradient", "features"]
+
+
+@dataclass(frozen=True)
+class ColorOverrides:
+    """What the widths alone may leave open about a network of colors. It changes nothing about the geometry."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = _FORBID_UNKNOWN
+
+    keep: bool | None = None
+    """False: leave the color out."""
+    average_appearance: bool | None = None
+    """True: the mean of the images' appearances (sdfstudio, nerfstudio); else none of them."""
+    direction_degree: Annotated[int, Ge(0), Le(24)] | None = None
+    """Frequencies of the direction's sines and cosines, or the degree of its spherical harmonics."""
+    inputs: Inputs | None = None
+    """What the network sees: no_direction and no_gradient are NeuS's modes no_view_dir and no_normal; features:
+    nothing but the geometry's results (instant-nsr-pl)."""
+    hidden_width: Annotated[int, Ge(1), Le(1024)] | None = None
+    """Of a fully fused network's layers."""
+    padding: Annotated[float, Ge(0), Le(1)] | None = None
+    """sdfstudio's rgb_padding."""
+    output: Literal["sigmoid", "linear"] | None = None
+    """What stands behind the last layer."""
+    channels: Literal["rgb", "bgr"] | None = None
+    """The order in which NeuS was trained; its own trainer reads images as bgr."""
+
+
 @dataclass(frozen=True)
 class CamerasDescription:
     """What the file of cameras does not say of them."""
@@ -148,16 +176,19 @@ class UploadDescription:
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
     label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None
+    grid_box: _Box | None = None
+    """Lowest and highest corner of what the hash grid covers, in the checkpoint's coordinates, if that is no cube."""
     use_grid: bool | None = None
     """False: the network has a hash grid's columns, but was trained without it."""
     hash: GridDescription = field(default_factory=GridDescription)
     positional_encoding: EncodingDescription = field(default_factory=EncodingDescription)
     cameras: CamerasDescription = field(default_factory=CamerasDescription)
+    color: ColorOverrides = field(default_factory=ColorOverrides)
 
     def non_default(self) -> dict[str, Any]:
         """The entries that say something, as plain (JSON) values."""
         values = asdict(self)
-        for name in ("hash", "positional_encoding", "cameras"):
+        for name in ("hash", "positional_encoding", "cameras", "color"):
             values[name] = {part: value for part, value in values[name].items() if value is not None}
         values["as"] = values.pop("as_")
         return {name: value for name, value in values.items() if value not in (None, {})}

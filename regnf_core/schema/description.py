@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Ge, Le, MaxLen
+from annotated_types import Ge, Gt, Le, MaxLen
 from pydantic import AfterValidator, FiniteFloat
 
+from regnf_core.schema.color import ColorDescription, NetworkColor, ValueColor, split_color
 from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
 from regnf_core.schema.similarity import require_similarity
-from regnf_core.schema.tensor_check import TensorSpec
+from regnf_core.schema.tensor_check import TensorSpec, require
 
 FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid"}
 Corner = tuple[float, float, float]
@@ -66,6 +67,10 @@ class FieldDescription(ABC):
     """Set: the field is in its dataset's frame, and so are ``bounds``."""
     observation: ObservationGrid | None = None
     """What was seen of the volume, if it is known; its states are one more tensor."""
+    inverse_deviation: Annotated[float, Gt(0), Le(1e12)] | None = None
+    """NeuS's s, which says how opaque the function's values are, per unit of its coordinates, if it is known."""
+    color: ColorDescription | None = None
+    """Its tensors have names of their own."""
 
     @property
     def function_bounds(self) -> tuple[Corner, Corner]:
@@ -79,7 +84,37 @@ class FieldDescription(ABC):
         if self.observation is not None:
             self.observation.check_tensors(tensors)
             tensors = {name: spec for name, spec in tensors.items() if name != OBSERVATION}
-        self.check_tensors(tensors)
+        if self.color is None:
+            self.check_tensors(tensors)
+            return
+        own, color = split_color(tensors)
+        self.check_tensors(own)
+        self._check_color(self.color, color, own)
+
+    def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int | None:
+        """Columns of the last layer, which a color's network sees too; None: the kind has no such network."""
+        del tensors
+        return None
+
+    def node_shape(self, tensors: Mapping[str, TensorSpec]) -> tuple[int, ...] | None:
+        """The shape of the vertices or nodes that may have colors; None: the kind has none."""
+        del tensors
+        return None
+
+    def _check_color(
+        self,
+        color: NetworkColor | ValueColor,
+        tensors: Mapping[str, TensorSpec],
+        own: Mapping[str, TensorSpec],
+    ) -> None:
+        if isinstance(color, NetworkColor):
+            width = self.hidden_width(own)
+            require(width is not None, f"fields of the kind {self.kind} have no color by a network")
+            color.check(tensors, width or 0)
+        else:
+            shape = self.node_shape(own)
+            require(shape is not None, f"fields of the kind {self.kind} have no color by values")
+            color.check(tensors, shape or ())
 
     @abstractmethod
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -72,12 +73,11 @@ class HashGridConfig:
 
     def scales(self) -> tuple[float, ...]:
         """Cells along an edge of the unit cube, per level: exp2(l log2(growth)) base - 1, in float32."""
-        log2_growth = np.float32(math.log2(np.float32(self.per_level_scale)))
-        scales = []
-        for level in range(self.levels):
-            growth = np.float32(2.0 ** float(np.float32(level) * log2_growth))
-            scales.append(float(growth * np.float32(self.base_resolution) - np.float32(1.0)))
-        return tuple(scales)
+        return _scales(self.levels, self.base_resolution, self.per_level_scale)
+
+    def described(self) -> dict[str, Any]:
+        """The entries of a description's ``hash`` that say this config."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     def level_resolutions(self) -> tuple[int, ...]:
         """Nodes along an edge, per level."""
@@ -152,6 +152,13 @@ class HashGridConfig:
             if abs(scale - nearest) <= _ROUNDING_REACH * max(1.0, scale / 1000):
                 doubtful[level] = nearest + 2 if usual[level] == nearest + 1 else nearest + 1
         return doubtful
+
+
+@lru_cache(maxsize=4096)
+def _scales(levels: int, base_resolution: int, per_level_scale: float) -> tuple[float, ...]:
+    log2_growth = np.float32(math.log2(np.float32(per_level_scale)))
+    growths = (np.float32(2.0 ** float(np.float32(level) * log2_growth)) for level in range(levels))
+    return tuple(float(growth * np.float32(base_resolution) - np.float32(1.0)) for growth in growths)
 
 
 def _combinations(levels: Iterable[int]) -> Iterator[tuple[int, ...]]:

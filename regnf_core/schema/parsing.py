@@ -59,8 +59,9 @@ def _is_flat(values: dict[str, Any]) -> bool:
 def description_to_dict(description: FieldDescription) -> dict[str, Any]:
     """Plain (JSON) values of a description, defaults included, in a fixed order."""
     values: dict[str, Any] = _adapter(type(description)).dump_python(description, mode="json")
-    if description.placement is None:
-        del values["placement"]  # readers of before it take all other files
+    for name in ("placement", "inverse_deviation", "color"):
+        if values[name] is None:
+            del values[name]  # readers of before it take all other files
     return values
 
 

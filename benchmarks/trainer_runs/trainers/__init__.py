@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.trainer_runs.run import WrittenRun
-from benchmarks.trainer_runs.trainers import deepsdf, implicit, instant_nsr_pl, nerfstudio, neuralangelo, neus
+from benchmarks.trainer_runs.trainers import (
+    co_slam,
+    deepsdf,
+    implicit,
+    instant_nsr_pl,
+    monosdf,
+    nerfstudio,
+    neuralangelo,
+    neus,
+)
 
 Writer = Callable[[Path, np.random.Generator, int], WrittenRun]
 """Takes an empty folder, a source of randomness and the steps of training."""
@@ -24,4 +33,6 @@ TRAINERS: dict[str, Writer] = {
     "deepsdf": deepsdf.write_deepsdf,
     "volsdf": implicit.write_volsdf,
     "idr": implicit.write_idr,
+    "monosdf": monosdf.write_monosdf,
+    "co_slam": co_slam.write_co_slam,
 }

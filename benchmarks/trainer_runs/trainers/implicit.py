@@ -53,12 +53,7 @@ def _write(folder: Path, rng: np.random.Generator, steps: int, said: dict[str, A
 
     train(value, network.parameters(), random_shape(rng), rng, steps, 1e-3)
     prefix = str(rng.choice(["", "module."]))
-    state = {}
-    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        factors = torch.tensor(rng.uniform(0.5, 2, len(weight)), dtype=torch.float32)
-        parts = normalized(weight, factors) if said["weight_norm"] else {"weight": weight.detach()}
-        state |= {f"{prefix}implicit_network.lin{i}.{name}": part for name, part in parts.items()}
-        state[f"{prefix}implicit_network.lin{i}.bias"] = bias.detach()
+    state = implicit_state(rng, network, f"{prefix}implicit_network.", said["weight_norm"])
     state[f"{prefix}rendering_network.lin0.bias"] = torch.zeros(8)
     if more:
         state[f"{prefix}density.beta"] = torch.tensor(0.05)
@@ -69,6 +64,17 @@ def _write(folder: Path, rng: np.random.Generator, steps: int, said: dict[str, A
     (time / "runconf.conf").write_text(_conf(said, features, more))
     net = network.double()
     return WrittenRun(folder, checkpoint, {**said, "sphere": more.strip()}, lambda x: value(x, net))
+
+
+def implicit_state(rng: np.random.Generator, network: Network, prefix: str, is_normalized: bool) -> dict[str, Tensor]:
+    """The tensors ``<prefix>lin*``."""
+    state = {}
+    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        factors = torch.tensor(rng.uniform(0.5, 2, len(weight)), dtype=torch.float32)
+        parts = normalized(weight, factors) if is_normalized else {"weight": weight.detach()}
+        state |= {f"{prefix}lin{i}.{name}": part for name, part in parts.items()}
+        state[f"{prefix}lin{i}.bias"] = bias.detach()
+    return state
 
 
 def _conf(said: dict[str, Any], features: int, more: str) -> str:

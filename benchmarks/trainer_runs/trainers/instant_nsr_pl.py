@@ -10,8 +10,9 @@ import torch
 import yaml
 from torch import Tensor
 
+from benchmarks.trainer_runs.colors import Outputs, color_function, flat_state, harmonics, joined, random_layers
 from benchmarks.trainer_runs.functions import GridLayout, Network, hash_features, new_table, sphere_network
-from benchmarks.trainer_runs.run import WrittenRun, newer_names, normalized
+from benchmarks.trainer_runs.run import ColorFunction, WrittenRun, newer_names, normalized
 from benchmarks.trainer_runs.shapes import random_shape
 from benchmarks.trainer_runs.training import train
 
@@ -35,23 +36,65 @@ def write_instant_nsr_pl(folder: Path, rng: np.random.Generator, steps: int) -> 
     widths = [3 + layout.levels * layout.features, *[hidden] * depth, int(rng.choice([13, 17]))]
     network, table = sphere_network(rng, widths, 3, (), 0.5 / radius), new_table(rng, layout)
 
-    def value(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
+    def results(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
         unit = (x + radius) / (2 * radius)
-        return net(torch.cat((2 * unit - 1, hash_features(layout, entries, unit, active)), dim=1))[:, 0]
+        return net(torch.cat((2 * unit - 1, hash_features(layout, entries, unit, active)), dim=1))
+
+    def value(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
+        return results(x, net, entries)[:, 0]
 
     shape = random_shape(rng)
     train(value, [*network.parameters(), table], shape, rng, steps, 3e-3)
     state = _state(rng, network, table, radius, progressive)
+    net, entries = network.double(), table.detach().double()
+    colors, texture, color = _color(rng, widths[-1], lambda x: results(x, net, entries))
+    state |= colors
     trial = folder / "exp" / "neus-thing" / "@20230601-101010"
     checkpoint = trial / "ckpt" / f"epoch=0-step={step}.ckpt"
     checkpoint.parent.mkdir(parents=True)
     torch.save({"epoch": 0, "global_step": step, "state_dict": state, "loops": {}, "optimizer_states": []}, checkpoint)
     (trial / "config").mkdir()
     settings = _settings(layout, radius, (hidden, depth, widths[-1]), mask if progressive else {})
+    settings["model"]["texture"] = texture
     (trial / "config" / "parsed.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
-    net, entries = network.double(), table.detach().double()
     said = {"layout": layout, "radius": radius, "active": active, "depth": depth}
-    return WrittenRun(folder, checkpoint, said, lambda x: value(x, net, entries), 0.95 * min(radius, 1.0))
+    reach = 0.95 * min(radius, 1.0)
+    return WrittenRun(folder, checkpoint, said, lambda x: value(x, net, entries), reach, color=color)
+
+
+def _color(
+    rng: np.random.Generator, features: int, outputs: Outputs
+) -> tuple[dict[str, Tensor], dict[str, Any], ColorFunction]:
+    """A random color network, of plain layers or fully fused: its state, its settings, its function."""
+    degree, fused = int(rng.choice([4, 4, 3, 2])), bool(rng.random() < 0.5)
+    inputs, width, depth = features + degree**2 + 3, int(rng.choice([64, 32])), int(rng.integers(1, 4))
+    layers = random_layers(rng, inputs, width, depth)
+    state = layers.state(rng, "model.texture.network.layers.", False, 2)
+    if fused:
+        for bias in layers.biases:
+            bias.zero_()
+        state = {"model.texture.network.params": flat_state(layers, inputs)}
+
+    def combine(x: Tensor, d: Tensor, gradient: Tensor, found: Tensor) -> Tensor:
+        del x
+        unit = gradient / gradient.norm(dim=1, keepdim=True)
+        return torch.sigmoid(layers(joined([found, harmonics(d, degree), unit])))
+
+    network = {
+        "otype": "FullyFusedMLP" if fused else "VanillaMLP",
+        "activation": "ReLU",
+        "output_activation": "none",
+        "n_neurons": width,
+        "n_hidden_layers": depth,
+    }
+    texture = {
+        "name": "volume-radiance",
+        "input_feature_dim": features + 3,
+        "dir_encoding_config": {"otype": "SphericalHarmonics", "degree": degree},
+        "mlp_network_config": network,
+        "color_activation": "sigmoid",
+    }
+    return state, texture, color_function(outputs, combine)
 
 
 def _state(
@@ -71,7 +114,7 @@ def _state(
         del state[f"{prefix}mask"]
     state["model.variance.variance"] = torch.tensor(0.4)
     box = torch.tensor([-radius] * 3 + [radius] * 3)
-    return state | {"model.scene_aabb": box, "model.texture.network.params": torch.zeros(8)}
+    return state | {"model.scene_aabb": box}
 
 
 def _settings(layout: GridLayout, radius: float, sizes: tuple[int, int, int], mask: dict[str, int]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.trainer_runs.colors import Outputs, color_function, joined, random_layers
 from benchmarks.trainer_runs.functions import (
     GridLayout,
     Network,
@@ -20,7 +21,7 @@ from benchmarks.trainer_runs.functions import (
     sines_by_axis,
     sphere_network,
 )
-from benchmarks.trainer_runs.run import WrittenRun, newer_names, normalized
+from benchmarks.trainer_runs.run import ColorFunction, WrittenRun, newer_names, normalized
 from benchmarks.trainer_runs.shapes import random_shape
 from benchmarks.trainer_runs.trainers.nerfstudio_config import nerfstudio_config, sdfstudio_config
 from benchmarks.trainer_runs.training import train
@@ -103,19 +104,48 @@ def _write(folder: Path, rng: np.random.Generator, steps: int, method: _Method) 
     network = sphere_network(rng, [*widths, 1 + said["geo_feat_dim"]], 3, skips, said["bias"])
     table, factor = new_table(rng, layout), 2 * np.pi if method.nerfstudio else 1.0
 
-    def value(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
+    def results(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
         sines = sines_by_axis(x, degree, factor)
         grid = torch.zeros(len(x), layout.levels * layout.features, dtype=x.dtype)
         if method.uses_grid:
             grid = hash_features(layout, entries, (x + 2) / 4)
-        return net(torch.cat((x, sines if method.uses_sines else sines * 0, grid), dim=1))[:, 0]
+        return net(torch.cat((x, sines if method.uses_sines else sines * 0, grid), dim=1))
+
+    def value(x: Tensor, net: Network = network, entries: Tensor = table) -> Tensor:
+        return results(x, net, entries)[:, 0]
 
     trained = [*network.parameters(), *([table] if method.uses_grid else [])]
     train(value, trained, random_shape(rng), rng, steps, 2e-3)
     step = int(rng.choice([20000, 30000, 99999]))
-    checkpoint = _save(folder, rng, method, said, _state(rng, method, network, table), step)
+    state = _state(rng, method, network, table)
     net, entries = network.double(), table.detach().double()
-    return WrittenRun(folder, checkpoint, said, lambda x: value(x, net, entries))
+    color = _add_color(rng, method, said, state, lambda x: results(x, net, entries))
+    checkpoint = _save(folder, rng, method, said, state, step)
+    return WrittenRun(folder, checkpoint, said, lambda x: value(x, net, entries), color=color)
+
+
+def _add_color(
+    rng: np.random.Generator, method: _Method, said: dict[str, Any], state: dict[str, Tensor], outputs: Outputs
+) -> ColorFunction:
+    """A random color network in ``state``, and its settings in ``said``."""
+    prefix = next(key for key in state if key.endswith(".aabb")).removesuffix("aabb")
+    embedding = int(rng.choice([32, 16, 8]))
+    rows = torch.tensor(rng.normal(size=(7, embedding)), dtype=torch.float32)
+    layers = random_layers(
+        rng, 33 + said["geo_feat_dim"] + embedding, int(rng.choice([48, 64])), int(rng.integers(1, 5))
+    )
+    state |= layers.state(rng, f"{prefix}clin") | {f"{prefix}embedding_appearance.embedding.weight": rows}
+    average = bool(rng.random() < 0.5)
+    padding = 0.0 if method.nerfstudio else float(rng.choice([0.001, 0.001, 0.01]))
+    said |= {"rgb_padding": padding, "use_average_appearance_embedding": average}
+    appearance = rows.double().mean(0) if average else torch.zeros(embedding)
+    factor = 2 * np.pi if method.nerfstudio else 1.0
+
+    def combine(x: Tensor, d: Tensor, gradient: Tensor, found: Tensor) -> Tensor:
+        parts = [x, sines_by_axis(d, 4, factor), d, gradient, found[:, 1:], appearance.expand(len(x), -1)]
+        return torch.sigmoid(layers(joined(parts))) * (1 + 2 * padding) - padding
+
+    return color_function(outputs, combine)
 
 
 def _state(rng: np.random.Generator, method: _Method, network: Network, table: Tensor) -> dict[str, Tensor]:
@@ -129,7 +159,6 @@ def _state(rng: np.random.Generator, method: _Method, network: Network, table: T
         f"{prefix}aabb": torch.tensor([[-1.0] * 3, [1.0] * 3]),
         f"{prefix}encoding.params": table.detach().reshape(-1),
         f"{prefix}deviation_network.variance": torch.tensor([0.3]),
-        f"{prefix}clin0.bias": torch.zeros(4),
         "_model.proposal_networks.0.encoding.params": torch.zeros(64),
         **(newer_names(layers) if method.nerfstudio and rng.random() < 0.3 else layers),
     }

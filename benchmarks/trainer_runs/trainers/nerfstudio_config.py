@@ -49,6 +49,7 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
       max_res: 64
       num_levels: 5
     scene_contraction_norm: inf
+    use_average_appearance_embedding: {str(said["use_average_appearance_embedding"]).lower()}
     sdf_field: !!python/object:nerfstudio.fields.sdf_field.SDFFieldConfig
       _target: !!python/name:nerfstudio.fields.sdf_field.SDFField ''
 {_lines(field)}
@@ -82,6 +83,7 @@ pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConf
   model: !!python/object:nerfstudio.models.{config}
     _target: !!python/name:nerfstudio.models.{target} ''
     background_model: none
+    use_average_appearance_embedding: {str(said["use_average_appearance_embedding"]).lower()}
     sdf_field: !!python/object:nerfstudio.fields.sdf_field.SDFFieldConfig
       _target: !!python/name:nerfstudio.fields.sdf_field.SDFField ''
 {_lines(field)}

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.calls import GRADIENT, Calls
+from regnf_core.schema.color import COLOR, NetworkColor
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
@@ -31,6 +32,13 @@ def network_work(description: FieldDescription, tensors: Mapping[str, StoredArra
         each = _POINT_S + decoded * layers + (2 * math.floor(description.reach) + 1) ** 3 * _CELL_S
         return each * GRADIENT * (sum(calls.values) + sum(calls.gradients))
     return (_POINT_S + layers) * calls.points
+
+
+def color_work(color: NetworkColor, tensors: Mapping[str, StoredArray]) -> float:
+    """Seconds that the network of a color takes at a point on one core, beside those of the geometry."""
+    layers = sum(_layer(array.shape) for name, array in tensors.items() if name.startswith(f"{COLOR}.layers."))
+    width = 0 if color.hash is None else color.hash.width
+    return _POINT_S + layers + width * _CORNERS * _CORNER_S
 
 
 def _layer(shape: tuple[int, ...]) -> float:

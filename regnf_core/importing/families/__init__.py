@@ -7,6 +7,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families import (
+    co_slam,
     deepsdf,
     deepsdf_blocks,
     instant_nsr_pl,
@@ -43,6 +44,7 @@ FAMILIES: tuple[Family, ...] = (
     torch_ngp.convert,
     nglod.convert,
     isdf.convert,
+    co_slam.convert,
     unsupported.refuse,
     plain_network.convert,
 )

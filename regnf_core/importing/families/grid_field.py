@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 from regnf_core.importing.arrays import Float32Array
@@ -15,8 +15,8 @@ from regnf_core.importing.families.grid_space import GridSpace
 from regnf_core.schema.hash_grid_config import HashGridConfig
 
 _MAX_STRIDES = 3
-MAX_LAYOUTS = 64
-"""Most layouts that are weighed against each other."""
+MAX_LAYOUTS = 512
+"""Most layouts that are listed."""
 
 
 def space_readings(
@@ -32,7 +32,7 @@ def space_readings(
     whether it is known.
     """
     readings = []
-    written = sorted((entry for space in spaces for entry in space.written()), key=lambda entry: entry.tier)
+    written = sorted((entry for space in spaces for entry in space.written), key=lambda entry: entry.order)
     for entry in written[:MAX_LAYOUTS]:
         # the training device may have indexed the same table otherwise
         others = tuple(itertools.islice(entry.grid.stride_variants(), _MAX_STRIDES)) if entry.tier == 0 else ()
@@ -61,7 +61,7 @@ def grid_readings(
     return tuple(
         Reading(
             grid_name(grid),
-            {**kind, **entries, "hash": asdict(grid)},
+            {**kind, **entries, "hash": grid.described()},
             {**layers, "hash_table": table.reshape(-1, grid.features_per_level)},
         )
         for grid in grids

@@ -77,7 +77,7 @@ def _spaces(parameters: int, width: int, habits: GridHabits, given: GridDescript
                 given.top_resolution,
                 given.per_level_scale,
             )
-            if space.written():
+            if space.written:
                 yield space
 
 

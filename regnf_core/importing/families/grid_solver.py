@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,16 +61,15 @@ def solve(
     sizes_in_order = sorted(log2_sizes)
     if entries % levels == 0 and (entries // levels).bit_length() - 1 in sizes_in_order:
         found |= {_function(full): full for full in _full(entries // levels, levels, bases)}
-    pairs = [(size, base) for size in sizes_in_order for base in _bases(entries, levels, size, bases)]
-    if not pairs:
+    sizes, starts = _pairs(entries, levels, sizes_in_order, bases)
+    if not len(sizes):
         return tuple(found.values())
     known = dict(zip(bases, growths, strict=True)) if growths is not None else {}
-    sizes, starts = (np.array(column, dtype=np.int64) for column in zip(*pairs, strict=True))
     caps = 1 << sizes
     first = _first_at_least(entries, levels, caps, starts)
     beyond = _first_at_least(entries + 1, levels, caps, starts)
     several = _jumping(first, levels, caps, starts) > 1
-    for i, (size, base) in enumerate(pairs):
+    for i, (size, base) in enumerate(zip(sizes.tolist(), starts.tolist(), strict=True)):
         low, high = int(first[i]), int(beyond[i]) - 1
         growth = known.get(base)
         interval: GridInterval | None = None
@@ -91,11 +91,13 @@ def _full(cap: int, levels: int, bases: Sequence[int]) -> Iterator[GridInterval]
         yield GridInterval(levels, cap.bit_length() - 1, min(beyond), 1.0, MAX_GROWTH, base_is_free=len(beyond) > 1)
 
 
-def _bases(entries: int, levels: int, log2_size: int, bases: Sequence[int]) -> Iterator[int]:
-    """Bases whose coarsest level is not full and leaves room for the others."""
-    cap = 1 << log2_size
-    if levels * cap > entries:
-        yield from (base for base in bases if _round_up(base**3) < cap and _round_up(base**3) * levels <= entries)
+def _pairs(entries: int, levels: int, log2_sizes: Sequence[int], bases: Sequence[int]) -> tuple[_Ints, _Ints]:
+    """Table sizes and bases whose coarsest level is not full and leaves room for the others."""
+    sizes = [size for size in log2_sizes if levels << size > entries]
+    all_sizes, all_bases = (grid.ravel() for grid in np.meshgrid(_ints(sizes), _ints(bases), indexing="ij"))
+    coarsest = _round_up(all_bases**3)
+    fits = (coarsest < 1 << all_sizes) & (coarsest * levels <= entries)
+    return all_sizes[fits], all_bases[fits]
 
 
 def _first_at_least(entries: int, levels: int, caps: _Ints, bases: _Ints) -> _Ints:
@@ -130,7 +132,7 @@ def _level_entries(bits: _Ints, levels: int, caps: _Ints, bases: _Ints) -> _Ints
     factors = np.exp2(powers.astype(np.float64)).astype(np.float32)
     scales = factors * bases.astype(np.float32)[:, None] - np.float32(1.0)
     nodes = np.ceil(np.minimum(scales, np.float32(1 << 20))).astype(np.int64) + 1
-    return np.asarray(np.minimum(-(-(nodes**3) // _ALIGNMENT) * _ALIGNMENT, caps[:, None]), dtype=np.int64)
+    return np.asarray(np.minimum(_round_up(nodes**3), caps[:, None]), dtype=np.int64)
 
 
 def _rounded(entries: int, levels: int, size: int, base: int, growth: float | None) -> GridInterval | None:
@@ -173,5 +175,13 @@ def _growth(bits: int) -> float:
     return float(np.int32(bits).view(np.float32))
 
 
-def _round_up(nodes: int) -> int:
+def _ints(values: Sequence[int]) -> _Ints:
+    return np.array(values, dtype=np.int64)
+
+
+@overload
+def _round_up(nodes: int) -> int: ...
+@overload
+def _round_up(nodes: _Ints) -> _Ints: ...
+def _round_up(nodes: int | _Ints) -> int | _Ints:
     return -(-nodes // _ALIGNMENT) * _ALIGNMENT

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
@@ -18,6 +19,10 @@ _MAX_TOP = 1 << 14
 _MOST_ROUND = 40
 """Finest resolutions of an interval that are listed beside the powers of two, at most."""
 
+_COPIED = tuple(2.0 ** (k / 15) for k in range(4, 11))
+"""Growths from one power of two to another over the usual 16 levels, which are written with other numbers of levels,
+too."""
+
 
 @dataclass(frozen=True)
 class WrittenGrid:
@@ -28,6 +33,11 @@ class WrittenGrid:
     """0: a usual number (a power of two, a growth of two decimals) · 1: a round one · 2: any whole number of nodes."""
     said: dict[str, Any]
     """The entries of the description's ``hash`` that say it."""
+
+    @property
+    def order(self) -> tuple[int, bool]:
+        """Where it is listed: of as usual numbers, growths of two decimals last, because there are so many."""
+        return self.tier, round(self.grid.per_level_scale, 2) == self.grid.per_level_scale
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,7 @@ class GridSpace:
     is_told: bool = False
     """Whether the file itself says how long each level is: the layout of its rows is then the family's affair."""
 
+    @cached_property
     def written(self) -> tuple[WrittenGrid, ...]:
         """The grids that somebody would have written, the most usual first. Each has the table's number of entries."""
         found: dict[object, WrittenGrid] = {}
@@ -56,7 +67,7 @@ class GridSpace:
                         extra = 0 if base in _USUAL_BASES or not interval.base_is_free else 2
                         entry = WrittenGrid(grid, max(tier, extra), self._said(interval, base) | said)
                         found.setdefault((grid, interval), entry)
-        return tuple(sorted(found.values(), key=lambda entry: entry.tier))
+        return tuple(sorted(found.values(), key=lambda entry: entry.order))
 
     def _bases(self, interval: GridInterval) -> tuple[int, ...]:
         if not interval.base_is_free:
@@ -85,7 +96,8 @@ class GridSpace:
         elif interval.resolutions is not None:
             yield 0, interval.lowest, {"per_level_scale": interval.lowest}
         else:
-            yield from _tops(interval, base)
+            for tier, growth, said in _tops(interval, base):
+                yield tier + (self.writes_growth and tier > 0), growth, said
             if self.writes_growth and (base in _USUAL_BASES or not interval.base_is_free):
                 yield from _short_growths(interval)
 
@@ -117,12 +129,23 @@ def _tops(interval: GridInterval, base: int) -> Iterator[tuple[int, float, dict[
             several = range(-(-lowest // unit) * unit, highest + 1, unit)
             if len(listed) + len(several) <= _MOST_ROUND:
                 listed = {**dict.fromkeys(several, 1 if unit > 1 else 2), **listed}
+        if not any(listed.values()):
+            listed = {**dict.fromkeys(_two_digits(lowest, highest), 1), **listed}
     for top, tier in listed.items():
         yield tier, _growth_to(top, base, interval.levels), {"top_resolution": top}
 
 
+def _two_digits(lowest: int, highest: int) -> list[int]:
+    """Numbers of two digits and zeros, in a range that is too wide for closer ones."""
+    units = (10**k for k in range(len(str(highest)) - 1))
+    return [number for unit in units for number in range(10 * unit, 100 * unit, unit) if lowest <= number <= highest]
+
+
 def _short_growths(interval: GridInterval) -> Iterator[tuple[int, float, dict[str, Any]]]:
     lowest, highest = interval.lowest * (1.0 - _EDGE), min(interval.highest * (1.0 + _EDGE), 2.5)
+    for growth in _COPIED:
+        if lowest <= growth <= highest:
+            yield 0, growth, {"per_level_scale": growth}
     for decimals, tier in ((2, 0), (3, 1), (4, 2)):
         first, last = math.ceil(lowest * 10**decimals), math.floor(highest * 10**decimals)
         if decimals > 2 and interval.base_is_free:

@@ -17,6 +17,8 @@ import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
+from regnf_core.importing.families.color import instant_nsr_pl as color
+from regnf_core.importing.families.color.head import with_color, with_deviation, with_hidden_factor
 from regnf_core.importing.families.converted import ConvertedField, Reading, Variant, converted_of
 from regnf_core.importing.families.grid_field import space_readings, step_of
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces
@@ -56,8 +58,8 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     require_shape(table_name, table, (None,))
     spaces = find_spaces(table.size, layers.input_width - 3, _HABITS, overrides.hash)
     why = [f"keys {_PREFIX}*, {len(layers.weights)} layers", f"scene_aabb: the scene lies within {radius:g} of 0"]
-    untold = _untold(state, layers, source, overrides, why)
     warnings: list[str] = []
+    untold = _untold(state, layers, source, overrides, why, warnings)
     mask = overrides.level_mask
     if mask is None and table_name == _PROGRESSIVE_TABLE:
         mask = _open_levels(checkpoint, spaces[0].intervals[0].levels, why, warnings)
@@ -71,7 +73,20 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     readings = space_readings(table, spaces, _in_scene_units(layers, radius), entries, how)
     if overrides.activation == "relu":
         readings = tuple(_with_relu(reading) for reading in readings)
-    return replace(converted_of(FAMILY, tuple(why), readings, tuple(warnings)), untold=untold)
+    converted = replace(converted_of(FAMILY, tuple(why), readings, tuple(warnings)), untold=untold)
+    return _with_color(converted, checkpoint["state_dict"], len(layers.weights), source, overrides)
+
+
+def _with_color(
+    converted: ConvertedField, whole: dict[str, Any], count: int, source: TensorSource, overrides: UploadDescription
+) -> ConvertedField:
+    """With what the file has beside the geometry of ``count`` layers: the deviation, and the color."""
+    converted = with_deviation(converted, whole, "model.variance.variance", source)
+    if not color.has_color(whole) or overrides.color.keep is False:
+        return converted
+    state, last = strip_prefix(whole, _PREFIX), f"network.layers.{2 * count - 2}"
+    factor = 1.0 / _SHARPER if overrides.activation == "relu" else 1.0
+    return with_color(converted, lambda: color.read_color(whole, state, last, source, overrides.color), factor)
 
 
 def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
@@ -89,10 +104,15 @@ def _layers(state: dict[str, Any], source: TensorSource) -> Layers:
 
 
 def _untold(
-    state: dict[str, Any], layers: Layers, source: TensorSource, overrides: UploadDescription, why: list[str]
+    state: dict[str, Any],
+    layers: Layers,
+    source: TensorSource,
+    overrides: UploadDescription,
+    why: list[str],
+    warnings: list[str],
 ) -> tuple[Variant, ...]:
     """Both activations where neither the description nor the weights tell which it is; what they tell goes to
-    ``why``."""
+    ``why``, and what holds for the trainer as it is published alone, to ``warnings``."""
     if overrides.output_bias is None and overrides.output_scale is None:
         why.append("nothing is said of sdf_bias and sdf_activation: none is assumed")
     if overrides.activation is not None:
@@ -100,6 +120,10 @@ def _untold(
     if not began_as_a_sphere(folded_weight(state, f"network.layers.{2 * len(layers.weights) - 2}", source)):
         return _ACTIVATIONS
     why.append("softplus: the last layer's weights have one sign, as those that begin as a sphere")
+    warnings.append(
+        "ACTIVATION_ASSUMED: the trainer puts softplus into networks that begin as a sphere; say activation relu of a"
+        " changed one that does not"
+    )
     return ()
 
 
@@ -120,7 +144,8 @@ def _with_relu(reading: Reading) -> Reading:
     factors = {"layers.0.weight": _SHARPER, f"layers.{last}.weight": 1.0 / _SHARPER}
     factors |= {f"layers.{layer}.bias": _SHARPER for layer in range(last)}
     sharper = {name: np.asarray(reading.tensors[name] * by, dtype=np.float32) for name, by in factors.items()}
-    return replace(reading, tensors={**reading.tensors, **sharper})
+    reading = replace(reading, tensors={**reading.tensors, **sharper})
+    return with_hidden_factor(reading, reading.tensors[f"layers.{last}.weight"].shape[1], 1.0 / _SHARPER)
 
 
 def _as_it_is(reading: Reading) -> Reading:

@@ -13,10 +13,29 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import tensor_error
+from regnf_core.importing.families.color import neus as color
+from regnf_core.importing.families.color.head import ReadColor, understood, with_color, with_deviation, without_color
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import layer_names, read_layers, strip_prefix
-from regnf_core.importing.families.network import FORM_ENTRIES, Form, Network, OpenForm, network_field, skips_of, told
-from regnf_core.importing.families.shared import UNIT_CUBE, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.monosdf_grid import FAMILY as MONOSDF
+from regnf_core.importing.families.monosdf_grid import convert_grid
+from regnf_core.importing.families.network import (
+    BETA,
+    FORM_ENTRIES,
+    Form,
+    Network,
+    OpenForm,
+    network_field,
+    skips_of,
+    told,
+)
+from regnf_core.importing.families.shared import (
+    UNIT_CUBE,
+    assumed_bounds,
+    refuse_other_entries,
+    require_family,
+    shared_entries,
+)
 from regnf_core.importing.families.states import state_under
 from regnf_core.importing.tensor_source import TensorSource
 from regnf_core.importing.upload_description import UploadDescription
@@ -25,6 +44,7 @@ FAMILY = "neus"
 _SCALES = (1.0, 3.0)
 """Those of the published configurations. Others are to be said: evidence tells a scale to a tenth only."""
 _IMPLICIT = "implicit_network."
+_RENDERING = "rendering_network."
 _IMPLICIT_FAMILIES = ("volsdf", "monosdf", "idr")
 MAX_DEGREE = 24
 
@@ -40,7 +60,32 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     require_family(overrides, FAMILY)
     state = strip_prefix(checkpoint["sdf_network_fine"], "")
     open_scale = overrides.input_scale is None and overrides.output_scale is None
-    return _converted(state, source, overrides, FAMILY, "sdf_network_fine", _SCALES if open_scale else ())
+    converted = _converted(state, source, overrides, FAMILY, "sdf_network_fine", _SCALES if open_scale else ())
+    sharpness = strip_prefix(checkpoint.get("variance_network_fine"), "")
+    converted = with_deviation(converted, sharpness, "variance", source)
+    colors = strip_prefix(checkpoint.get("color_network_fine"), "")
+    if not colors or overrides.color.keep is False:
+        return converted
+    return _with_color(converted, state, colors, source, overrides)
+
+
+def _with_color(
+    converted: ConvertedField,
+    state: dict[str, Any],
+    colors: dict[str, Any],
+    source: TensorSource,
+    overrides: UploadDescription,
+) -> ConvertedField:
+    last = len(layer_names(state, "lin")) - 1
+    is_softplus = overrides.activation in (None, "softplus")
+
+    def read() -> ReadColor:
+        understood(not overrides.output_column, "the distance is not the first of the network's results")
+        understood(last not in converted.description["input_at"], "the last layer sees the position again")
+        return color.read_color(colors, state, f"lin{last}", source, overrides.color)
+
+    # Softplus of another factor is stored as that of the usual one, of other numbers.
+    return with_color(converted, read, BETA / (overrides.activation_scale or BETA) if is_softplus else 1.0)
 
 
 def convert_implicit(
@@ -51,12 +96,27 @@ def convert_implicit(
     if not strip_prefix(state, "lin0."):
         return None
     if strip_prefix(state, "encoding."):
-        message = "MonoSDF's network with a hash grid of its own kernel; extract its mesh, and give that"
+        family, converted = MONOSDF, _with_grid(state, source, overrides)
+    else:
+        density = bool(state_under(checkpoint, "density."))
+        family = overrides.family if overrides.family in _IMPLICIT_FAMILIES else "volsdf" if density else "idr"
+        require_family(overrides, family)
+        converted = _converted(state, source, overrides, family, _IMPLICIT.removesuffix("."), ())
+    colors = state_under(checkpoint, _RENDERING) and overrides.color.keep is not False
+    return without_color(converted, [_RENDERING] if colors else [], family)
+
+
+def _with_grid(state: dict[str, Any], source: TensorSource, overrides: UploadDescription) -> ConvertedField:
+    if "encoding.offsets" not in state:
+        message = "MonoSDF's network with another grid than its own kernel's; extract its mesh, and give that"
         raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-    density = bool(state_under(checkpoint, "density."))
-    family = overrides.family if overrides.family in _IMPLICIT_FAMILIES else "volsdf" if density else "idr"
-    require_family(overrides, family)
-    return _converted(state, source, overrides, family, _IMPLICIT.removesuffix("."), ())
+    names = _names(state)
+    layers = read_layers(state, names, source, column=overrides.output_column or 0)
+    return convert_grid(state, layers, skips_of(layers, names), source, overrides)
+
+
+def _names(state: dict[str, Any]) -> list[str]:
+    return [f"lin{name}" for name in layer_names(strip_prefix(state, "lin"), "", minimum=2)]
 
 
 def _converted(
@@ -68,8 +128,7 @@ def _converted(
     scales: tuple[float, ...],
 ) -> ConvertedField:
     refuse_other_entries(overrides, family, FORM_ENTRIES)
-    names = layer_names(strip_prefix(state, "lin"), "", minimum=2)
-    names = [f"lin{name}" for name in names]
+    names = _names(state)
     layers = read_layers(state, names, source, column=overrides.output_column or 0)
     degree, rest = divmod(layers.input_width - 3, 6)
     if rest or not 0 <= degree <= MAX_DEGREE:
@@ -79,10 +138,7 @@ def _converted(
     forms = [OpenForm("as the description says", form, family)]
     if scales:
         forms = [_at_scale(form, scale, overrides.world_scale or 1.0) for scale in scales]
-    why = (
-        f"keys {where}.lin*, {len(names)} layers, {degree} frequencies",
-        "bounds [-1, 1]: the unit sphere's cube, in which it trains",
-    )
+    why = (f"keys {where}.lin*, {len(names)} layers, {degree} frequencies", *assumed_bounds(overrides))
     return network_field(network, forms, shared_entries(overrides, UNIT_CUBE), why)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
+from regnf_core.importing.families.color.head import without_color
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
@@ -72,7 +73,9 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
         f"an object {_OBJECT} under neural_points: {len(tensors['points'])} points, features {order}",
         f"distances are the decoder's results times {settings.distance_scale:g}",
     )
-    return ConvertedField(FAMILY, why, description, {**tensors, **layers.tensors()})
+    converted = ConvertedField(FAMILY, why, description, {**tensors, **layers.tensors()})
+    colors = isinstance(checkpoint.get("color"), dict) and overrides.color.keep is not False
+    return without_color(converted, ["color"] if colors else [], FAMILY)
 
 
 def _attributes(value: object, kind: str) -> Mapping[Any, Any]:

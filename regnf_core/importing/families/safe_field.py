@@ -14,10 +14,12 @@ from regnf_core.importing.containers.safetensors_header import StoredTensor, rea
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.color import COLOR, split_color
+from regnf_core.schema.observation_grid import OBSERVATION
 from regnf_core.schema.safe_format import read_description
 
 FAMILY = "regnf"
-_OF_THE_IMPORT = frozenset({"family", "frame", "dataset_transform", "accept_implausible", "as", "cameras"})
+_OF_THE_IMPORT = frozenset({"family", "frame", "dataset_transform", "accept_implausible", "as", "cameras", "color"})
 """Entries that no field file has."""
 _OVERRULED = frozenset({"contraction", "level_mask"})
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype("<f4"), "F16": np.dtype("<f2"), "I32": np.dtype("<i4")}
@@ -34,8 +36,15 @@ def convert_safe_field(path: Path, data: memoryview, tensor_bytes: int, override
         raise FieldFormatError("the tensors exceed the limit", reason="TENSOR_TOO_LARGE")
     description = _overruled(read_description(path), overrides)
     tensors = {name: _array(name, tensor, data) for name, tensor in header.items()}
-    why = ("a regnf field file",)
-    return ConvertedField(FAMILY, why, description, tensors, kept_warnings(description["source"].get(WARNINGS)))
+    why: tuple[str, ...] = ("a regnf field file",)
+    if description.get(OBSERVATION) is not None:
+        why += ("it records which parts were observed",)
+    if overrides.color.keep is False:
+        description = {name: value for name, value in description.items() if name != COLOR}
+        tensors = split_color(tensors)[0]
+    source = dict(description["source"])
+    warnings = kept_warnings(source.pop(WARNINGS, None))  # the import writes them anew
+    return ConvertedField(FAMILY, why, description | {"source": source}, tensors, warnings)
 
 
 def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dict[str, Any]:

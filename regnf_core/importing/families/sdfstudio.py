@@ -2,19 +2,21 @@
 
 The two trainers write the same keys and shapes for different functions: nerfstudio multiplies the sines' argument by
 2 pi and contracts space for the grid alone. Only sdfstudio's field has a ``laplace_density``, which decides; the
-uploader may overrule. Training state, color, background, proposal networks and image losses are left behind.
+uploader may overrule. Training state, background, proposal networks and image losses are left behind.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape
+from regnf_core.importing.families.color import studio
+from regnf_core.importing.families.color.head import with_assumption, with_color, with_deviation
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
 from regnf_core.importing.families.grid_field import most_usual, space_readings
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces
@@ -80,7 +82,13 @@ def convert(checkpoint: dict[Any, Any], source: TensorSource, overrides: UploadD
     layers = read_layers(state, names, source)
     require_extra_columns(layers, names, {SKIP_LAYER: layers.input_width})
     evidence = (f"keys {prefix}glin*, {len(names)} layers", why)
-    return _assemble(state, layers, variant, evidence, source, overrides)
+    converted = _assemble(state, layers, variant, evidence, source, overrides)
+    converted = with_deviation(converted, state, "deviation_network.variance", source)
+    if not studio.has_color(state) or overrides.color.keep is False:
+        return converted
+    color, two_pi = overrides.color, variant.two_pi
+    converted = with_color(converted, lambda: studio.read_color(state, names[-1], source, color, two_pi))
+    return with_assumption(converted, studio.assumed_of(state, color))
 
 
 def _tell_variant(state: dict[str, Any], layers: int, overrides: UploadDescription) -> tuple[_Variant, str]:
@@ -88,7 +96,7 @@ def _tell_variant(state: dict[str, Any], layers: int, overrides: UploadDescripti
         if overrides.family not in _VARIANTS:
             message = f"the file is one of {sorted(_VARIANTS)}, the description says {overrides.family}"
             raise FieldFormatError(message, reason="FAMILY_NOT_SUPPORTED")
-        return _VARIANTS[overrides.family], "the description names the family"
+        return _VARIANTS[overrides.family], "the description or the settings name the family"
     if not any(key.startswith("laplace_density.") for key in state):
         return _VARIANTS["nerfstudio_neus_facto"], "no laplace_density: nerfstudio, not sdfstudio"
     name = "sdfstudio_neus_facto"
@@ -171,7 +179,7 @@ def _readings(
         )
     may_be_unused = overrides.use_grid is not True and (not is_trained or len(layers.weights) > SKIP_LAYER)
     if not readings or may_be_unused:  # columns of zeros never see the grid, whatever is said
-        unused = asdict(spaces[0].written()[0].grid)
+        unused = spaces[0].written[0].grid.described()
         description = {"kind": "neus_facto", **entries, "hash": unused, "use_grid": False}
         readings.append(Reading("no grid", description, layers.tensors(), {"use_grid": False}))
     told = {"positional_encoding": {"degree": degree}}

@@ -22,6 +22,7 @@ _SHARED = frozenset(
         "accept_implausible",
         "as",
         "cameras",
+        "color",
     }
 )
 """Entries that mean something for every family."""
@@ -47,6 +48,11 @@ def shared_entries(
         "up_axis": overrides.up_axis,
         "label": overrides.label,
     }
+
+
+def assumed_bounds(overrides: UploadDescription) -> tuple[str, ...]:
+    """Why the unit cube bounds a field that trains in the unit sphere; nothing where other bounds are said."""
+    return () if overrides.bounds else ("bounds [-1, 1]: the unit sphere's cube, in which it trains",)
 
 
 def refuse_other_entries(overrides: UploadDescription, family: str, meant: Sequence[str] = ()) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,11 +17,10 @@ import numpy as np
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, require_shape, tensor_error
 from regnf_core.importing.families.converted import ConvertedField, Reading, converted_of
-from regnf_core.importing.families.grid_field import finest_of, grid_readings, most_usual, space_readings
+from regnf_core.importing.families.grid_field import most_usual, space_readings
 from regnf_core.importing.families.grid_search import GridHabits, find_spaces
-from regnf_core.importing.families.grid_solver import GridInterval
-from regnf_core.importing.families.grid_space import GridSpace
 from regnf_core.importing.families.layers import Layers, layer_names, read_layers, require_extra_columns, strip_prefix
+from regnf_core.importing.families.offset_grids import not_recognized, offset_readings, read_table
 from regnf_core.importing.families.shared import (
     UNIT_CUBE,
     contradiction,
@@ -32,7 +30,6 @@ from regnf_core.importing.families.shared import (
 )
 from regnf_core.importing.tensor_source import TensorSource, lookup
 from regnf_core.importing.upload_description import GridDescription, UploadDescription
-from regnf_core.schema.hash_grid_config import MAX_GROWTH, HashGridConfig
 
 FAMILY = "torch_ngp"
 _OWN, _TCNN = ("encoder.embeddings", "encoder.offsets", "backbone.0.weight"), ("encoder.params", "backbone.params")
@@ -81,58 +78,11 @@ def _read_own(state: dict[str, Any], source: TensorSource, entries: dict[str, An
     names = layer_names(state, "backbone.")
     layers = read_layers(state, names, source, has_biases=False)
     require_extra_columns(layers, names)
-    table = source.array("encoder.embeddings", state["encoder.embeddings"])
-    require_shape("encoder.embeddings", table, (None, None))
-    offsets = source.integers("encoder.offsets", state["encoder.offsets"])
-    sizes = tuple(int(n) for n in np.diff(offsets)) if offsets.ndim == 1 else ()
-    levels, features = len(sizes), table.shape[1]
-    if not sizes or offsets[0] != 0 or offsets[-1] != len(table) or min(sizes) <= 0:
-        raise tensor_error("encoder.offsets do not divide encoder.embeddings into levels", "TENSOR_SHAPE")
-    if layers.input_width != levels * features or levels > 32 or features > 32:
-        raise tensor_error(f"{levels} levels of {features} features, but {layers.input_width} columns", "TENSOR_SHAPE")
-    _require_said(given, levels, features)
-    space = _own_space(sizes, features, given)
-    readings = []
-    for entry in space.written() if space is not None else ():
-        grid = _own_grid(entry.grid)
-        if grid.level_entries() == sizes:
-            (reading,) = grid_readings(table, (grid,), layers.tensors(), entries)
-            readings.append(replace(reading, say={"hash": entry.said}, tier=entry.tier, scale=finest_of(grid)))
-    if not readings:
-        raise _not_recognized(f"no hash grid has levels of {sizes} entries")
-    return most_usual(readings), len(layers.weights)
-
-
-def _require_said(given: GridDescription, levels: int, features: int) -> None:
-    for name, found in (("levels", levels), ("features_per_level", features)):
-        said = getattr(given, name)
-        if said not in (None, found):
-            raise contradiction(f"hash.{name}", said, found)
-
-
-def _own_grid(grid: HashGridConfig) -> HashGridConfig:
-    """The grid as the trainer lays it out: a level of resolution r has r + 1 nodes along an edge, and rows as long."""
-    nodes = tuple(math.ceil(grid.base_resolution * grid.per_level_scale**i) + 1 for i in range(grid.levels))
-    return replace(grid, resolutions=nodes)
-
-
-def _own_space(sizes: Sequence[int], features: int, given: GridDescription) -> GridSpace | None:
-    """The grids whose levels have these sizes, which tell the nodes along an edge of all that are not full."""
-    log2_size = max(3, math.ceil(math.log2(max(sizes)))) if given.log2_table_size is None else given.log2_table_size
-    if log2_size > _MAX_LOG2_SIZE:
-        raise _not_recognized(f"a level of {max(sizes)} entries is larger than any that is taken")
-    nodes = [round(size ** (1 / 3)) for size in sizes if size < 1 << log2_size]  # at most 7 more than the cube
-    base = nodes[0] - 1 if nodes else given.base_resolution
-    least = base if base is not None else max(2, math.floor((1 << log2_size) ** (1 / 3)) - 1)
-    low, high = 1.0, MAX_GROWTH
-    for level, count in enumerate(nodes[1:], start=1):
-        low = max(low, ((count - 2) / least) ** (1 / level))
-        high = min(high, ((count - 1) / least) ** (1 / level))
-    if least < 2 or low > high or given.base_resolution not in (None, base):
-        return None
-    interval = GridInterval(len(sizes), log2_size, least, low, high, base_is_free=base is None)
-    said = (given.top_resolution, given.per_level_scale)
-    return GridSpace((interval,), features, given.interpolation or "linear", False, *said, is_told=True)
+    table = read_table(state, source, "encoder.", given)
+    if layers.input_width != table.width:
+        message = f"{table.width} columns of the grid, but the network has {layers.input_width}"
+        raise tensor_error(message, "TENSOR_SHAPE")
+    return offset_readings(table, layers.tensors(), entries, given), len(layers.weights)
 
 
 def _read_tcnn(state: dict[str, Any], source: TensorSource, entries: dict[str, Any], given: GridDescription) -> _Found:
@@ -156,7 +106,7 @@ def _read_tcnn(state: dict[str, Any], source: TensorSource, entries: dict[str, A
     if not readings:
         if given != GridDescription():
             raise contradiction("hash", given, f"{table.size} and {network.size} numbers")
-        raise _not_recognized(f"no grid and network have {table.size} and {network.size} parameters")
+        raise not_recognized(f"no grid and network have {table.size} and {network.size} parameters")
     return most_usual(readings), count
 
 
@@ -183,7 +133,3 @@ def _split(network: Float32Array, width: int, neurons: int) -> Layers | None:
     biases[0] = weights[0][:, width:].sum(axis=1, dtype=np.float32)
     weights[0] = np.ascontiguousarray(weights[0][:, :width])
     return Layers((*weights[:-1], weights[-1][:1]), (*biases[:-1], biases[-1][:1]))
-
-
-def _not_recognized(message: str) -> FieldFormatError:
-    return FieldFormatError(message, reason="HASH_GRID_NOT_RECOGNIZED")

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
+from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.facing import SAMPLES, facing_of
 from regnf_core.importing.families.orientation import agreeing
@@ -29,7 +30,7 @@ def mesh_field(
     require_family(overrides, family)
     refuse_other_entries(overrides, family)
     _check(geometry)
-    vertices, faces = _welded(geometry.vertices, geometry.faces)
+    vertices, faces, kept = _welded(geometry.vertices, geometry.faces)
     require_within(mesh_seconds(vertices, faces, 3 * SAMPLES), work_s)
     faces, turned = agreeing(vertices.astype(np.float64), faces)
     asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
@@ -48,7 +49,7 @@ def mesh_field(
         *facing.why,
         *(f"ignored: {what}" for what in geometry.left_out),
     )
-    return ConvertedField(
+    converted = ConvertedField(
         family,
         why,
         {
@@ -60,6 +61,8 @@ def mesh_field(
         {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
         (*facing.warnings, *_warnings(max(np.abs(low).max(), np.abs(high).max()) / diagonal)),
     )
+    colors = None if overrides.color.keep is False else geometry.colors
+    return with_values(converted, lambda: None if colors is None else colors[kept].astype(np.float16))
 
 
 def _check(geometry: Geometry) -> None:
@@ -69,8 +72,13 @@ def _check(geometry: Geometry) -> None:
         raise malformed("a face names a vertex that does not exist")
 
 
-def _welded(vertices: Float64Array, faces: Int64Array) -> tuple[npt.NDArray[np.float32], Int64Array]:
-    """Vertices at one place are one, those of no face and triangles without area are dropped."""
+def _welded(
+    vertices: Float64Array, faces: Int64Array
+) -> tuple[npt.NDArray[np.float32], Int64Array, npt.NDArray[np.int64]]:
+    """Vertices at one place are one, those of no face and triangles without area are dropped.
+
+    Also the number, in the file, of each vertex that is left.
+    """
     used, faces = np.unique(faces, return_inverse=True)
     places = vertices[used].astype(np.float32) + np.float32(0.0)  # adding zero makes -0.0 plain
     rows = np.ascontiguousarray(places).view([("", np.float32)] * 3).reshape(-1)
@@ -82,7 +90,7 @@ def _welded(vertices: Float64Array, faces: Int64Array) -> tuple[npt.NDArray[np.f
     if len(corners) == 0:
         raise malformed("no triangle of the mesh has an area")
     kept, corners = np.unique(corners, return_inverse=True)
-    return places[first][kept], corners.reshape(-1, 3)
+    return places[first][kept], corners.reshape(-1, 3), used[first][kept]
 
 
 def _open_edge_share(faces: Int64Array, vertices: int) -> float:

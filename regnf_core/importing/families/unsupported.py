@@ -32,8 +32,11 @@ _KNOWN = (
         ("model",),
         ("encoder.",),
     ),
-    _Known("SHINE-Mapping's, a tree of features with tables of its own", _MESH, ("feature_octree", "geo_decoder")),
-    _Known("Co-SLAM's, whose bounds and truncation are in no file", _MESH, ("model",), ("decoder.sdf_net.",)),
+    _Known(
+        "SHINE-Mapping's, an octree whose tables are pickled as an object, and its scale in the settings",
+        "give the mesh that it writes to the run's folder mesh",
+        ("feature_octree", "geo_decoder"),
+    ),
     _Known("NICE-SLAM's, grids of occupancies", _MESH, ("c", "decoder_state_dict")),
     _Known("nerfstudio's splatfacto, Gaussians without a surface", _MESH, ("pipeline",), ("_model.gauss_params.",)),
     _Known(

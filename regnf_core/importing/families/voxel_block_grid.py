@@ -20,6 +20,7 @@ from regnf_core.importing.containers.voxel_maps import (
     seen_extent,
     stored_weights,
 )
+from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
@@ -42,6 +43,8 @@ class _Blocks:
     weights: Float32Array
     keys: IntArray
     voxel_size: float
+    kept: npt.NDArray[np.bool_]
+    """Which of the file's blocks they are."""
 
 
 def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
@@ -69,7 +72,23 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     told = f"arrays key, block_resolution and attr_name_tsdf: {len(blocks.keys)} blocks of {values.shape[1]}^3 voxels"
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.keys.astype(np.int32)}
     tensors["weights"] = stored_weights(blocks.weights)
-    return ConvertedField(FAMILY, (told, why), description, tensors, warnings)
+    converted = ConvertedField(FAMILY, (told, why), description, tensors, warnings)
+    if "attr_name_color" not in arrays or overrides.color.keep is False:
+        return converted
+    return with_values(converted, lambda: _colors(arrays, blocks))
+
+
+def _colors(arrays: ArraySource, blocks: _Blocks) -> npt.NDArray[np.float16] | None:
+    """(B, R, R, R, 3) in [0, 1], x first, -1 where nothing was seen; None where all are black: no colors were given."""
+    stored = arrays.weights(_attribute(arrays, "color"))  # 0 to 255
+    edge = blocks.tsdf.shape[1]
+    if stored.shape != (len(blocks.kept), edge, edge, edge, 3):
+        raise tensor_error(f"the colors have shape {stored.shape}, expected three numbers a voxel", "TENSOR_SHAPE")
+    if not stored.any():
+        return None
+    colors = (stored[blocks.kept].transpose(0, 3, 2, 1, 4) / np.float32(255.0)).clip(0.0, 1.0)
+    colors[blocks.weights <= 0.0] = -1.0
+    return np.ascontiguousarray(colors, dtype=np.float16)
 
 
 def _read(arrays: ArraySource) -> _Blocks:
@@ -88,7 +107,7 @@ def _read(arrays: ArraySource) -> _Blocks:
     kept = (weights > 0).any(axis=(1, 2, 3))
     if not kept.any():
         raise tensor_error("no voxel was ever seen: all weights are zero", "TENSOR_SHAPE")
-    return _Blocks(tsdf[kept], weights[kept], keys[kept], voxel_size)
+    return _Blocks(tsdf[kept], weights[kept], keys[kept], voxel_size, np.asarray(kept))
 
 
 def _truncation(blocks: _Blocks, overrides: UploadDescription) -> tuple[float, str, tuple[str, ...]]:

@@ -25,8 +25,8 @@ class _OutOfTimeError(RegnfError):
 
 
 def draw_candidates(candidates: Sequence[OpenCandidate], folder: Path, seconds: float) -> None:
-    """Draw each to ``folder``/candidate-N.png, N from 1, as many as can be drawn in so many seconds."""
-    deadline = time.monotonic() + seconds
+    """Draw each to ``folder``/candidate-N.png, N from 1, as many as so many processor seconds allow."""
+    deadline = time.process_time() + seconds
     for number, one in enumerate(candidates, 1):
         _draw(one, folder / candidate_name(number), deadline)
 
@@ -35,10 +35,10 @@ def _draw(candidate: OpenCandidate, path: Path, deadline: float) -> None:
     """A picture, if one can be made: the refusal does without. torch lacks memory with a RuntimeError."""
 
     def look(_: int) -> None:
-        if time.monotonic() > deadline:
+        if time.process_time() > deadline:
             raise _OutOfTimeError("no time is left for the picture")
 
     with contextlib.suppress(RegnfError, MemoryError, RuntimeError), without_new_code():
         reading = candidate.make()
-        if seconds_of(reading.description, reading.tensors, _WORK) < deadline - time.monotonic():
+        if seconds_of(reading.description, reading.tensors, _WORK) < deadline - time.process_time():
             field_picture(field_of(reading), reading.description.get("up_axis"), SMALL, look).save(path)

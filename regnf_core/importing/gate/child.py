@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Literal
 
+from regnf_core.importing.gate.fair_clock import FairClock
 from regnf_core.importing.gate.watch import Trespass, Watch
 
 _LOOK_S = 0.1
@@ -42,13 +43,12 @@ def run_child(
     wall_s: float,
     folder_bytes: int = 1 << 32,
 ) -> ChildOutcome:
-    """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds.
+    """Run ``command`` in ``folder`` with ``request`` on standard input, for at most ``wall_s`` seconds by a fair clock.
 
     It is stopped too when it has many threads, or more than ``folder_bytes`` in ``folder``: see ``Watch``. The child
     leads a process group of its own; at the end the whole group is killed, whatever became of the child.
     ``request`` must fit into a pipe (64 KiB).
     """
-    deadline = time.monotonic() + wall_s
     process = subprocess.Popen(
         command,
         cwd=folder,
@@ -59,6 +59,7 @@ def run_child(
         start_new_session=True,
         close_fds=True,
     )
+    clock = FairClock(process.pid, wall_s)
     _inherit_priority(process.pid)
     stopped: Stopped | None = "late"
     watch = Watch(folder, folder_bytes)
@@ -67,7 +68,7 @@ def run_child(
         with contextlib.suppress(BrokenPipeError):
             _pipe(process.stdin).write(request)
             _pipe(process.stdin).close()
-        stopped = _listen(process, said, watch, deadline) or _stays(process.pid, watch, deadline)
+        stopped = _listen(process, said, watch, clock) or _stays(process.pid, watch, clock)
     finally:
         code, cpu_seconds = _end(process)
     return ChildOutcome(
@@ -99,15 +100,15 @@ def _end(process: subprocess.Popen[bytes]) -> tuple[int, float]:
 
 
 def _listen(
-    process: subprocess.Popen[bytes], said: tuple[bytearray, bytearray], watch: Watch, deadline: float
+    process: subprocess.Popen[bytes], said: tuple[bytearray, bytearray], watch: Watch, clock: FairClock
 ) -> Stopped | None:
     """Collect in ``said`` what the child says until it closes both streams; otherwise tell why it should be stopped."""
     with selectors.DefaultSelector() as selector:
         for stream, words in zip((_pipe(process.stdout), _pipe(process.stderr)), said, strict=True):
             selector.register(stream.fileno(), selectors.EVENT_READ, words)
         while selector.get_map():
-            ready = selector.select(min(max(deadline - time.monotonic(), 0.0), _LOOK_S))
-            if time.monotonic() > deadline:
+            ready = selector.select(min(clock.left_s(), _LOOK_S))
+            if not clock.left_s():
                 return "late"
             if trespass := watch.look(process.pid):
                 return trespass
@@ -121,13 +122,13 @@ def _listen(
     return None
 
 
-def _stays(pid: int, watch: Watch, deadline: float) -> Stopped | None:
+def _stays(pid: int, watch: Watch, clock: FairClock) -> Stopped | None:
     """Why the child, which has closed its streams, should be stopped; None when it ends by itself in time.
 
     Its status stays to be collected.
     """
     while os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
-        if time.monotonic() > deadline:
+        if not clock.left_s():
             return "late"
         if trespass := watch.look(pid):
             return trespass

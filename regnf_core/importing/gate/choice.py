@@ -1,8 +1,9 @@
 """Which of several functions a checkpoint's tensors stand for, by evidence from the weights; else it is asked.
 
-Readings that fit clearly worse than the best are out. Those left that are one function need no choice. Of the others
-the most usual one is taken if it alone is so usual and the rest lie so near it that it is no accident. What stays open
-is refused, with the line to add to the description for each.
+The reading is looked for whose levels do the most for the gradient, from the listed ones on to those beside the best.
+It is taken if it beats every other function that the tensors may stand for, one by one at the same points, and those
+beside it. Where no levels tell, only readings of the same resolutions, or without a grid, are weighed against each
+other. What stays open is refused, with the line to add to the description for each.
 """
 
 from __future__ import annotations
@@ -12,38 +13,47 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import Any
 
 from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.cost.calls import FINAL_POINTS, FINALISTS, TRIAL_POINTS
+from regnf_core.importing.cost.calls import (
+    CLIMB_POINTS,
+    FINAL_POINTS,
+    FINALISTS,
+    LAST_FINALISTS,
+    LAST_POINTS,
+    MAX_CLIMBS,
+    MAX_TRIED,
+    TRIAL_POINTS,
+    TRIED_MORE,
+    TRIED_NEAR,
+    WRITTEN_NEAR,
+)
 from regnf_core.importing.families.converted import ConvertedField, Reading
 from regnf_core.importing.gate.ambiguity import AmbiguousError, OpenCandidate
-from regnf_core.importing.gate.evidence import Evidence, Trial
+from regnf_core.importing.gate.evidence import CLEAR_SUPPORT, LEAST_SUPPORT, Evidence, Trial
 from regnf_core.importing.gate.interpolation import told_interpolation
+from regnf_core.importing.gate.misfit_choice import chosen_by_misfit
 from regnf_core.importing.gate.plausibility import without_new_code
+from regnf_core.importing.gate.readings_beside import readings_beside, readings_written_near
 from regnf_core.schema.hash_grid_config import Interpolation
 
 _SHOWN = MOST_CANDIDATES
-_CLEARLY, _LEAST = 0.1, 0.01
-"""In the first round a reading is out that fits worse by this share of the best's misfit, and by this much at least."""
-_TELLING = 0.4
-"""A best reading that is itself farther from a distance speaks against no other: the least noisy may be wrong."""
-_FINALLY = 0.04
-"""The same in the second round, at more points."""
-_ACCIDENT = 0.5 * math.log(2.0)
-"""Usual numbers are powers of two: among layouts spread by less than this (log of the finest resolution), one of them
-is no accident."""
+_KINDS: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
 
 
-def choose_reading(converted: ConvertedField) -> ConvertedField:
+def choose_reading(converted: ConvertedField, share: int = 1) -> ConvertedField:
     """``converted`` with the reading that its weights speak for, and with what was decided, and by what, in ``why``.
+
+    share: after the first round the readings are tried at one ``share``-th of the points.
 
     Raises AmbiguousError: readings that differ fit alike.
     """
     if not converted.readings:
         return converted
     with without_new_code():
-        chosen, why = _choose(converted.readings)
+        chosen, why = _choose(converted.readings, share)
     return replace(
         converted,
         why=(*converted.why, *why),
@@ -53,57 +63,174 @@ def choose_reading(converted: ConvertedField) -> ConvertedField:
     )
 
 
-def _choose(readings: Sequence[Reading]) -> tuple[Reading, list[str]]:
+def _choose(readings: Sequence[Reading], share: int) -> tuple[Reading, list[str]]:
     evidence = Evidence(readings[0], TRIAL_POINTS)
-    trials = [evidence.of(reading) for reading in readings]
-    best = min(trials, key=lambda trial: trial.mean)
-    speaks = best.mean < _TELLING
-    left = [trial for trial in trials if not speaks or not best.is_better(trial, _CLEARLY, _LEAST)]
-    finest = Evidence(best.reading, FINAL_POINTS)
-    if speaks and len(left) > 1 and not all(trial.is_same(best) for trial in left):
-        left = _second_round(left, finest)
-    chosen = _settled(left)
+    trials = [evidence.of(reading) for reading in readings[:MAX_TRIED]]
+    for best in {id(trial): trial for trial in (min(trials, key=lambda trial: trial.mean), _best(trials))}.values():
+        # the same grid over another cube, or beside other sines
+        trials += [evidence.of(reading) for reading in readings[MAX_TRIED:] if reading.is_grid_of(best.reading)]
+    nearest = min(trials, key=lambda trial: trial.mean)
+    if math.isinf(nearest.mean):  # none has finite values: the evaluation says so
+        return nearest.reading, []
+    finest = Evidence(nearest.reading, FINAL_POINTS // share)
+    chosen, fitting = chosen_by_misfit(trials, finest)
+    if chosen is None or _is_doubtful(chosen, trials, finest):
+        trials = _searched(readings, trials, evidence)
+        best = _best(trials)
+        if not best.is_telling:
+            raise _ambiguous([trial.reading for trial in fitting])
+        chosen = _proven(trials, best, share)
+    if others := _over_other_cubes(chosen, readings, finest):
+        raise _ambiguous([trial.reading for trial in (chosen, *others)])
     why = [_said(trials, evidence.of(chosen.reading))] if len(trials) > 1 else []
     if chosen.reading.interpolation == "open" and chosen.distance is not None:
-        return _interpolated(chosen.reading, finest, why)
+        return _interpolated(chosen.reading, share, why)
     return chosen.reading, why
 
 
-def _second_round(trials: Sequence[Trial], finest: Evidence) -> list[Trial]:
-    """Those of ``trials`` that are as good as the best of them at more points. The least usual ones are not asked."""
-    finalists = sorted(trials, key=lambda trial: (trial.reading.tier, trial.mean))[:FINALISTS]
-    again = [finest.of(trial.reading) for trial in finalists]
-    best = min(again, key=lambda trial: trial.mean)
-    return [trial for trial in again if not best.is_better(trial, _FINALLY)]
+def _is_doubtful(chosen: Trial, trials: Sequence[Trial], finest: Evidence) -> bool:
+    """Whether the levels contradict what the misfit and the usual numbers chose: subtracted they do better than added,
+    or those of another function do much more."""
+    first = next(trial for trial in trials if trial.reading is chosen.reading)
+    if chosen.levels is None or not _others(trials, first):
+        return False
+    mine, best = finest.of(chosen.reading), _best(trials)
+    if mine.support < -LEAST_SUPPORT or not best.is_telling:
+        return mine.support < -LEAST_SUPPORT
+    other = finest.of(best.reading)
+    return not other.is_same(mine) and (
+        mine.support < LEAST_SUPPORT or other.support_over(mine) + other.usual_over(mine) > LEAST_SUPPORT
+    )
 
 
-def _settled(left: Sequence[Trial]) -> Trial:
-    """The one of the trials left that stands, or a refusal."""
-    usual = min(left, key=lambda trial: (trial.reading.tier, trial.mean))
-    others = [trial for trial in left if not trial.is_same(usual)]
-    if not others:
-        return usual
-    rivals = [trial for trial in others if trial.reading.tier <= usual.reading.tier]
-    scales = [trial.reading.scale for trial in left if trial.reading.scale is not None]
-    if rivals or usual.reading.tier > 0 or len(scales) < len(left) or max(scales) - min(scales) > _ACCIDENT:
-        raise _ambiguous([trial.reading for trial in (usual, *others)])
-    return usual
+def _over_other_cubes(chosen: Trial, readings: Sequence[Reading], finest: Evidence) -> list[Trial]:
+    """The same grid over other cubes, as far as its levels tell nearly as much there. Points are in other cells there,
+    so that the levels cannot be compared one by one."""
+    mine = finest.of(chosen.reading)
+    cube = chosen.reading.description.get("grid_radius")
+    others = [one for one in readings if one.is_grid_of(chosen.reading) and one.description.get("grid_radius") != cube]
+    trials = [trial for trial in map(finest.of, others) if trial.is_telling and not trial.is_same(mine)]
+    return [trial for trial in trials if mine.support - trial.support < CLEAR_SUPPORT]
 
 
-def _interpolated(reading: Reading, evidence: Evidence, why: list[str]) -> tuple[Reading, list[str]]:
+def _searched(readings: Sequence[Reading], trials: list[Trial], evidence: Evidence) -> list[Trial]:
+    """``trials``, and those of further readings: next to the best of them where it tells, else of the most usual."""
+    best, tried = _best(trials), {id(trial.reading) for trial in trials}
+    rest = [reading for reading in readings if id(reading) not in tried]
+    if not best.is_telling:
+        trials = trials + [evidence.of(reading) for reading in rest[:TRIED_MORE]]
+        best, rest = _best(trials), rest[TRIED_MORE:]
+    beside = [reading for reading in rest if _group(reading) == _group(best.reading)]
+    near = sorted(beside, key=lambda reading: abs((reading.scale or 0.0) - (best.reading.scale or 0.0)))
+    return trials + [evidence.of(reading) for reading in near[: TRIED_NEAR if best.is_telling else 0]]
+
+
+def _best(trials: Sequence[Trial]) -> Trial:
+    """The best supported one; where no levels tell, the one nearest to a distance."""
+    best = max(trials, key=lambda trial: (trial.is_telling, trial.support))
+    return best if best.is_telling else min(trials, key=lambda trial: trial.mean)
+
+
+def _group(reading: Reading) -> object:
+    grid = reading.description.get("hash") or {}
+    names = ("levels", "features_per_level", "log2_table_size", "base_resolution")
+    return (reading.description.get("use_grid"), *(grid.get(name) for name in names))
+
+
+def _proven(trials: Sequence[Trial], best: Trial, share: int) -> Trial:
+    """The best reading if it beats every other one, at more points, and those beside it, too; or a refusal."""
+    tier = min(trial.reading.tier for trial in trials if trial.reading.has_sines_of(best.reading))
+    found = _climbed(best.reading, tier, Evidence(best.reading, CLIMB_POINTS // share))
+    finest = Evidence(best.reading, FINAL_POINTS // share)
+    rivals = [trial.reading for trial in _nearest(_standing(trials, best), best, FINALISTS)]
+    rivals = [rival for rival in rivals if not any(rival.is_grid_of(reading) for reading in found)]
+    again = [finest.of(reading) for reading in (*found, *rivals)]
+    chosen = _most_supported(again, again[0])
+    beside = [finest.of(reading) for reading in readings_beside(chosen.reading, tier)]
+    standing = _nearest(_standing((*again, *beside), chosen), chosen, LAST_FINALISTS)
+    if standing:
+        last, kind = Evidence(best.reading, LAST_POINTS // share), _likelier_interpolation(chosen, finest)
+        chosen, *rest = [last.of(_compared(trial.reading, kind)) for trial in (chosen, *standing)]
+        standing = _standing(rest, chosen)
+    if not standing and chosen.support < CLEAR_SUPPORT:
+        standing = _others(trials, best)
+    if standing or not chosen.reading.is_written:
+        raise _ambiguous([trial.reading for trial in (chosen, *_usual_first(standing))])
+    return chosen
+
+
+def _climbed(reading: Reading, tier: int, evidence: Evidence) -> list[Reading]:
+    """The better supported reading to which ``reading`` leads over those beside it, and the nearest to that.
+
+    Raises AmbiguousError: there are still better ones.
+    """
+    best = evidence.of(reading)
+    tried = [best]
+    for _ in range(MAX_CLIMBS):
+        near = (*islice(readings_written_near(best.reading, tier), WRITTEN_NEAR), *readings_beside(best.reading, tier))
+        tried += [evidence.of(other) for other in near if not any(t.reading.is_grid_of(other) for t in tried)]
+        better = _most_supported(tried, best)
+        if better is best:
+            written = [trial for trial in tried if trial.reading.is_written and trial is not best]
+            return [best.reading, *(trial.reading for trial in _nearest(written, best, LAST_FINALISTS))]
+        best = better
+    raise _ambiguous([trial.reading for trial in _nearest(tried, best, LAST_FINALISTS)])
+
+
+def _most_supported(trials: Sequence[Trial], best: Trial) -> Trial:
+    """The one of ``trials`` that is most ahead of ``best``, or ``best``."""
+    return max((best, *trials), key=lambda trial: trial.support_over(best) + trial.usual_over(best))
+
+
+def _nearest(rivals: Sequence[Trial], best: Trial, most: int) -> list[Trial]:
+    """The rivals that come nearest to the ``best`` one: who is behind these is behind it, too."""
+    return sorted(rivals, key=lambda rival: best.support_over(rival) + best.usual_over(rival))[:most]
+
+
+def _standing(trials: Sequence[Trial], best: Trial) -> list[Trial]:
+    """Those of ``trials`` that are another function than the ``best`` and not beaten by it."""
+    return [trial for trial in _others(trials, best) if not best.beats(trial)]
+
+
+def _others(trials: Sequence[Trial], best: Trial) -> list[Trial]:
+    return [trial for trial in trials if not trial.is_same(best)]
+
+
+def _usual_first(trials: Sequence[Trial]) -> list[Trial]:
+    return sorted(trials, key=lambda trial: (trial.reading.tier, -trial.support))
+
+
+def _likelier_interpolation(trial: Trial, evidence: Evidence) -> Interpolation | None:
+    """The interpolation under which layouts are compared: the better supported one, unless it is known."""
+    if trial.reading.interpolation == "known":
+        return None
+    linear, smooth = (evidence.of(_with_interpolation(trial.reading, kind)) for kind in _KINDS)
+    return "linear" if linear.support_over(smooth) > 0.0 else "smoothstep"
+
+
+def _interpolated(reading: Reading, share: int, why: list[str]) -> tuple[Reading, list[str]]:
     """``reading`` with the interpolation that the evidence tells, or a refusal."""
-    kinds: tuple[Interpolation, Interpolation] = ("linear", "smoothstep")
-    linear, smooth = (evidence.of(_with_interpolation(reading, kind)) for kind in kinds)
-    if linear.is_same(smooth):
-        return reading, why
-    told = told_interpolation(linear, smooth)
-    if told is None:
-        habit = reading.description["hash"]["interpolation"]
-        asked = [_with_interpolation(reading, kind) for kind in sorted(kinds, key=lambda kind: kind != habit)]
-        # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
-        raise _ambiguous(asked, whole=True)
-    more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
-    return _with_interpolation(reading, told), [*why, more]
+    for points in (FINAL_POINTS, LAST_POINTS):
+        evidence = Evidence(reading, points // share)
+        linear, smooth = (evidence.of(_with_interpolation(reading, kind)) for kind in _KINDS)
+        if linear.is_same(smooth):
+            return reading, why
+        told = told_interpolation(linear, smooth)
+        if told is not None:
+            more = f"{told} interpolation: under it the gradient's norm does not follow the cells"
+            return _with_interpolation(reading, told), [*why, more]
+    habit = reading.description["hash"]["interpolation"]
+    asked = [_with_interpolation(reading, kind) for kind in sorted(_KINDS, key=lambda kind: kind != habit)]
+    # evidence that cannot tell the interpolation is no proof of the layout: whoever answers says both
+    raise _ambiguous(asked, whole=True)
+
+
+def _compared(reading: Reading, kind: Interpolation | None) -> Reading:
+    """``reading`` as it is compared with others: under the likelier interpolation where that is open."""
+    if kind is None:
+        return reading
+    grid = {**reading.description["hash"], "interpolation": kind}
+    return replace(reading, description={**reading.description, "hash": grid})
 
 
 def _with_interpolation(reading: Reading, kind: Interpolation) -> Reading:

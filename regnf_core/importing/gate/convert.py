@@ -1,9 +1,10 @@
 """The conversion itself, run in a throw-away process:
 ``python -m regnf_core.importing.gate.convert OUT_DIR UPLOAD [SETTINGS] [CAMERAS]``.
 
-Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "settings", "cameras"}, the last
-two the names of those files or null; standard output gets one JSON line: the report, or {"reason", "detail"} and
-perhaps "candidates". The field is written to OUT_DIR/field.safetensors, a picture beside it; of candidates too.
+Standard input holds one JSON object {"description", "limits", "parent_pid", "picture", "ask_by_picture", "settings",
+"cameras"}, the last two the names of those files or null; standard output gets one JSON line: the report, or {"reason",
+"detail"} and perhaps "candidates". The field is written to OUT_DIR/field.safetensors, a picture beside it; pictures of
+candidates too.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_core.importing.gate.reading import Companions
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.sandbox import confine
+from regnf_core.schema.color import split_color
 from regnf_core.schema.kinds.voxel_grid import WEIGHTS
 from regnf_core.schema.observation_grid import OBSERVATION
 
@@ -69,7 +71,7 @@ def convert_file(
     beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
-    from regnf_core.importing.gate.cost_estimate import require_affordable
+    from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable, with_affordable_color
     from regnf_core.importing.gate.observed import observed
     from regnf_core.importing.gate.placement import placed
     from regnf_core.schema.safe_format import add_to_source, write_safe_field
@@ -78,19 +80,21 @@ def convert_file(
     converted = read.field
     _require_text(converted.description)
     require_affordable(converted, limits)
-    converted = placed(_settled(converted), read.description)
+    settled = _settled(converted, affordable_share(converted, limits))
+    converted = placed(with_affordable_color(settled, limits), read.description)
     converted = observed(converted, read, limits, required=beside is not None and beside.cameras is not None)
     target = out_dir / FIELD_NAME
     write_safe_field(target, converted.description, converted.tensors, _ROOM)
-    parameters = sum(array.size for name, array in converted.tensors.items() if name not in _SEEN)
+    own, _ = split_color(converted.tensors)
+    parameters = sum(array.size for name, array in own.items() if name not in _SEEN)
     family, why, warnings = converted.family, converted.why, converted.warnings
     kind = str(converted.description["kind"])
     bounds, label = converted.description["bounds"], converted.description["label"]
     guessed = _Guess(None if _sign_is_said(converted, read.description) else int(converted.description["sign"]))
     sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
     del converted  # the tensors are on disk: let go of them before the evaluation
-    drawn_to = out_dir / PICTURE_NAME if picture else None
-    measured, more = _evaluated(target, up_axis, drawn_to, None if read.description.accept_implausible else guessed)
+    drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, up_axis)
+    measured, more = _evaluated(target, drawing, None if read.description.accept_implausible else guessed)
     if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     warned = list(kept_warnings(_latest([*warnings, *more])))
@@ -140,9 +144,23 @@ class _Guess:
     sign: int | None
 
 
-def _evaluated(
-    path: Path, up_axis: str | None, picture: Path | None, judged: _Guess | None
-) -> tuple[dict[str, float], list[str]]:
+@dataclass(frozen=True)
+class _Drawing:
+    """The picture that is to be left for people to look at; ``path``: where, None: nowhere."""
+
+    path: Path | None
+    up_axis: str | None
+
+    def of(self, field: SdfField) -> None:
+        """Draw it if that can be done: it is not a condition of the import."""
+        from regnf_core.importing.gate.plausibility import without_new_code
+
+        if self.path is not None:
+            with without_new_code(), contextlib.suppress(RegnfError, MemoryError):
+                _draw(field, self.up_axis, self.path)
+
+
+def _evaluated(path: Path, drawing: _Drawing, judged: _Guess | None) -> tuple[dict[str, float], list[str]]:
     """What was measured of the field in the file ``path``, and warnings; it is drawn if that is quick.
 
     judged: None takes it even if it does not behave like a signed distance. Raises FieldFormatError.
@@ -155,18 +173,15 @@ def _evaluated(
     measured, warnings = check_plausibility(field)
     if judged is not None:
         require_plausible(measured, judged.sign)
-    if picture is not None and time.process_time() - started < _QUICK_S:
-        _draw(field, up_axis, picture)
+    if time.process_time() - started < _QUICK_S:
+        drawing.of(field)
     return measured, warnings
 
 
 def _draw(field: SdfField, up_axis: str | None, path: Path) -> None:
-    """A picture, if one can be made: it is not a condition of the import."""
-    from regnf_core.importing.gate.plausibility import without_new_code
     from regnf_core.viewing.field_picture import field_picture
 
-    with contextlib.suppress(RegnfError, MemoryError), without_new_code():
-        field_picture(field, up_axis).save(path)
+    field_picture(field, up_axis).save(path)
 
 
 def _require_text(description: dict[str, Any]) -> None:
@@ -184,8 +199,8 @@ def _require_text(description: dict[str, Any]) -> None:
         raise FieldFormatError("the field's description is not Unicode text", reason="SAFE_FORMAT_INVALID") from error
 
 
-def _settled(converted: ConvertedField) -> ConvertedField:
-    """The one function that the field stands for, where its shapes leave several."""
+def _settled(converted: ConvertedField, share: int) -> ConvertedField:
+    """The one function that the field stands for, where its shapes leave several. share: see calls_of_trials."""
     if converted.open_readings:
         from regnf_core.importing.gate.network_form import settle_form  # loads torch
 
@@ -193,7 +208,7 @@ def _settled(converted: ConvertedField) -> ConvertedField:
     if converted.readings:
         from regnf_core.importing.gate.choice import choose_reading  # loads torch
 
-        converted = choose_reading(converted)
+        converted = choose_reading(converted, share)
     require_told(converted)
     return converted
 
@@ -212,13 +227,14 @@ def run(
     limits: ImportLimits,
     picture: bool = False,
     beside: Companions | None = None,
+    ask_by_picture: bool = False,
 ) -> dict[str, Any]:
     """``convert_file``'s report, or {"reason", "detail"} for every foreseen way to fail."""
     started = time.monotonic()
     try:
         return convert_file(upload, out_dir, description, limits, picture, beside)
     except AmbiguousError as error:
-        if picture:
+        if ask_by_picture:
             _draw_asked(error, out_dir, limits.wall_s - (time.monotonic() - started))
         asked = [{"name": one.name, "description": one.say} for one in error.asked]
         return {"reason": error.reason, "detail": str(error), "candidates": asked}
@@ -245,7 +261,8 @@ def main(arguments: list[str]) -> int:
     isolation = confine(limits, request["parent_pid"], opened, out_dir, threads)
     upload, *others = (Path(f"/proc/self/fd/{number}") for number in opened)
     named = {part: (request[part], others.pop(0)) for part in ("settings", "cameras") if request[part] is not None}
-    report = run(upload, out_dir, request["description"], limits, request["picture"], Companions(**named))
+    beside, said = Companions(**named), request["description"]
+    report = run(upload, out_dir, said, limits, request["picture"], beside, request["ask_by_picture"])
     report |= {"isolation": isolation, "peak_memory_bytes": _peak_memory()}
     sys.stdout.write(json.dumps(report, allow_nan=False) + "\n")
     sys.stdout.flush()

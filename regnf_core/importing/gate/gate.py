@@ -45,6 +45,7 @@ _OUT_OF_MEMORY_SIGNS = (b"MemoryError", b"DefaultCPUAllocator", b"Cannot allocat
 _MAX_DESCRIPTION = 16_384
 _MAX_NAME = 120
 _PICTURE_BYTES = 16 << 20
+"""What the import may write besides the field."""
 _log = logging.getLogger(__name__)
 
 
@@ -56,30 +57,32 @@ def import_field(
     picture: bool = False,
     settings: Path | None = None,
     cameras: Path | None = None,
+    ask_by_picture: bool = False,
 ) -> ImportReport:
     """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
     ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
-    of the field in ``out_dir``/preview.png too, and in the error one of each function that the file may stand for, if
-    they can be made in good time. settings: the trainer's own, one file or an archive of several. cameras: where those
-    stood whose images the field was made from, likewise. The upload may be an archive of a whole run; then it brings
-    its settings along.
+    of the field in ``out_dir``/preview.png too, if it can be made in good time; it implies ask_by_picture: leave in the
+    error one of each function that the file may stand for. settings: the trainer's own, one file or an archive of
+    several. cameras: where those stood whose images the field was made from, likewise.
+    The upload may be an archive of a whole run; then it brings its settings along.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
     limits = limits or ImportLimits()
-    request = _request(description, limits, picture, settings, cameras)
+    shown = {"picture": picture, "ask_by_picture": picture or ask_by_picture}
+    request = _request(description, limits, shown, settings, cameras)
     files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]
     out_dir.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     try:
-        return _import_once(files, out_dir, request, limits, started, picture)
+        return _import_once(files, out_dir, request, limits, started)
     except _KilledError:
         _log.warning("the import's process was killed from outside; it is started once more")
     try:
-        return _import_once(files, out_dir, request, limits, started, picture)
+        return _import_once(files, out_dir, request, limits, started)
     except _KilledError as error:
         raise FieldFormatError("the import needs more memory than there is", reason="IMPORT_OUT_OF_MEMORY") from error
 
@@ -89,7 +92,7 @@ class _KilledError(Exception):
 
 
 def _import_once(
-    files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float, picture: bool
+    files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float
 ) -> ImportReport:
     """One child, within what is left of the time since ``started``. Raises _KilledError, and as ``import_field``."""
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
@@ -100,7 +103,7 @@ def _import_once(
         values = _values_of(outcome, work)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
-        if picture and is_sound_picture(work / PICTURE_NAME):
+        if json.loads(request)["picture"] and is_sound_picture(work / PICTURE_NAME):
             os.replace(work / PICTURE_NAME, out_dir / PICTURE_NAME)
         return report
     finally:
@@ -110,7 +113,7 @@ def _import_once(
 def _request(
     description: dict[str, Any] | None,
     limits: ImportLimits,
-    picture: bool,
+    shown: dict[str, bool],
     settings: Path | None,
     cameras: Path | None,
 ) -> bytes:
@@ -119,7 +122,7 @@ def _request(
             "description": description,
             "limits": asdict(limits),
             "parent_pid": os.getpid(),
-            "picture": picture,
+            **shown,
             "settings": None if settings is None else settings.name[-_MAX_NAME:],
             "cameras": None if cameras is None else cameras.name[-_MAX_NAME:],
         }

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.importing.cost.calls import Calls
 from regnf_core.importing.families.converted import ConvertedField, OpenReading
@@ -66,12 +67,14 @@ class _Candidate:
 def settle_form(converted: ConvertedField) -> ConvertedField:
     """``converted`` with the one reading that behaves as a distance, and in ``why`` by which evidence.
 
-    Raises AmbiguousError: several readings that differ do, or none.
+    Raises AmbiguousError: several readings that differ do, or none. FieldFormatError (FIELD_NOT_FINITE).
     """
     readings = _affordable(converted)
     finalists = _finalists(readings)
+    if not finalists:
+        raise FieldFormatError("values and gradients are finite in none of its readings", reason="FIELD_NOT_FINITE")
     if not any(min(one.trial.misses) < _DISTANCE_LIKE for one in finalists):
-        raise _undecided(finalists or _as_candidates(readings), "none behaves like a distance")
+        raise _undecided(_as_candidates(readings), "none behaves like a distance")
     ends = any(one.open.ends_at is not None for one in finalists)
     chosen, how, *warnings = _by_end(finalists) if ends else _by_misses(finalists)
     if len(readings) < len(converted.open_readings):

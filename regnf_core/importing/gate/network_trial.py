@@ -28,7 +28,7 @@ _CONE = 0.9
 
 @dataclass(frozen=True)
 class Trial:
-    """A reading, built; ``field`` is None if it cannot be.
+    """A reading, built; ``field`` is None if it cannot be, or if its values are not finite.
 
     misses: by how much of their length steps to the surface miss it, mean, from 0 to 1: of all points, then of those
     ever nearer to the surface. Infinite where too few steps stay within the bounds.
@@ -47,11 +47,14 @@ class Trial:
 @without_new_code()
 def tried(reading: Reading, samples: int, known_to: float | None) -> Trial:
     """known_to: distances beyond which the trainer leaves values to themselves, if there are such."""
+    none = Trial(reading, None, (math.inf,) * len(_PARTS))
     field = _built(reading)
     if field is None:
-        return Trial(reading, None, (math.inf,) * len(_PARTS))
+        return none
     points = _in_bounds(field, samples)
     distance, gradient = field.signed_distance_and_gradient(points)
+    if not (torch.isfinite(distance).all() and torch.isfinite(gradient.norm(dim=-1)).all()):
+        return none
     length = gradient.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     ends = points - distance[:, None] * gradient / length
     low, high = field.bounds[0].float(), field.bounds[1].float()

@@ -18,7 +18,11 @@ def placed(converted: ConvertedField, description: UploadDescription) -> Convert
     rows = description.dataset_transform
     if rows is None:
         if description.frame == "dataset":
-            message = "description.frame: the dataset's frame is not known; give its settings, or dataset_transform"
+            message = (
+                "description.frame: the dataset's frame is not known; put the file that says it into the run's folder,"
+                " dataparser_transforms.json (nerfstudio) or the dataset's meta_data.json (sdfstudio), or give"
+                " dataset_transform"
+            )
             raise FieldFormatError(message, reason="INVALID_DESCRIPTION")
         return converted
     a, b, c = rows[0][:3]

@@ -31,6 +31,8 @@ class Geometry:
     """(F, 3) indices; F is 0 for a point cloud."""
     normals: Float64Array | None = None
     """(V, 3), where the file has one a vertex."""
+    colors: Float64Array | None = None
+    """(V, 3) in [0, 1], R, G, B, where the file has one a vertex."""
     left_out: tuple[str, ...] = ()
     """What the file holds or names that was not read, a few words each."""
 
@@ -56,6 +58,11 @@ def require_room(vertices: int, triangles: int) -> None:
         raise FieldFormatError(f"{vertices} vertices, at most {MAX_VERTICES} are taken", reason="MESH_TOO_LARGE")
     if triangles > MAX_TRIANGLES:
         raise FieldFormatError(f"{triangles} triangles, at most {MAX_TRIANGLES} are taken", reason="MESH_TOO_LARGE")
+
+
+def within_unit(colors: Float64Array, top: float = 1.0) -> Float64Array:
+    """Colors of numbers up to ``top`` as such in [0, 1]; what is no number is black."""
+    return np.nan_to_num(colors / top, nan=0.0, posinf=1.0, neginf=0.0).clip(0.0, 1.0)
 
 
 def fans(polygons: npt.NDArray[Any]) -> Int64Array:

@@ -1,4 +1,6 @@
-"""glTF 2.0, binary or text: the triangles of all nodes at their poses. Textures, skins and morphs are ignored."""
+"""glTF 2.0, binary or text: the triangles of all nodes at their poses, with their vertices' or materials' colors.
+Textures, skins and morphs are ignored.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +21,7 @@ from regnf_core.importing.meshes.geometry import (
     unsupported,
 )
 from regnf_core.importing.meshes.glb_buffers import Accessors
+from regnf_core.importing.meshes.glb_colors import joined_colors, primitive_colors
 from regnf_core.importing.meshes.glb_nodes import placed_meshes
 
 _HEADER, _CHUNK_HEADER = 12, 8
@@ -86,6 +89,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
         raise unsupported(f"the glTF file needs the extension {str(unknown[0])[:60]}: export it without compression")
     vertices: list[Float64Array] = []
     faces: list[Int64Array] = []
+    colors: list[Float64Array | None] = []
     so_far = triangles = 0
     for number, matrix in placed_meshes(document):
         for primitive in document["meshes"][number]["primitives"]:
@@ -97,6 +101,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
                 raise malformed("a glTF face names a vertex that does not exist")
             turned = np.linalg.det(matrix[:3, :3]) < 0  # a mirrored node turns its faces round
             vertices.append(places @ matrix[:3, :3].T + matrix[:3, 3])
+            colors.append(primitive_colors(document, primitive, accessors, len(places)))
             faces.append((corners[:, ::-1] if turned else corners) + so_far)
             so_far, triangles = so_far + len(places), triangles + len(corners)
             require_room(so_far, triangles)
@@ -104,6 +109,7 @@ def _scene(document: dict[str, Any], accessors: Accessors) -> Geometry:
     return Geometry(
         np.concatenate([empty, *vertices]),
         np.concatenate([empty.astype(np.int64), *faces]),
+        colors=joined_colors(colors, [len(part) for part in vertices]),
         left_out=_left_out(document),
     )
 

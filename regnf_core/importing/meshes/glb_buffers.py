@@ -21,7 +21,7 @@ from regnf_core.importing.meshes.geometry import (
 )
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MAX_ITEMS = 3 * MAX_TRIANGLES
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 

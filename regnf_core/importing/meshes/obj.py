@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import Geometry, elsewhere, malformed, require_room
+from regnf_core.importing.meshes.geometry import Float64Array, Geometry, elsewhere, malformed, require_room, within_unit
 
 _COMMANDS = (b"call", b"csh")
 _NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"surf": "free-form surfaces", b"l": "lines"}
@@ -15,6 +15,7 @@ def read_obj(data: memoryview) -> Geometry:
     MESH_EXTERNAL_REFERENCE for one that would have a command run.
     """
     vertices: list[list[float]] = []
+    colors: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []
     left_out: set[str] = set()
     for line in bytes(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
@@ -23,6 +24,7 @@ def read_obj(data: memoryview) -> Geometry:
             continue
         if words[0] == b"v":
             vertices.append(_place(words))
+            colors.extend(_color(words))
         elif words[0] == b"f":
             corners = [_index(word, len(vertices)) for word in words[1:]]
             if len(corners) < 3:
@@ -37,6 +39,7 @@ def read_obj(data: memoryview) -> Geometry:
     return Geometry(
         np.array(vertices, dtype=np.float64).reshape(-1, 3),
         np.array(triangles, dtype=np.int64).reshape(-1, 3),
+        colors=_shares(np.array(colors)) if vertices and len(colors) == len(vertices) else None,
         left_out=tuple(sorted(left_out)),
     )
 
@@ -47,6 +50,19 @@ def _place(words: list[bytes]) -> list[float]:
     except ValueError as error:
         raise malformed("an OBJ vertex is not three numbers") from error
     return [x, y, z]
+
+
+def _shares(colors: Float64Array) -> Float64Array:
+    """Colors in [0, 1]; no standard says what 1 is, and some write numbers up to 255."""
+    return within_unit(colors, 255.0 if colors.max() > 1.0 else 1.0)
+
+
+def _color(words: list[bytes]) -> list[list[float]]:
+    """The three numbers behind a vertex's place, if there are so many and they are numbers."""
+    try:
+        return [list(map(float, words[-3:]))] if len(words) in (7, 8) else []
+    except ValueError:
+        return []
 
 
 def _index(word: bytes, so_far: int) -> int:

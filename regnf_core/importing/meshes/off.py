@@ -1,4 +1,4 @@
-"""OFF (Geomview), text and binary: vertices, their normals, polygons. Colors and texture coordinates are ignored."""
+"""OFF (Geomview), text and binary: vertices, their normals and colors, polygons. Texture coordinates are ignored."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from regnf_core.importing.meshes.geometry import (
     malformed,
     require_room,
     unsupported,
+    within_unit,
 )
 
 _MAGIC = re.compile(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?:[ \t]*BINARY)?")
@@ -38,21 +39,26 @@ def read_off(data: memoryview) -> Geometry:
         line = head.find(b"\n")
         if line < 0:
             raise malformed("an OFF file that ends within its first line")
-        return _binary(data[line + 1 :], 3 + 3 * normal + 4 * color + 2 * texture, normal)
-    return _text(bytes(data[magic.end() :]), normal)
+        return _binary(data[line + 1 :], 3 + 3 * normal + 4 * color + 2 * texture, normal, color)
+    return _text(bytes(data[magic.end() :]), normal, color)
 
 
-def _text(text: bytes, normal: bool) -> Geometry:
+def _text(text: bytes, normal: bool, color: bool) -> Geometry:
     lines = _lines(text)
     vertices, faces = _counts([int(_number(word)) for word in next(lines, [])[:3]])
-    places = [_places(next(lines, []), normal) for _ in range(vertices)]
+    places, colors = [], []
+    for _ in range(vertices):
+        words = next(lines, [])
+        places.append(_places(words, normal))
+        colors.extend(_color(words[6 if normal else 3 :]) if color else [])
     triangles: list[tuple[int, int, int]] = []
     for _ in range(faces):
         corners = _corners(next(lines, []))
         triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
         require_room(vertices, len(triangles))
     table = np.array(places, dtype=np.float64).reshape(vertices, 6 if normal else 3)
-    return _geometry(table, np.array(triangles, dtype=np.int64).reshape(-1, 3), normal)
+    painted = np.array(colors) if colors and len(colors) == vertices else None
+    return _geometry(table, np.array(triangles, dtype=np.int64).reshape(-1, 3), normal, painted)
 
 
 def _lines(text: bytes) -> Iterator[list[bytes]]:
@@ -94,7 +100,17 @@ def _number(word: bytes) -> float:
     return number
 
 
-def _binary(data: memoryview, columns: int, normal: bool) -> Geometry:
+def _color(words: list[bytes]) -> list[list[float]]:
+    """The first three numbers, if there are so many; whole ones are shares of 255."""
+    try:
+        numbers = [float(word) for word in words[:3]]
+    except ValueError:
+        return []
+    top = 1.0 if any(b"." in word for word in words[:3]) else 255.0
+    return [[number / top for number in numbers]] if len(numbers) == 3 else []
+
+
+def _binary(data: memoryview, columns: int, normal: bool, color: bool) -> Geometry:
     if len(data) < 12:
         raise malformed("an OFF file without the numbers of its vertices and faces")
     vertices, faces = _counts(np.frombuffer(data[:12], ">i4").tolist())
@@ -102,7 +118,10 @@ def _binary(data: memoryview, columns: int, normal: bool) -> Geometry:
     if 12 + size > len(data):
         raise malformed("the OFF file ends within its vertices")
     table = np.frombuffer(data[12 : 12 + size], ">f4").reshape(vertices, columns).astype(np.float64)
-    return _geometry(table, _binary_faces(data[12 + size :], faces), normal)
+    start = 6 if normal else 3
+    return _geometry(
+        table, _binary_faces(data[12 + size :], faces), normal, table[:, start : start + 3] if color else None
+    )
 
 
 def _binary_faces(data: memoryview, faces: int) -> Int64Array:
@@ -126,5 +145,6 @@ def _binary_faces(data: memoryview, faces: int) -> Int64Array:
     return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
 
 
-def _geometry(table: Float64Array, triangles: Int64Array, normal: bool) -> Geometry:
-    return Geometry(table[:, :3], triangles, table[:, 3:6] if normal else None)
+def _geometry(table: Float64Array, triangles: Int64Array, normal: bool, colors: Float64Array | None) -> Geometry:
+    painted = None if colors is None else within_unit(colors)
+    return Geometry(table[:, :3], triangles, table[:, 3:6] if normal else None, painted)

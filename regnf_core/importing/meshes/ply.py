@@ -7,11 +7,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed, require_room, strips
+from regnf_core.importing.meshes.geometry import (
+    Float64Array,
+    Geometry,
+    Int64Array,
+    malformed,
+    require_room,
+    strips,
+    within_unit,
+)
 from regnf_core.importing.meshes.ply_body import BinaryBody, TextBody
 from regnf_core.importing.meshes.ply_header import Element, read_ply_header
 
 _INDEX_NAMES = ("vertex_indices", "vertex_index")
+_COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _MAX_ROWS = 50_000_000
 
 
@@ -23,7 +32,7 @@ def read_ply(data: memoryview) -> Geometry:
     header = read_ply_header(data)
     rest = data[header.size :]
     body = TextBody(rest) if header.byte_order is None else BinaryBody(rest, header.byte_order)
-    vertices, normals = np.zeros((0, 3)), None
+    vertices, normals, colors = np.zeros((0, 3)), None, None
     faces = np.zeros((0, 3), np.int64)
     left_out: list[str] = []
     for element in header.elements:
@@ -33,6 +42,7 @@ def read_ply(data: memoryview) -> Geometry:
             vertices = _columns(table, ("x", "y", "z"))
             if {"nx", "ny", "nz"} <= table.keys():
                 normals = _columns(table, ("nx", "ny", "nz"))
+            colors = _colors(table, element)
         elif element.name == "face":
             require_room(0, element.count)
             faces = np.concatenate([faces, body.triangles(element, _index_property(element))])
@@ -44,7 +54,18 @@ def read_ply(data: memoryview) -> Geometry:
         else:
             body.skip(element)
             left_out.append(f"elements {element.name[:40]}")
-    return Geometry(vertices, faces, normals, tuple(left_out))
+    return Geometry(vertices, faces, normals, colors, tuple(left_out))
+
+
+def _colors(table: dict[str, Float64Array], element: Element) -> Float64Array | None:
+    """Of the vertices, in [0, 1]: whole numbers are shares of the largest of their type."""
+    types = {p.name: p.type for p in element.properties}
+    for names in _COLOR_NAMES:
+        kinds = {types.get(name) for name in names}
+        if len(kinds) == 1 and None not in kinds:
+            kind = np.dtype(kinds.pop())
+            return within_unit(_columns(table, names), 1.0 if kind.kind == "f" else float(np.iinfo(kind).max))
+    return None
 
 
 def _strip(order: npt.NDArray[Any]) -> Int64Array:

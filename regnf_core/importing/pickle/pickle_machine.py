@@ -40,7 +40,14 @@ class PickleMachine:
         """Spend ``work`` of the opcode budget."""
         self.budget -= work
         if self.budget < 0:
-            raise pickle_error("the pickle asks for too much work", "PICKLE_TOO_COMPLEX")
+            raise pickle_error(f"the pickle asks for too much work{self._held()}", "PICKLE_TOO_COMPLEX")
+
+    def _held(self) -> str:
+        """What object the pickle is about, for whoever does not know why so large a file is refused."""
+        named = next((value.full_name for value in self.stack if isinstance(value, Placeholder)), None)
+        return (
+            "" if named is None else f"; it holds an object of {named[:120]}: save plain tensors, or give a mesh of it"
+        )
 
     def finish(self) -> Any:
         """The one value on the stack."""

@@ -31,6 +31,11 @@ class Run:
     checkpoint: Path
     settings: tuple[Path, ...]
 
+    def joined_by(self, file: Path) -> Run:
+        """With a file of the dataset, in place of the one of that name."""
+        others = (path for path in self.settings if path.name != file.name)
+        return Run(self.checkpoint, (*others, file.resolve(strict=True)))
+
 
 def find_run(folder: Path) -> Run:
     """The run in ``folder``. Raises FieldFormatError: RUN_WITHOUT_CHECKPOINT, AMBIGUOUS_RUN, RUN_TOO_LARGE."""

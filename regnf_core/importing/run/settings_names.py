@@ -29,7 +29,7 @@ RUN_FILES = (
     "cameras_sphere.npz",
 )
 """Below one of the folders from the checkpoint's own upwards."""
-_DATA_FILES = ("dataparser_transforms.json", "meta_data.json", "transforms.json", "cameras_sphere.npz")
+DATA_FILES = ("dataparser_transforms.json", "meta_data.json", "transforms.json", "cameras_sphere.npz")
 """What trainers keep beside the images: taken from anywhere in the run where there is one of the name."""
 MAX_FILES = 32
 
@@ -45,7 +45,7 @@ def choose_settings(names: Collection[str], checkpoint: str) -> tuple[str, ...]:
                 path = PurePosixPath(name)
                 if path.is_relative_to(folder) and _matches(path.relative_to(folder), pattern):
                     chosen.setdefault(_role(path), name)
-    for wanted in _DATA_FILES:
+    for wanted in DATA_FILES:
         found = [name for name in known if PurePosixPath(name).name == wanted]
         if len(found) == 1:
             chosen.setdefault(wanted, found[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +11,7 @@ from regnf_core.importing.families.shared import contradiction
 from regnf_core.importing.settings.documents import Documents
 from regnf_core.importing.settings.facts import Facts
 from regnf_core.importing.settings.keys import Keys
+from regnf_core.importing.upload_description import UploadDescription
 
 
 @dataclass
@@ -21,7 +22,7 @@ class Said:
     facts: Facts
     documents: Documents
     values: dict[str, Any] = field(default_factory=dict)
-    """Entries of an UploadDescription; those of ``hash`` and ``positional_encoding`` with a dot: ``hash.levels``."""
+    """Entries of an UploadDescription; those of its parts with a dot: ``hash.levels``."""
     used: dict[str, list[str]] = field(default_factory=dict)
     """Of each file the keys that counted, as "key value"."""
     warnings: list[str] = field(default_factory=list)
@@ -53,6 +54,25 @@ class Said:
         if said != (found if isinstance(found, int) else list(found)):
             raise contradiction(f"{keys.file}: {keys.at}{key}", said, found)
         self.note(keys, key)
+
+    def about_color(self, translate: Callable[[], None]) -> None:
+        """Run ``translate``; what is malformed about a color leaves the color out, with a warning."""
+        try:
+            translate()
+            said = {name.removeprefix("color."): value for name, value in self.values.items() if "color." in name}
+            UploadDescription.from_dict({"color": said})
+        except FieldFormatError as error:
+            for name in [name for name in self.values if name.startswith("color.")]:
+                del self.values[name]
+            self.values["color.keep"] = False
+            self.warnings.append(f"COLOR_LEFT_OUT: {error}")
+
+    def without_color(self, keys: Keys, names: Sequence[str]) -> None:
+        """Leave the color out, with a warning, if there are ``names``: settings that make it one that is not known."""
+        if names:
+            told = ", ".join(f"{name} {str(keys.find(name))[:40]}" for name in names)
+            self.values["color.keep"] = False
+            self.warnings.append(f"COLOR_LEFT_OUT: {keys.file}: {told} is not supported; the geometry is kept")
 
     def refuse(self, keys: Keys, key: str) -> None:
         """Raise FieldFormatError (FAMILY_NOT_SUPPORTED): the value of ``key`` makes another function of the field."""

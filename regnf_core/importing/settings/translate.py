@@ -17,6 +17,7 @@ from regnf_core.importing.settings.latent_codes import latent_code
 from regnf_core.importing.settings.plain import malformed
 from regnf_core.importing.settings.said import Said
 from regnf_core.importing.settings.trainers import (
+    co_slam,
     deepsdf,
     fusion,
     implicit_network,
@@ -31,6 +32,8 @@ from regnf_core.importing.settings.trainers import (
 from regnf_core.importing.upload_description import UploadDescription
 
 _MAX_WHY = 400
+_PARTS = ("hash", "positional_encoding", "color")
+"""Entries of a description that have entries of their own, which settings say."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ TRAINERS = (
     Trainer(lambda _: "DeepSDF", deepsdf),
     Trainer(lambda _: "PIN-SLAM", pin_slam),
     Trainer(lambda _: "iSDF", isdf),
+    Trainer(lambda _: "Co-SLAM", co_slam),
     Trainer(lambda _: "a network of sines", sines),
     Trainer(lambda _: "a map of truncated distances", fusion),
 )
@@ -128,13 +132,13 @@ def _settings(said: Said) -> Settings:
 
 def merged(said: dict[str, Any], by_settings: dict[str, Any]) -> dict[str, Any]:
     """A description of both; what the caller ``said`` goes before, and takes with it what would contradict it."""
-    below = {name: value for name, value in by_settings.items() if name not in ("hash", "positional_encoding")}
+    below = {name: value for name, value in by_settings.items() if name not in _PARTS}
     result = {**below, **{name: value for name, value in said.items() if value is not None}}
     if said.get("latent_index") is not None and said.get("latent") is None and "latent" in result:
         del result["latent_index"]  # the settings' code is the one of this index
     if "bounds" in by_settings and said.get("bounds") is None and said.get("world_scale") is not None:
         result["bounds"] = [[said["world_scale"] * value for value in corner] for corner in by_settings["bounds"]]
-    for part in ("hash", "positional_encoding"):
+    for part in _PARTS:
         own = said.get(part) or {}
         theirs = dict(by_settings.get(part, {}))
         for one, other in (("top_resolution", "per_level_scale"), ("per_level_scale", "top_resolution")):

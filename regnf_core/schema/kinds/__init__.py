@@ -8,6 +8,7 @@ from __future__ import annotations
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.kinds.feature_volumes import FeatureVolumesDescription
 from regnf_core.schema.kinds.grid_mlp import GridMlpDescription
+from regnf_core.schema.kinds.grid_network import GridNetworkDescription
 from regnf_core.schema.kinds.mesh import MeshDescription
 from regnf_core.schema.kinds.mlp import MlpDescription
 from regnf_core.schema.kinds.neural_points import NeuralPointsDescription
@@ -23,6 +24,7 @@ KINDS: dict[str, type[FieldDescription]] = {
     "onnx": OnnxDescription,
     "neural_points": NeuralPointsDescription,
     "grid_mlp": GridMlpDescription,
+    "grid_network": GridNetworkDescription,
     "feature_volumes": FeatureVolumesDescription,
     "voxel_grid": VoxelGridDescription,
     "voxel_blocks": VoxelBlocksDescription,

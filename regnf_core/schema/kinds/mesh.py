@@ -20,6 +20,10 @@ class MeshDescription(FieldDescription):
     inside_above: Annotated[float, Ge(-1), Le(1)] = 0.5
     """Matter is where the generalized winding number exceeds this."""
 
+    def node_shape(self, tensors: Mapping[str, TensorSpec]) -> tuple[int, ...]:
+        """(V,)"""
+        return tensors["vertices"].shape[:1]
+
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"vertices", "faces"}, integers={"faces"})

@@ -43,6 +43,10 @@ class MlpDescription(FieldDescription):
         """Columns of the network's first layer: position, sines and cosines."""
         return 3 + (self.positional_encoding.width if self.positional_encoding is not None else 0)
 
+    def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int:
+        """Columns of the last layer."""
+        return tensors[f"layers.{count_layers(tensors) - 1}.weight"].shape[1]
+
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)

@@ -43,6 +43,10 @@ class NeusFactoDescription(FieldDescription):
         encodings = (self.positional_encoding, self.hash)
         return 3 + sum(encoding.width for encoding in encodings if encoding is not None)
 
+    def hidden_width(self, tensors: Mapping[str, TensorSpec]) -> int:
+        """Columns of the last layer."""
+        return tensors[f"layers.{count_layers(tensors) - 1}.weight"].shape[1]
+
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         layers = count_layers(tensors)

@@ -21,6 +21,10 @@ class VoxelBlocksDescription(FieldDescription):
     voxel_size: Length
     """From node to node."""
 
+    def node_shape(self, tensors: Mapping[str, TensorSpec]) -> tuple[int, ...]:
+        """(B, R, R, R)"""
+        return tensors["values"].shape
+
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"values", "blocks"} | (tensors.keys() & {WEIGHTS}), integers={"blocks"})

@@ -28,6 +28,10 @@ class VoxelGridDescription(FieldDescription):
     spacing: tuple[Length, Length, Length]
     """From node to node along x, y and z."""
 
+    def node_shape(self, tensors: Mapping[str, TensorSpec]) -> tuple[int, ...]:
+        """(X, Y, Z)"""
+        return tensors["values"].shape
+
     def check_tensors(self, tensors: Mapping[str, TensorSpec]) -> None:
         """Raise FieldFormatError (FIELD_SHAPES_MISMATCH), naming the first tensor that is not as described."""
         require_names(tensors, {"values"} | (tensors.keys() & {WEIGHTS}))

@@ -83,7 +83,18 @@ def field_state(log2_size: int, hidden: int, radius: float) -> dict[str, Tensor]
         state[f"glin{layer}.weight_v"] = weight
     state["laplace_density.beta"] = torch.tensor([0.1])
     state["deviation_network.variance"] = torch.tensor([0.3])
-    state["clin0.weight_v"] = torch.zeros(8, 8)
+    return state | color_state(generator, hidden)
+
+
+def color_state(generator: torch.Generator, features: int, width: int = 8, images: int = 5) -> dict[str, Tensor]:
+    """The color network's tensors: position, direction, gradient, features, appearance -> width -> R, G, B."""
+    columns = 3 + 27 + 3 + features + 32
+    state = {"embedding_appearance.embedding.weight": torch.randn(images, 32, generator=generator)}
+    for layer, (rows, wide) in enumerate([(width, columns), (3, width)]):
+        weight = torch.randn(rows, wide, generator=generator) / math.sqrt(wide)
+        state[f"clin{layer}.bias"] = torch.zeros(rows)
+        state[f"clin{layer}.weight_g"] = weight.norm(dim=1, keepdim=True)
+        state[f"clin{layer}.weight_v"] = weight
     return state
 
 

@@ -16,7 +16,7 @@ HABITS = GridHabits((2, 4, 8), "smoothstep")
 
 def find(parameters: int, width: int, **overrides: Any) -> list[WrittenGrid]:
     spaces = find_spaces(parameters, width, HABITS, GridDescription(**overrides))
-    return sorted((entry for space in spaces for entry in space.written()), key=lambda entry: entry.tier)
+    return sorted((entry for space in spaces for entry in space.written), key=lambda entry: entry.tier)
 
 
 def most_usual(parameters: int, width: int, **overrides: Any) -> HashGridConfig:

@@ -79,6 +79,7 @@ def test_a_network_that_began_as_a_sphere_has_softplus(seed: int, tmp_path: Path
     made = Trained(True, softplus, seed)
     report = convert_file(made.save(tmp_path), tmp_path, {"hash": GRID}, ImportLimits())
     assert any("softplus" in why and "one sign" in why for why in report["why"])
+    assert any(warning.startswith("ACTIVATION_ASSUMED") for warning in report["warnings"])
     made.assert_is(tmp_path)
 
 
@@ -96,7 +97,7 @@ def test_any_other_network_is_asked_about(seed: int, tmp_path: Path) -> None:
 
 def test_both_are_drawn_for_whoever_is_asked(tmp_path: Path) -> None:
     made = Trained(False, softplus, 1)
-    refused = run(made.save(tmp_path), tmp_path, {"hash": GRID}, ImportLimits(), picture=True)
+    refused = run(made.save(tmp_path), tmp_path, {"hash": GRID}, ImportLimits(), ask_by_picture=True)
     assert [one["description"] for one in refused["candidates"]] == [{"activation": "softplus"}, {"activation": "relu"}]
     assert all(json.dumps(one["description"]) in refused["detail"] for one in refused["candidates"])
     assert all((tmp_path / candidate_name(number)).exists() for number in (1, 2))

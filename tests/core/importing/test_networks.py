@@ -43,6 +43,14 @@ def test_a_random_network_without_settings_is_never_guessed_at(family: str, tmp_
     assert any(name in found.detail for name in case.said)
 
 
+def test_a_network_that_is_finite_in_no_form_is_not_asked_about(tmp_path: Path) -> None:
+    state = {"a.weight": torch.full((6, 3), 3e38), "a.bias": torch.zeros(6), "b.weight": torch.full((1, 6), 3e38)}
+    torch.save(state | {"b.bias": torch.zeros(1)}, tmp_path / "upload")
+    with pytest.raises(FieldFormatError) as caught:
+        convert_file(tmp_path / "upload", tmp_path, {"output_tanh": 0}, ImportLimits())
+    assert caught.value.reason == "FIELD_NOT_FINITE"
+
+
 def test_a_network_that_is_a_distance_tells_its_form(tmp_path: Path) -> None:
     """Two neurons a coordinate make |x| + |y| + |z|: the gradient has length sqrt 3, unless it is divided by that."""
     first = torch.cat((torch.eye(3), -torch.eye(3)))

@@ -56,7 +56,7 @@ def test_a_model_whose_few_numbers_are_all_constants_goes_through_the_gate(tmp_p
     report = import_field(saved(tmp_path, sphere().SerializeToString()), tmp_path / "out")
     assert (report.family, report.parameters) == ("onnx", 0)
     again = convert(tmp_path / "out" / "field.safetensors", tmp_path / "again")
-    assert again["plausibility"] == report.plausibility
+    assert again["plausibility"] == pytest.approx(report.plausibility, abs=1e-6)  # processes may round differently
 
 
 @pytest.mark.parametrize("exporter", ["of today", "of before"])

@@ -12,6 +12,7 @@ import torch
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
+from regnf_core.fields.color import has_color
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.gate.report import ImportLimits
@@ -19,7 +20,25 @@ from tests.devdata import dev_data
 
 CHECKPOINTS = {".ckpt", ".pth", ".pt"}
 ANGELO_GRID = {"hash": {"base_resolution": 16, "top_resolution": 512, "features_per_level": 8}}
-WARNED = {"neus": ["SCALE_ASSUMED"]}
+COLORS = {
+    "sdfstudio_neus_facto": "rgb_uncontracted.npy",
+    "sdfstudio_neus": "rgb_uncontracted.npy",
+    "sdfstudio_neus_facto_angelo": "rgb_uncontracted_autograd_gradient.npy",
+    "nerfstudio_neus_facto": "rgb.npy",
+    "neus": "rgb.npy",
+    "instant_nsr_pl": "rgb.npy",
+}
+"""The values of the colors, of points that are not contracted. angelo's own gradient is of differences, with noise."""
+WARNED = {
+    "neus": ["SCALE_ASSUMED"],
+    "instant_nsr_pl": ["ACTIVATION_ASSUMED"],
+    "sdfstudio_neus_facto": ["COLOR_ASSUMED"],
+    "sdfstudio_neus": ["COLOR_ASSUMED"],
+    "sdfstudio_neus_facto_angelo": ["COLOR_ASSUMED"],
+    "nerfstudio_neus_facto": ["COLOR_ASSUMED"],
+    "neuralangelo": ["COLOR_LEFT_OUT"],
+}
+"""Their appearance is not in the file alone, and neuralangelo's color is not read."""
 _opened: list[str] = []
 _watching = False
 
@@ -43,11 +62,23 @@ def assert_reproduces(field_file: Path, folder: Path) -> None:
     np.testing.assert_allclose(gradient.numpy(), np.load(folder / "gradient.npy"), rtol=0, atol=1e-3)
 
 
+def assert_reproduces_color(field_file: Path, folder: Path, values: str) -> None:
+    """Colors within 5e-6 of those in the file ``values``, clamped as a color is; the inverse deviation to 1e-6."""
+    field = open_field(field_file)
+    assert has_color(field)
+    points, directions = (torch.from_numpy(np.load(folder / f"{name}.npy")) for name in ("points", "directions"))
+    expected = np.load(folder / values).clip(0.0, 1.0)
+    if folder.name == "neus":  # its trainer's images are B, G, R
+        expected = expected[:, ::-1]
+    np.testing.assert_allclose(field.color(points, directions).numpy(), expected, rtol=0, atol=5e-6)
+    assert field.inverse_deviation == pytest.approx(float(np.load(folder / "inv_s.npy")[0]), rel=1e-6)
+
+
 def test_sdfstudio_through_the_gate(tmp_path: Path) -> None:
     folder = dev_data("formats", "sdfstudio_neus_facto")
     report = import_field(only_file(folder, {".ckpt"}), tmp_path)
     assert report.family == "sdfstudio_neus_facto"
-    assert report.warnings == ()
+    assert [warning.partition(":")[0] for warning in report.warnings] == ["COLOR_ASSUMED"]
     assert report.plausibility["gradient_median"] == pytest.approx(1.0, abs=0.02)
     assert_reproduces(tmp_path / FIELD_NAME, folder)
 
@@ -75,6 +106,16 @@ def test_every_variant_is_recognized_and_reproduced(
     assert [warning.partition(":")[0] for warning in report["warnings"]] == WARNED.get(family, [])
     assert report["plausibility"]["gradient_median"] == pytest.approx(1.0, abs=0.02)
     assert_reproduces(tmp_path / FIELD_NAME, folder)
+    if family in COLORS:
+        assert_reproduces_color(tmp_path / FIELD_NAME, folder, COLORS[family])
+
+
+@pytest.mark.parametrize("family", ["sdfstudio_neus_facto", "nerfstudio_neus_facto"])
+def test_the_mean_appearance_may_be_asked_for(tmp_path: Path, family: str) -> None:
+    folder = dev_data("formats", family)
+    said = {"color": {"average_appearance": True}} | ({"contraction": "linf"} if family.startswith("sdf") else {})
+    convert_file(only_file(folder, {".ckpt"}), tmp_path, said, ImportLimits())
+    assert_reproduces_color(tmp_path / FIELD_NAME, folder, "rgb_average_appearance.npy")
 
 
 def test_the_contraction_may_be_asked_for(tmp_path: Path) -> None:
@@ -83,6 +124,7 @@ def test_the_contraction_may_be_asked_for(tmp_path: Path) -> None:
     distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(np.load(folder / "points.npy")))
     expected = np.load(folder / "sdf_contracted.npy").reshape(-1)
     np.testing.assert_allclose(distance.numpy(), expected, rtol=0, atol=1e-5 * np.ptp(expected))
+    assert_reproduces_color(tmp_path / FIELD_NAME, folder, "rgb.npy")
 
 
 def test_the_trainers_configuration_is_never_opened(tmp_path: Path) -> None:

@@ -36,14 +36,16 @@ def changed(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     return values
 
 
-def test_only_the_distance_is_kept() -> None:
+def test_only_the_distance_and_its_color_are_kept() -> None:
     values = checkpoint(log2_size=14)
     converted = convert(values)
     names = {f"layers.{i}.{part}" for i in range(3) for part in ("weight", "bias")}
-    assert set(converted.tensors) == {"hash_table", *names}
+    colors = {f"color.layers.{i}.{part}" for i in range(2) for part in ("weight", "bias")}
+    assert set(converted.tensors) == {"hash_table", *names, *colors}
+    assert set(convert(values, color={"keep": False}).tensors) == {"hash_table", *names}
     assert converted.tensors["layers.2.weight"].shape == (1, 64)
     assert converted.family == "sdfstudio_neus_facto"
-    assert converted.warnings == ()
+    assert [warning.partition(":")[0] for warning in converted.warnings] == ["COLOR_ASSUMED"]
     table = values["pipeline"][F + "encoding.params"].numpy().reshape(-1, 2)
     np.testing.assert_array_equal(converted.tensors["hash_table"], table)
 
@@ -158,7 +160,7 @@ def test_bounds_come_from_the_aabb_or_are_assumed_aloud() -> None:
     assert converted.description["bounds"] == box.tolist()
     assumed = convert(changed(lambda pipeline: pipeline.pop(F + "aabb")))
     assert assumed.description["bounds"] == [[-1.0] * 3, [1.0] * 3]
-    assert [w.split(":")[0] for w in assumed.warnings] == ["BOUNDS_ASSUMED"]
+    assert [w.split(":")[0] for w in assumed.warnings] == ["BOUNDS_ASSUMED", "COLOR_ASSUMED"]
     empty = changed(lambda pipeline: pipeline.update({F + "aabb": box.flip(0)}))
     assert_refused(lambda: convert(empty), "BOUNDS_INVALID")
 

@@ -18,14 +18,14 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "nerfacto, distributed": ({"pipeline": {"module._model.field.mlp_base.0.weight": ONE}}, "nerfacto"),
     "splatfacto": ({"pipeline": {"_model.gauss_params.means": ONE}}, "Gaussians"),
     "SHINE-Mapping": ({"iters": 9, "feature_octree": {"a": ONE}, "geo_decoder": {"lout.weight": ONE}}, "SHINE"),
-    "Co-SLAM": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.0.weight": ONE}}, "Co-SLAM"),
+    "Co-SLAM, fused": ({"pose": {}, "model": {"embed_fn.params": ONE, "decoder.sdf_net.model.params": ONE}}, "Co-SLAM"),
     "NICE-SLAM": ({"c": {"grid_fine": ONE}, "decoder_state_dict": {"a": ONE}}, "NICE-SLAM"),
     "NeRF": ({"global_step": 1, "network_fn_state_dict": {"pts_linears.0.weight": ONE}}, "NeRF"),
     "torch-ngp's radiance field": ({"model": {"encoder.embeddings": ONE, "sigma_net.0.weight": ONE}}, "torch-ngp"),
-    "MonoSDF with a grid": (
+    "MonoSDF with another grid": (
         {
             "model_state_dict": {
-                "module.implicit_network.encoding.embeddings": ONE,
+                "module.implicit_network.encoding.params": ONE,
                 "module.implicit_network.lin0.weight_v": ONE,
             }
         },

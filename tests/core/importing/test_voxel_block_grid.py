@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 from regnf_core.fields.build import open_field
+from regnf_core.fields.color import has_color
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 from tests.core.fields.grids import slow_trilinear
@@ -254,3 +255,23 @@ def test_the_reference_file_is_reproduced(tmp_path: Path) -> None:
     at_voxels = field.signed_distance(torch.from_numpy(np.load(folder / "voxel_points.npy"))).numpy()
     stored = np.load(folder / "voxel_sdf.npy").reshape(-1)
     np.testing.assert_allclose(at_voxels[seen], stored[seen], rtol=0, atol=1e-5 * np.ptp(expected))
+
+
+def test_colors_are_kept(tmp_path: Path) -> None:
+    """Of what was seen, shares of 255; all black means that no colors were given."""
+    rng = np.random.default_rng(2)
+    shape = ball()["value_002"].shape
+    paint = rng.integers(1, 256, shape).astype(np.uint16)  # as Open3D stores them, or as floats
+    report = converted(tmp_path, ball(value_002=paint))
+    assert not [warning for warning in report["warnings"] if warning.startswith("COLOR")]
+    field = open_field(tmp_path / FIELD_NAME)
+    assert has_color(field)
+    arrays = ball()
+    seen = np.argwhere(arrays["value_001"][..., 0] > 0)[::97]
+    block, z, y, x = seen.T
+    points = SIZE * (EDGE * arrays["key"][block] + np.stack((x, y, z), axis=-1))
+    found = field.color(torch.from_numpy(points + 1e-7), torch.zeros(len(points), 3)).numpy()
+    np.testing.assert_allclose(found, paint[block, z, y, x] / 255.0, rtol=0, atol=2e-3)
+    (tmp_path / "black").mkdir()
+    converted(tmp_path / "black", ball())
+    assert not has_color(open_field(tmp_path / "black" / FIELD_NAME))

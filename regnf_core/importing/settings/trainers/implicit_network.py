@@ -6,6 +6,7 @@ from regnf_core.importing.families.shared import contradiction
 from regnf_core.importing.settings.documents import Documents, mappings
 from regnf_core.importing.settings.keys import Keys
 from regnf_core.importing.settings.said import Said
+from regnf_core.importing.settings.trainers.monosdf_grid import grid_of_monosdf
 from regnf_core.importing.settings.trainers.skips import agree_on_skips
 
 _NETWORK = "model.implicit_network"
@@ -22,11 +23,11 @@ def translate(keys: Keys, said: Said) -> None:
     network = keys.below(_NETWORK)
     if network.whole("d_in") not in (None, 3):
         said.refuse(network, "d_in")
-    if network.flag("use_grid_feature"):
-        said.refuse(network, "use_grid_feature")
     said.put("positional_encoding.degree", network.whole("multires"), network, "multires")
     if network.flag("inside_outside"):  # begun as a room: positive in the free space that it encloses
         said.put("sign", 1, network, "inside_outside")
+    if network.has("use_grid_feature") or keys.flag("model.Grid_MLP"):
+        grid_of_monosdf(network, said)
     dims, prefix = network.wholes("dims"), "implicit_network.lin"
     layers = said.facts.count(prefix, ".bias")
     if dims is not None and layers:

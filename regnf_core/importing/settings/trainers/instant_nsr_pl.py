@@ -12,6 +12,9 @@ from regnf_core.importing.settings.said import Said
 _GEOMETRY = "model.geometry"
 _ENCODING = f"{_GEOMETRY}.xyz_encoding_config"
 _NETWORK = f"{_GEOMETRY}.mlp_network_config"
+_TEXTURE = "model.texture"
+_COLORS = {"volume-radiance": None, "volume-color": "features"}
+"""What the color's kinds see besides the usual."""
 _PROGRESSIVE = "ProgressiveBandHashGrid"
 _ACTIVATION = re.compile(r"(mul|scale|clamp|[+-])?(.*)")
 
@@ -26,6 +29,7 @@ def translate(keys: Keys, said: Said) -> None:
     said.put("family", "instant_nsr_pl", keys, "model.name")
     _grid(keys.below(_ENCODING), said)
     _network(keys.below(_NETWORK), keys.below(_GEOMETRY), said)
+    said.about_color(lambda: _color(keys.below(_TEXTURE), said))
     _radius(keys, said)
 
 
@@ -88,6 +92,28 @@ def _output(geometry: Keys, said: Said) -> None:
         said.put("output_scale", factor, geometry, "sdf_activation")
     if bias:
         said.put("output_bias", bias, geometry, "sdf_bias")
+
+
+def _color(texture: Keys, said: Said) -> None:
+    """Nothing of it makes the geometry another one: a color of a form that is not known is left out."""
+    direction, network = texture.below("dir_encoding_config"), texture.below("mlp_network_config")
+    if not isinstance(texture.find(""), dict):
+        return
+    usual = {
+        "name": (*_COLORS, None),
+        "color_activation": ("sigmoid", None),
+        "dir_encoding_config.otype": ("SphericalHarmonics", None),
+        "mlp_network_config.otype": ("FullyFusedMLP", "VanillaMLP", None),
+        "mlp_network_config.output_activation": ("none", "None", None),
+        "mlp_network_config.activation": ("ReLU", None),
+    }
+    said.without_color(texture, [key for key, known in usual.items() if texture.text(key) not in known])
+    if (inputs := _COLORS.get(texture.text("name") or "")) is not None:
+        said.put("color.inputs", inputs, texture, "name")
+    else:
+        said.put("color.direction_degree", direction.whole("degree"), direction, "degree")
+    if network.text("otype") == "FullyFusedMLP":
+        said.put("color.hidden_width", network.whole("n_neurons"), network, "n_neurons")
 
 
 def _radius(keys: Keys, said: Said) -> None:

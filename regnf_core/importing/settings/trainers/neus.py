@@ -9,6 +9,8 @@ from regnf_core.importing.settings.similarity import is_similarity
 from regnf_core.importing.settings.trainers.skips import agree_on_skips
 
 _NETWORK = "model.sdf_network"
+_COLOR = "model.rendering_network"
+_MODES = {"idr": "all", "no_view_dir": "no_direction", "no_normal": "no_gradient"}
 
 
 def main_file(documents: Documents) -> Keys | None:
@@ -33,7 +35,20 @@ def translate(keys: Keys, said: Said) -> None:
     first = said.facts.shape("sdf_network_fine.lin0.bias")
     said.agree(network, "d_hidden", first[0] if first else None)
     agree_on_skips(network, "skip_in", "sdf_network_fine.lin", said)
+    said.about_color(lambda: _color(keys.below(_COLOR), said))
     frame = optional_arrays(said.documents, "scale_mat_0")
     if frame is not None and is_similarity(frame[1]):
         said.values["dataset_transform"] = frame[1]
         said.used.setdefault(frame[0], []).append("scale_mat_0")
+
+
+def _color(network: Keys, said: Said) -> None:
+    """Nothing of it makes the geometry another one."""
+    mode, squeezed = network.text("mode"), network.flag("squeeze_out")
+    if mode is not None and mode not in _MODES:
+        said.without_color(network, ["mode"])
+    elif mode is not None:
+        said.put("color.inputs", _MODES[mode], network, "mode")
+    said.put("color.direction_degree", network.whole("multires_view"), network, "multires_view")
+    if squeezed is not None:
+        said.put("color.output", "sigmoid" if squeezed else "linear", network, "squeeze_out")

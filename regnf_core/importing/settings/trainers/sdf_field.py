@@ -12,6 +12,8 @@ _FIELD = "pipeline.model.sdf_field"
 _PREFIX = "glin"
 _DEGREE = 6
 _STEPS_A_LEVEL = 10_000
+_OTHER_COLORS = ("use_diffuse_color", "use_specular_tint", "use_reflections", "use_n_dot_v")
+"""Each makes the color another function."""
 
 
 def main_file(documents: Documents) -> Keys | None:
@@ -54,6 +56,7 @@ def translate(keys: Keys, said: Said) -> None:
         said.put("sign", 1, field, "inside_outside")
     said.values["contraction"] = "linf_grid" if theirs else "none"
     _schedule(keys, field, said)
+    said.about_color(lambda: _color(keys.below("pipeline.model"), field, said))
     _frame(keys, said)
 
 
@@ -105,6 +108,14 @@ def _schedule(keys: Keys, field: Keys, said: Said) -> None:
             f"LEVEL_MASK_ASSUMED: by step {step} training had opened {opened} of {levels} levels; the trainer evaluates"
             f" all of them after loading, and so does the field; say level_mask {opened} for the other"
         )
+
+
+def _color(model: Keys, field: Keys, said: Said) -> None:
+    """Nothing of it makes the geometry another one: a color of a form that is not known is left out."""
+    key = "use_average_appearance_embedding"
+    said.put("color.average_appearance", model.flag(key), model, key)
+    said.put("color.padding", field.number("rgb_padding"), field, "rgb_padding")
+    said.without_color(field, [name for name in _OTHER_COLORS if field.flag(name)])
 
 
 def _frame(keys: Keys, said: Said) -> None:

@@ -6,6 +6,7 @@ import struct
 
 import pytest
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.pickle.pickle_machine import PickleLimits
 from regnf_core.importing.pickle.pickle_reader import read_pickle
 from tests.core.importing.archives import assert_refused, text
@@ -82,3 +83,11 @@ def test_tuples_of_tuples_of_tuples_as_keys_are_refused() -> None:
     """Shared by reference they are short in the file and endless to hash."""
     nested = b"K\x01" + (b"q\x000(" + b"h\x00" * 16 + b"t") * 4
     assert_refused(lambda: read_pickle(memoryview(PROTO + b"}" + nested + b"Ns.")), "PICKLE_MALFORMED")
+
+
+def test_what_asks_for_too_much_is_named() -> None:
+    """So that whoever uploads a map of millions of nodes knows what is too large."""
+    body = b"cmodel.feature_octree\nFeatureOctree\n)\x81}(" + b"".join(b"K\x01K\x02" for _ in range(200)) + b"ub."
+    with pytest.raises(FieldFormatError, match=r"model\.feature_octree\.FeatureOctree") as caught:
+        read_pickle(memoryview(PROTO + body), PickleLimits(opcodes=100))
+    assert caught.value.reason == "PICKLE_TOO_COMPLEX"

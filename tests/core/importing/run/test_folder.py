@@ -6,7 +6,9 @@ import tarfile
 from pathlib import Path
 
 import pytest
+import torch
 
+from regnf_core.field_source import find_source
 from regnf_core.importing.run import folder as runs
 from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
 from tests.core.importing.archives import assert_refused
@@ -29,6 +31,21 @@ def test_a_run_is_found_and_its_settings_are_packed(tmp_path: Path) -> None:
     with tarfile.open(packed) as archive:
         assert archive.getnames() == ["config.yml"]
     assert packed.read_bytes() == pack_settings(found, tmp_path).read_bytes()
+
+
+def test_a_file_of_the_dataset_joins_the_settings_of_the_run(tmp_path: Path) -> None:
+    run = lay_out(tmp_path / "run", "config.yml", "meta_data.json", "sdfstudio_models/step-10.ckpt")
+    torch.save({}, run / "sdfstudio_models/step-10.ckpt")
+    data = lay_out(tmp_path / "data", "meta_data.json", "other.yml")
+    found = find_source(run, settings=data / "meta_data.json")
+    assert (found.settings, found.config) == ((run / "config.yml", data / "meta_data.json"), None)
+    with found.packed_settings() as packed, tarfile.open(packed) as archive:
+        assert archive.getnames() == ["run/config.yml", "data/meta_data.json"]
+    assert find_source(run, settings=data / "other.yml").settings == (data / "other.yml",)
+    assert find_source(run, settings=False).settings == ()
+    (run / "config.yml").unlink()
+    (run / "meta_data.json").unlink()
+    assert find_source(run, settings=data / "meta_data.json").settings == (data / "meta_data.json",)
 
 
 def test_settings_in_folders_of_their_own_are_found(tmp_path: Path) -> None:

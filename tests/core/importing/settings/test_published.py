@@ -1,4 +1,4 @@
-"""The configurations that nine trainers publish, each translated to a description.
+"""The configurations that ten trainers publish, each translated to a description.
 
 ``published_configurations.json`` has what their repositories' files say of the geometry network, by file name.
 """
@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,15 @@ import yaml
 from tests.core.importing.archives import assert_refused
 from tests.core.importing.settings.translating import facts, translated
 
+MONOSDF_GRID = {
+    "levels": 16,
+    "features_per_level": 2,
+    "log2_table_size": 19,
+    "base_resolution": 16,
+    "top_resolution": 2048,
+}
+"""Its files leave the layout out: these are the trainer's defaults."""
+MONOSDF_ROWS = sum(min(1 << 19, (math.ceil(16 * 128 ** (level / 15)) + 1) ** 3) for level in range(16))
 _PUBLISHED = json.loads((Path(__file__).parent / "published_configurations.json").read_text())
 
 
@@ -44,15 +54,18 @@ def test_implicit_networks(name: str, values: dict[str, Any]) -> None:
     network, sphere = values["implicit_network"], values["scene_bounding_sphere"]
     where = "" if sphere is None else f" scene_bounding_sphere = {sphere}\n"
     text = f"model{{\n{where} implicit_network\n {{\n{hocon(network)}\n }}\n}}"
-    if network.get("use_grid_feature"):
-        assert_refused(lambda: translated({name: text}), "FAMILY_NOT_SUPPORTED")
-        return
     expected: dict[str, Any] = {"positional_encoding": {"degree": network["multires"]}}
     if sphere is not None:
         expected["bounds"] = [[-sphere] * 3, [sphere] * 3]
     if network.get("inside_outside"):
         expected["sign"] = 1  # a room, as it should be
-    assert translated({name: text}).values == expected
+    if "use_grid_feature" in network:
+        expected |= {
+            "use_grid": network["use_grid_feature"],
+            "hash": MONOSDF_GRID | {"radius": network["divide_factor"]},
+        }
+    known = facts({"implicit_network.encoding.embeddings": (MONOSDF_ROWS, 2)} if "use_grid_feature" in network else {})
+    assert translated({name: text}, known).values == expected
 
 
 @pytest.mark.parametrize(("name", "values"), configurations("deepsdf"))
@@ -102,3 +115,15 @@ def test_isdf(name: str, values: dict[str, Any]) -> None:
 def test_pin_slam(name: str, values: dict[str, Any]) -> None:
     """Its map holds what the function needs; without the map there is nothing to compare."""
     assert translated({name: yaml.safe_dump({"setting": {"name": "a"}, **values})}).values == {"family": "pin_slam"}
+
+
+@pytest.mark.parametrize(("name", "values"), configurations("co_slam"))
+def test_co_slam(name: str, values: dict[str, Any]) -> None:
+    """Each scene's file with that of its dataset, as the trainer writes them to a run's config.json."""
+    said = translated({"config.json": json.dumps(values)}).values
+    bound, grid = values["mapping"]["bound"], values["grid"]
+    assert said["grid_box"] == [[low for low, _ in bound], [high for _, high in bound]]
+    assert said["truncation"] == values["training"]["trunc"] * values["data"]["sc_factor"]
+    cells = max(high - low for low, high in bound) / grid["voxel_sdf"]
+    assert abs(said["hash"]["top_resolution"] - cells + 0.5) <= 0.5 + 1e-6
+    assert said["hash"]["log2_table_size"] == grid["hash_size"]
