@@ -12,6 +12,7 @@ One seed is one world; a world is made once and kept. The part `test` is for rep
 from __future__ import annotations
 
 import argparse
+import gzip
 import itertools
 import json
 import multiprocessing
@@ -97,12 +98,18 @@ def _evidence(arguments: argparse.Namespace) -> None:
 
 
 def _train(arguments: argparse.Namespace) -> None:
-    rows = [json.loads(line) for path in arguments.rows for line in path.read_text().splitlines()]
+    rows = [json.loads(line) for path in arguments.rows for line in _text(path).splitlines()]
     model, table = training.trained(rows)
     arguments.output.write_text(json.dumps(model, indent=1) + "\n")
     if arguments.table is not None:
         arguments.table.write_text(f"# The verdict's probability in worlds that were left out\n\n{table}")
     _say(table)
+
+
+def _text(path: Path) -> str:
+    """Of a file that may be compressed by gzip, as its name says."""
+    data = path.read_bytes()
+    return (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
 
 
 def _report(arguments: argparse.Namespace) -> None:
@@ -155,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--seeds", type=int, nargs="*", help="these worlds alone")
         command.add_argument("--workers", type=int, default=1)
     learning = commands.add_parser("train", help="the verdict's probability model")
-    learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote")
+    learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     reporting = commands.add_parser("report", help="tables of runs")

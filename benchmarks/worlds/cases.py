@@ -87,6 +87,8 @@ def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
     told = world["scene"]
     if (home / SCENE).exists():
         field = open_field(home / SCENE)
+        units = told.get("units_per_meter", 1.0)
+        field = field if units == 1.0 else TransformedField(field, _scaled(units))
     else:
         with np.load(home / "scene.npz") as file:
             field = MeshField(file["vertices"], file["faces"])
@@ -96,6 +98,10 @@ def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
         return field
     grid, words = read_observation_grid(home)
     return ObservedField(field, stored_observation(grid, torch.from_numpy(words)))
+
+
+def _scaled(factor: float) -> Sim3:
+    return Sim3.from_matrix(torch.diag(torch.tensor([factor] * 3 + [1.0], dtype=torch.float64)))
 
 
 def _facts(home: Path, number: int, world: dict[str, Any], known: dict[str, Any]) -> dict[str, Any]:

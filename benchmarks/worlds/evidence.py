@@ -20,9 +20,11 @@ from regnf_core.geometry.points import NearestNeighbors, diameter
 from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.evaluation import rival_numbers
+from regnf_core.robust.verdict.evaluation import Ranking, rival_numbers
 from regnf_core.robust.verdict.evidence import gather_evidence
+from regnf_core.robust.verdict.lead import apart
 from regnf_core.robust.verdict.pose_features import pose_features
+from regnf_core.robust.verdict.probability import pose_odds
 from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
@@ -76,7 +78,7 @@ def _rows(known: WorldCase, asked: WorldCase) -> Iterator[Row]:
         winner = kept.evaluations[number].winner if number == last else None
         yield from _described(kept.problem, candidates, known if asked is known else None, winner)
     if asked is known:
-        yield from _described(kept.problem, _from_truth(kept, known), known, None)
+        yield from ({**row, "found": False} for row in _described(kept.problem, _from_truth(kept, known), known, None))
 
 
 def _from_truth(kept: Recording, known: WorldCase) -> PoseCandidates:
@@ -90,18 +92,26 @@ def _from_truth(kept: Recording, known: WorldCase) -> PoseCandidates:
 def _described(
     problem: RegistrationProblem, candidates: PoseCandidates, known: WorldCase | None, winner: int | None
 ) -> Iterator[Row]:
-    """Rows of these candidates. known: what they should be; None: all are wrong · winner: the chosen one's number."""
+    """Rows of these candidates. known: what they should be; None: all are wrong · winner: the chosen one's number.
+
+    A row's ``others`` are the candidates that are other answers, by how many rows they stand after it.
+    ``found``: it is one of a registration's candidates.
+    """
     assert candidates.offsets is not None
     features = pose_features(problem, candidates.T, candidates.offsets)
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, _OPTIONS.robust)
     errors = _errors(problem, candidates.T, known)
-    rivals = rival_numbers(problem, candidates, evidence, _OPTIONS.robust.rival_margin)
+    elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
+    ranking = Ranking(evidence.scores.double(), pose_odds().log_odds(features, elsewhere)[0])
+    rivals = rival_numbers(problem, candidates, ranking, _OPTIONS.robust.rival_margin)
     for number in range(len(candidates)):
         yield {
             "mssd": errors[number],
             "listed_mssd": min(errors[one] for one in (number, *rivals)),
             "rivals": len(rivals),
             "winner": number == winner,
+            "found": True,
+            "others": (elsewhere[number].nonzero()[:, 0] - number).tolist(),
             "score": float(evidence.scores[number]),
             "features": {name: float(values[number]) for name, values in features.items()},
         }

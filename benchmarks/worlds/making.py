@@ -18,6 +18,7 @@ from benchmarks.worlds.observing import observation_of_walk
 from benchmarks.worlds.recipe import FROM_IMAGES, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.schema.observation_grid import ObservationGrid
+from regnf_data.posed_images import PosedImages
 from regnf_data.worlds.detections import draw_box
 from regnf_data.worlds.fusing import fuse
 from regnf_data.worlds.mesh import Array, together
@@ -36,6 +37,8 @@ LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
 LEAST_VOXELS = 20.0
 """Across an object: what is smaller is no case."""
 _SCALES = (0.05, 20.0)
+_REACH = 1.9
+"""Of the bounds that images are fitted in, in the units of the fit: its grid ends at 2."""
 _TRAINED = (0.03, 0.15)
 """Shares of the iterations that an under-trained field is given."""
 
@@ -158,8 +161,9 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
         options = ReconstructionOptions(observation_voxels=0)
         if scene == "under-trained":
             options = replace(options, iterations=int(options.iterations * rng.uniform(*_TRAINED)))
-        reconstruct(seen.taken.images(seen.bounds), FitFiles(home / SCENE), options, world.seed)
-        return {"kind": scene, "iterations": options.iterations}
+        units = min(1.0, _REACH / float(np.abs(seen.bounds).max()))
+        reconstruct(in_units(seen.taken.images(seen.bounds), units), FitFiles(home / SCENE), options, world.seed)
+        return {"kind": scene, "iterations": options.iterations, "units_per_meter": units}
     mesh = together(*(placed.mesh for placed in world.all))
     np.savez(home / "scene.npz", vertices=mesh.vertices, faces=mesh.faces)
     if scene == "mesh":
@@ -170,6 +174,14 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
         "wavelength": float(rng.uniform(0.1, 0.6)),
         "bend_seed": int(rng.integers(2**31)),
     }
+
+
+def in_units(images: PosedImages, units_per_meter: float) -> PosedImages:
+    """The same images, in a world of another unit."""
+    poses = images.T_world_camera.copy()
+    poses[:, :3, 3] *= units_per_meter
+    depths = None if images.depths is None else (images.depths * units_per_meter).astype(np.float32)
+    return replace(images, T_world_camera=poses, depths=depths, bounds=images.bounds * units_per_meter)
 
 
 def _write_observation(seen: Seen, home: Path) -> None:

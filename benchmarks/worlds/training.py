@@ -3,12 +3,15 @@
 Logistic regression on monotone ramps: each feature's range is cut at quantiles, and each piece has a ramp whose weight
 is at least 0, so the sum is monotone in every feature. Worlds are left out in turn to see what the model says of rooms
 that it does not know; what it says of them is then made right on average (Platt's scaling on the left-out logits).
+
+This is done twice: with the features of each pose alone, and with one more, the lead that these left-out log odds give
+a pose over the other answers among the same candidates.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,9 @@ from scipy.optimize import minimize
 
 from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.calibration import calibration_table
+from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG
 
 Array = NDArray[np.float64]
 
@@ -33,58 +38,87 @@ OF_OTHERS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Poses with what is known of them: features (N, F), in the order of SPEAKS_FOR · right (N,) 0 or 1 · weight (N,) ·
-    world (N,): the room, by which poses belong together."""
+    """Poses with what is known of them: features (N, F), of the ``names`` · right (N,) 0 or 1 · weight (N,): of the
+    pose in the training; 0: none · world (N,): the room, by which poses belong together."""
 
+    names: tuple[str, ...]
     features: Array
     right: Array
     weight: Array
     world: NDArray[Any]
 
     def __getitem__(self, index: Any) -> Evidence:
-        return Evidence(self.features[index], self.right[index], self.weight[index], self.world[index])
+        return Evidence(self.names, self.features[index], self.right[index], self.weight[index], self.world[index])
+
+    def with_feature(self, name: str, values: Array, counts: NDArray[np.bool_]) -> Evidence:
+        """The same with one more feature (N,), trained with where ``counts`` (N,)."""
+        features = np.column_stack([self.features, values])
+        return Evidence((*self.names, name), features, self.right, self.weight * counts, self.world)
+
+    @property
+    def signs(self) -> Array:
+        """(F,) 1 where more of a feature speaks for a pose, else -1."""
+        return np.array([1.0 if SPEAKS_FOR_AMONG[name] else -1.0 for name in self.names])
+
+    @property
+    def counted(self) -> Evidence:
+        """The poses that are trained with."""
+        return self[self.weight > 0.0]
 
 
 @dataclass(frozen=True, eq=False)
 class Ramps:
-    """knots: (F, K) of each feature, turned so that more is better. weights: (F, K - 1) at least 0."""
+    """signs: (F,), see :class:`Evidence` · knots: (F, K) of each feature, turned so that more is better · weights:
+    (F, K - 1) at least 0."""
 
+    names: tuple[str, ...]
+    signs: Array
     knots: Array
     weights: Array
     bias: float
 
     def logit(self, features: Array) -> Array:
         """(N,) log odds of rows (N, F)."""
-        return self.bias + np.asarray(_design(features, self.knots) @ self.weights.ravel())
+        return self.bias + np.asarray(_design(features * self.signs, self.knots) @ self.weights.ravel())
 
     def scaled(self, slope: float, shift: float) -> Ramps:
-        return Ramps(self.knots, slope * self.weights, slope * self.bias + shift)
+        return replace(self, weights=slope * self.weights, bias=slope * self.bias + shift)
 
     def to_dict(self) -> dict[str, Any]:
         """As ``probability.json`` keeps it: features that do not count are left out."""
         terms = {}
-        for name, knots, weights in zip(SPEAKS_FOR, self.knots, self.weights, strict=True):
+        for name, knots, weights in zip(self.names, self.knots, self.weights, strict=True):
             if weights.sum() < 1e-3:
                 continue
             values = np.concatenate([[-weights.sum()], np.cumsum(weights) - weights.sum()])
-            if not SPEAKS_FOR[name]:
+            if not SPEAKS_FOR_AMONG[name]:
                 knots, values = -knots[::-1], values[::-1]
             terms[name] = {"knots": _rounded(knots), "values": _rounded(values)}
         return {"bias": round(self.bias, 4), "terms": terms}
 
 
 def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
-    """The model from the rows of :mod:`benchmarks.worlds.evidence`, as its file keeps it, and a table of how well its
-    probabilities hold in worlds that were left out."""
-    used = [row for row in rows if not _told_apart_by_rivals(row)]
+    """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
+    the probabilities hold in worlds that were left out."""
+    counts = np.array([not _told_apart_by_rivals(row) for row in rows])
     evidence = Evidence(
-        np.array([[row["features"][name] for name in SPEAKS_FOR] for row in used]),
-        np.array([float(row["mssd"] <= SUCCESS) for row in used]),
-        np.array([1.0 if row["winner"] else OF_OTHERS for row in used]),
-        np.array([row["world"].split("-")[1] for row in used]),
+        tuple(SPEAKS_FOR),
+        np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows]),
+        np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
+        np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * counts,
+        np.array([row["world"].split("-")[1] for row in rows]),
     )
-    model, left_out = train(evidence)
-    return model.to_dict(), calibration_table(used, left_out)
+    alone, odds = train(evidence)
+    found = np.array([row["found"] for row in rows])
+    among, left_out = train(evidence.with_feature(LEAD, _leads(rows, odds), found))
+    table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], left_out[counts])
+    return {"alone": alone.to_dict(), "among": among.to_dict()}, table
+
+
+def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:
+    """(N,) as :func:`regnf_core.robust.verdict.lead.leads` has them, from each row's ``others``."""
+    best = [max((odds[number + step] for step in row["others"]), default=-np.inf) for number, row in enumerate(rows)]
+    return np.clip(odds - np.array(best), -VERDICT.most_lead, VERDICT.most_lead)
 
 
 def _told_apart_by_rivals(row: dict[str, Any]) -> bool:
@@ -97,19 +131,19 @@ def train(evidence: Evidence) -> tuple[Ramps, Array]:
     left_out = np.zeros(len(evidence.right))
     for world in np.unique(evidence.world):
         of_world = evidence.world == world
-        left_out[of_world] = _fit(evidence[~of_world]).logit(evidence.features[of_world])
+        left_out[of_world] = _fit(evidence[~of_world].counted).logit(evidence.features[of_world])
     slope, shift = _platt(left_out, evidence)
-    return _fit(evidence).scaled(slope, shift), slope * left_out + shift
+    return _fit(evidence.counted).scaled(slope, shift), slope * left_out + shift
 
 
 def _fit(evidence: Evidence) -> Ramps:
-    turned = _turned(evidence.features)
+    turned = evidence.features * evidence.signs
     knots = np.stack([_knots(column) for column in turned.T])
-    design = _design(evidence.features, knots)
+    design = _design(turned, knots)
     start = np.zeros(design.shape[1] + 1)
     bounds = [(0.0, None)] * design.shape[1] + [(None, None)]
     found = minimize(_loss, start, (design, evidence), jac=True, bounds=bounds, method="L-BFGS-B")
-    return Ramps(knots, found.x[:-1].reshape(len(knots), -1), float(found.x[-1]))
+    return Ramps(evidence.names, evidence.signs, knots, found.x[:-1].reshape(len(knots), -1), float(found.x[-1]))
 
 
 def _loss(p: Array, design: Array, evidence: Evidence) -> tuple[float, Array]:
@@ -136,11 +170,6 @@ def _platt(logits: Array, evidence: Evidence) -> tuple[float, float]:
     return float(found.x[0]), float(found.x[1])
 
 
-def _turned(features: Array) -> Array:
-    """The features, turned so that more of each is better."""
-    return features * np.array([1.0 if better else -1.0 for better in SPEAKS_FOR.values()])
-
-
 def _knots(column: Array) -> Array:
     """PIECES + 1 increasing numbers: quantiles, moved apart where they coincide."""
     knots = np.quantile(column, np.linspace(0.02, 0.98, PIECES + 1))
@@ -150,11 +179,11 @@ def _knots(column: Array) -> Array:
     return np.asarray(knots)
 
 
-def _design(features: Array, knots: Array) -> Array:
-    """(N, F * PIECES): how far each row is short of the upper end of each piece, 0 to -1."""
+def _design(turned: Array, knots: Array) -> Array:
+    """(N, F * PIECES): how far each row of features is short of the upper end of each piece, 0 to -1."""
     low, high = knots[:, :-1], knots[:, 1:]
-    short = (high - _turned(features)[:, :, None]) / (high - low)
-    return -np.clip(short, 0.0, 1.0).reshape(len(features), -1)
+    short = (high - turned[:, :, None]) / (high - low)
+    return -np.clip(short, 0.0, 1.0).reshape(len(turned), -1)
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from regnf_core.detections import Detection, parse_detection
+from regnf_core.detections.objects import open3d_detection
 from regnf_core.errors import InvalidDetectionError
 from regnf_core.geometry.quaternions import matrix_from_quaternion
 from regnf_core.rotations import quaternion_of
@@ -64,7 +66,7 @@ class OrientedBox:
 
     @classmethod
     def from_corners(
-        cls, lower: Sequence[float], upper: Sequence[float], label: str | None = None, score: float | None = None
+        cls, lower: ArrayLike, upper: ArrayLike, label: str | None = None, score: float | None = None
     ) -> OrientedBox:
         """An axis-aligned box from its lowest and highest corner, (3,) each, scene frame."""
         low = torch.as_tensor(lower, dtype=torch.float64)
@@ -72,6 +74,27 @@ class OrientedBox:
         if low.shape != (3,) or high.shape != (3,):  # a single number would spread over all axes
             raise InvalidDetectionError("a box's corners have three coordinates each")
         return cls((low + high) / 2, high - low, torch.eye(3, dtype=torch.float64), label, score)
+
+    @classmethod
+    def from_center(
+        cls,
+        center: ArrayLike,
+        size: ArrayLike,
+        rotation: ArrayLike | None = None,
+        label: str | None = None,
+        score: float | None = None,
+    ) -> OrientedBox:
+        """A box from its center (3,), full edge lengths (3,) and axes: the columns of ``rotation`` (3, 3), scene frame.
+
+        Without a rotation the box is axis-aligned. Raises InvalidDetectionError naming the faulty member.
+        """
+        said = {"center": center, "size": size, "rotation": rotation, "label": label, "score": score}
+        return cls.from_dict({name: value for name, value in said.items() if value is not None})
+
+    @classmethod
+    def from_open3d(cls, box: Any, label: str | None = None, score: float | None = None) -> OrientedBox:
+        """A box from Open3D's OrientedBoundingBox or AxisAlignedBoundingBox. Raises InvalidDetectionError."""
+        return cls.from_detection(replace(open3d_detection(box), label=label, score=score))
 
     @classmethod
     def from_quaternion(
@@ -94,6 +117,12 @@ class OrientedBox:
             label,
             score,
         )
+
+    def __repr__(self) -> str:
+        center, size = ([float(f"{value:.4g}") for value in values.tolist()] for values in (self.center, self.size))
+        turned = "" if torch.equal(self.rotation, torch.eye(3, dtype=torch.float64)) else ", turned"
+        label = "" if self.label is None else f", {self.label!r}"
+        return f"OrientedBox(center {center}, size {size}{turned}{label})"
 
     @property
     def diagonal(self) -> float:

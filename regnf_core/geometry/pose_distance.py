@@ -24,15 +24,15 @@ def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) 
     points: (N, 3) of the object; a handful of its extreme points is enough.
     """
     order = scores.argsort()
+    placed = T[order].inverse().apply(points.double()).mT.contiguous()  # (H, 3, N)
+    reach = (apart / T.scale[order].double()).square().tolist()
+    numbers: list[int] = order.tolist()
     chosen: list[int] = []
-    open_ = torch.ones(len(order), dtype=torch.bool)
-    ranked = T[order]
-    for rank in range(len(order)):
-        if not open_[rank]:
-            continue
-        chosen.append(int(order[rank]))
-        if len(chosen) == limit:
-            break
-        near = displacement(ranked, ranked[rank], points) < apart
-        open_ &= ~near
+    left = torch.arange(len(order))
+    while len(left) and len(chosen) < limit:
+        best, others = int(left[0]), placed[1:]
+        chosen.append(numbers[best])
+        squares = (others - placed[0]).square().sum(1).amax(-1)
+        far = (~(squares < reach[best])).nonzero().squeeze(-1)
+        left, placed = left[1:][far], others[far]
     return torch.tensor(chosen, dtype=torch.long)

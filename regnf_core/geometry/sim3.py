@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -129,6 +130,17 @@ class Sim3:
             torch.where(mask[..., None, None], first.rotation, second.rotation),
             torch.where(mask[..., None], first.translation, second.translation),
         )
+
+    def __repr__(self) -> str:
+        if self.scale.ndim:
+            return f"Sim3({len(self)} transforms)"
+        place = ", ".join(f"{value:.4g}" for value in self.translation.tolist())
+        turn = ", ".join(f"{value:.4g}" for value in self.quaternion_xyzw().tolist())
+        return f"Sim3(scale {float(self.scale):.4g}, quaternion xyzw [{turn}], translation [{place}])"
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray[Any, Any]:
+        """(..., 4, 4) homogeneous matrices, for NumPy."""
+        return np.array(self.matrix().detach().cpu().numpy(), dtype=dtype)
 
     def __len__(self) -> int:
         """How many transforms a batch holds."""

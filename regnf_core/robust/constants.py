@@ -19,7 +19,7 @@ option, see regnf_core/options.py.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from regnf_core.robust.stage import Stage
 
@@ -200,6 +200,25 @@ class OcclusionConstants:
     """Least squares steps from the best guess. [by hand]"""
 
 
+_SEARCH_HEAD = (
+    Stage(points=48, widths=(), score_width=0.10, keep=500),
+    Stage(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05),
+)
+_SEARCH_CLOSER = Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=60, min_distance=0.05)
+_SEARCH_END = (
+    Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=20, min_distance=0.05),
+    Stage(
+        points=200,
+        widths=(0.06, 0.05, 0.04, 0.03, 0.03),
+        score_width=0.03,
+        keep=12,
+        min_distance=0.03,
+        copies=12,
+        spread=(0.10, 0.035, 0.05),
+    ),
+)
+
+
 @dataclass(frozen=True)
 class SearchConstants:
     """Pose candidates from samples alone (search/)."""
@@ -214,21 +233,20 @@ class SearchConstants:
     """Perturbed copies of a given initial pose. [by hand]"""
     warm_start_spread: tuple[float, float, float] = (0.17, 0.05, 0.10)
     """Standard deviations of their rotation (radians), translation (diameters) and log scale. [by hand]"""
-    stages: tuple[Stage, ...] = (
-        Stage(points=48, widths=(), score_width=0.10, keep=500),
-        Stage(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05),
-        Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=60, min_distance=0.05),
-        Stage(points=256, widths=(0.04, 0.03, 0.03, 0.03), score_width=0.03, keep=20, min_distance=0.05),
-        Stage(
-            points=200, widths=(0.06, 0.05, 0.04, 0.03, 0.03), score_width=0.03, keep=12, min_distance=0.03, copies=12
-        ),
-    )
+    stages: tuple[Stage, ...] = (*_SEARCH_HEAD, _SEARCH_CLOSER, *_SEARCH_END)
     """Successive halving on distance grids. The first stage only ranks the seeds. The last one leaves local minima:
     thin parts and what is close by hold poses some hundredths of the diameter off. [by hand, the last one on random
     worlds, docs/worlds.md]"""
-    copies_spread: tuple[float, float, float] = (0.10, 0.035, 0.05)
-    """Standard deviations of a stage's copies: rotation (radians), translation (diameters), log scale. [by
-    hand, on random worlds]"""
+    thorough_stages: tuple[Stage, ...] = (
+        *_SEARCH_HEAD,
+        replace(_SEARCH_CLOSER, copies=6, spread=(0.40, 0.08, 0.15)),
+        replace(_SEARCH_CLOSER, copies=6, spread=(0.40, 0.08, 0.15)),
+        replace(_SEARCH_CLOSER, copies=6, spread=(0.15, 0.05, 0.07)),
+        *_SEARCH_END,
+    )
+    """The same where the first search ended in a rejection: many truths have a better score than all that it found,
+    but no seed in their basin. Copies moved as far as seeds lie from one another reach it. [by hand, on random
+    worlds]"""
     min_share_of_detection: float = 0.25
     """Share of the detection box's edge. Along one of them at least, the object is that long. [by hand]"""
     box_weight: float = 0.2
@@ -270,7 +288,10 @@ class FeatureConstants:
     """Scale between the two clouds beyond which a match is wrong. [by hand]"""
 
 
-_LAST_STAGE = Stage(700, (0.01, 0.01, 0.008, 0.008, 0.008), 0.015, keep=8, min_distance=0.03, margin=1.0, adaptive=True)
+_LAST_STAGES = (
+    Stage(700, (0.01, 0.01, 0.008, 0.008, 0.008), 0.015, keep=8, min_distance=0.03, margin=1.0, widest=0.04),
+    Stage(700, (0.015, 0.01, 0.01, 0.008, 0.008), 0.015, keep=8, min_distance=0.03, margin=1.0, widest=0.02),
+)
 
 
 @dataclass(frozen=True)
@@ -278,13 +299,14 @@ class RefinementConstants:
     """Levenberg-Marquardt on the fields (refine/)."""
 
     stages: tuple[Stage, ...] = (
-        Stage(200, (0.05, 0.04, 0.03, 0.02, 0.02), 0.02, keep=6, min_distance=0.03, margin=0.15, adaptive=True),
-        Stage(300, (0.02, 0.015, 0.01, 0.01), 0.015, keep=3, min_distance=0.03, margin=0.10, adaptive=True),
+        Stage(200, (0.05, 0.04, 0.03, 0.02, 0.02), 0.02, keep=10, min_distance=0.03, margin=0.15, widest=0.04),
+        Stage(300, (0.02, 0.015, 0.01, 0.01), 0.015, keep=6, min_distance=0.03, margin=0.10, widest=0.04),
     )
     """On all pose candidates. The first stage was chosen together with the last one of the search, which uses the wider
-    kernels. [by hand, the first on random worlds]"""
-    last_stage: Stage = _LAST_STAGE
-    """On what is left, and the best pose's symmetry equivalents. [by hand]"""
+    kernels. [by hand, the first and the numbers kept on random worlds]"""
+    last_stages: tuple[Stage, ...] = _LAST_STAGES
+    """On what is left, and the best pose's symmetry equivalents. Wide kernels find the pose among rough surfaces,
+    narrow ones keep what is close by from drawing it away. [by hand, the second on random worlds]"""
     same_pose: float = 0.06
     """Diameters. A symmetry equivalent closer to a pose that is there already is not added. [by hand]"""
     damping_start: float = 1e-2
@@ -309,8 +331,6 @@ class RefinementConstants:
     spread_factor: float = 6.7
     """Kernel width over this quantile: 30 % of normal residuals are below 0.385 standard deviations, so 6.7 times that
     is 2.6 standard deviations. [derived; the 2.6 by hand]"""
-    max_adaptive_width: float = 0.04
-    """Diameters. The spread widens the kernel no further. [by hand]"""
     unobserved_width: float = 0.3
     """Share of the kernel width of object samples at unobserved places: the surface nearest to them is the border of
     what was observed, and would draw them there. [by hand, on objects known from one view]"""
@@ -322,6 +342,9 @@ class RefinementConstants:
     offset_prior: float = 0.02
     """Weight of "no offset", where one direction's samples weigh 1: round things may be larger as well as thicker.
     [early fits]"""
+    offset_prior_partial: float = 0.3
+    """The same where part of the scene was not observed: all that was seen from one side may be larger as well as
+    thicker. [random worlds]"""
 
 
 @dataclass(frozen=True)
@@ -402,8 +425,18 @@ class VerdictConstants:
     min_probability: float = 0.7
     """Probability of being right that a pose needs even where it meets all criteria. [random worlds: worlds left out of
     the parts train and validation, docs/verdict.md]"""
+    apart: float = 0.05
+    """Diameters. Poses farther apart cannot both be right. [derived: right is within 5 % of the truth]"""
+    axis_turns: int = 72
+    """Turns about a symmetry axis that poses are compared under: half a step moves a point by 2 % of the diameter.
+    [derived]"""
+    most_lead: float = 6.0
+    """Log odds. Larger leads are not told apart. [by hand]"""
     rivals_min_distance: float = 0.1
     """Diameters. Poses closer together are one answer with its uncertainty. [by hand]"""
+    rival_log_odds: float = 3.0
+    """Log odds. A pose that is less likely than the best one by more, a factor of 20, is told apart from it, however
+    near its score. [by hand]"""
     rival_margin_per_score: float = 0.15
     """Share of the best score added to the option ``rival_margin``: the worse the fields agree, the less a difference
     of scores tells. [main pairs]"""

@@ -36,7 +36,7 @@ from regnf_core.robust.stage import Stage
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
 from regnf_core.run import STARTS, Run
 
-ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, REFINEMENT.last_stage))
+ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT.last_stages))
 """Of the refinement on the fields."""
 
 
@@ -110,7 +110,8 @@ def search_poses(
 def refine_poses(
     problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
 ) -> PoseCandidates:
-    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them in the last stage. Best first.
+    """Refine poses T (H,) on the fields; the best one's symmetry equivalents join them for the last stages. Best
+    first.
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
@@ -123,7 +124,7 @@ def refine_poses(
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
     origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
     joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
-    return coarse_to_fine(problem.fit, joined, [REFINEMENT.last_stage], context)
+    return coarse_to_fine(problem.fit, joined, REFINEMENT.last_stages, context)
 
 
 def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
@@ -156,48 +157,56 @@ def _best_attempt(
     generator: torch.Generator,
     T_start: Sim3 | None,
 ) -> Evaluation:
-    """Around a given start, else from the shapes, else from feature matches too: slower ways where others fail."""
+    """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
+    others fail."""
     found: list[Evaluation] = []
-    for seeds, given in _seed_sets(problem, options, seed, generator, T_start):
-        found.append(_attempt(problem, seeds, given, options, run, generator))
+    for start in _starts(problem, options, seed, generator, T_start):
+        found.append(_attempt(problem, start, options, run, generator))
         if found[-1].verdict != "rejected":
             break
     return min(found, key=lambda one: one.rank)
 
 
-def _seed_sets(
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
+    stages: of the search."""
+
+    seeds: Sim3
+    given: Sim3
+    stages: Sequence[Stage] = SEARCH.stages
+
+
+def _starts(
     problem: RegistrationProblem,
     options: RegistrationOptions,
     seed: int,
     generator: torch.Generator,
     T_start: Sim3 | None,
-) -> Iterator[tuple[Sim3, Sim3]]:
-    """Seeds (H,) of one attempt after another, each made when its turn comes, and what is refined whatever the search
-    finds: a given start (1,), or nothing (0,)."""
+) -> Iterator[_Start]:
+    """One attempt after another, each made when its turn comes."""
     view, model = problem.view, problem.model
     if T_start is not None:
         start = problem.in_working_frames(T_start)
-        yield seed_poses_around(start, generator), start.expand(1)
+        yield _Start(seed_poses_around(start, generator), start.expand(1))
     seeds = geometric_seeds(view, model, start_rotations(options))
-    yield seeds, seeds[:0]
+    yield _Start(seeds, seeds[:0])
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        if len(matched):
-            yield Sim3.cat([seeds, matched]), seeds[:0]
+        yield _Start(Sim3.cat([seeds, matched]), seeds[:0], SEARCH.thorough_stages)
 
 
 def _attempt(
     problem: RegistrationProblem,
-    seeds: Sim3,
-    given: Sim3,
+    start: _Start,
     options: RegistrationOptions,
     run: Run,
     generator: torch.Generator,
 ) -> Evaluation:
     with run.phase("initializing"):
-        candidates = search_poses(problem.view, problem.model, seeds, generator, problem.bound)
+        candidates = search_poses(problem.view, problem.model, start.seeds, generator, problem.bound, start.stages)
     with run.phase("optimizing"):
-        refined = refine_poses(problem, Sim3.cat([candidates.T, given]), generator, _progress_of_steps(run))
+        refined = refine_poses(problem, Sim3.cat([candidates.T, start.given]), generator, _progress_of_steps(run))
     with run.phase("verifying"):
         return evaluate_candidates(problem, refined, options)
 

@@ -34,6 +34,7 @@ def result_of(
         seed=seed,
         options=options.to_dict(),
         alternatives=evaluation.alternatives,
+        considered=evaluation.considered,
         covariance=pose_covariance(problem, evaluation),
         symmetry=model.symmetry.group(),
     )

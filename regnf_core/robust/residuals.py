@@ -49,6 +49,9 @@ class SurfacePair:
 class Residuals:
     """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7).
 
+    Vectors are kept as planes, (H, 3, N) and (H, 7, N), so that all work runs along long rows; the Jacobian is such a
+    tensor, seen from the other side.
+
     cosines: (H, N + M), between a sample's normal and the other field's gradient where the pose carries the sample ·
     unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed; None: all of it was ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
@@ -76,16 +79,16 @@ class Residuals:
         """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: its column is the last one."""
         if self.offset is None:
             return self.jacobian
-        column = torch.ones_like(self.jacobian[..., :1])
-        column[:, : self.scene_count] = -1.0
-        return torch.cat([self.jacobian, column], -1)
+        column = torch.ones_like(self.values[:, None])
+        column[..., : self.scene_count] = -1.0
+        return torch.cat([self.jacobian.mT, column.to(self.jacobian)], 1).mT
 
     @classmethod
     def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
         """Those of ``first`` for the poses where ``mask`` (H,) is set, those of ``second`` for the others."""
         return cls(
             torch.where(mask[:, None], first.values, second.values),
-            torch.where(mask[:, None, None], first.jacobian, second.jacobian),
+            torch.where(mask[:, None, None], first.jacobian.mT, second.jacobian.mT).mT,
             torch.where(mask[:, None], first.cosines, second.cosines),
             first.scene_count,
             _where(mask[:, None], first.unobserved, second.unobserved),
@@ -106,7 +109,7 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         r1, r2 = r1 - offset[:, None].to(r1), r2 + offset[:, None].to(r2)
     return Residuals(
         torch.cat([r1, r2], 1),
-        torch.cat([J1, J2], 1),
+        torch.cat([J1, J2], 2).mT,
         torch.cat([cosines1, cosines2], 1),
         len(A),
         None if unobserved is None else torch.cat([torch.zeros_like(r1, dtype=torch.bool), unobserved], 1),
@@ -115,40 +118,60 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, Tensor, Tensor]:
-    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
-    arm = s[..., None] * (A.points @ R.mT)  # y - t, (H, N, 3)
+    s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
+    arm = (s[..., None] * R) @ A.points.T  # y - t, (H, 3, N)
     value, g = _query(obj, arm + t)
     own = s * A.values
-    lever = (g * arm).sum(-1) - own
-    J = torch.cat([torch.linalg.cross(arm, g), g, lever[..., None]], dim=-1)
-    return value - own, J, _cosine(g, A.normals @ R.mT)
+    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.T)
 
 
 def _object_to_scene(
     scene: DistanceModel, B: Samples, T: Sim3, unobserved: UnobservedTest | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    s, R, t = T.scale[:, None], T.rotation, T.translation[:, None]
-    arm = B.points - t  # z - t, (H, M, 3)
-    w = (arm @ R) / s[..., None]
+    s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
+    arm = B.points.T - t  # z - t, (H, 3, M)
+    w = (R.mT / s[..., None]) @ arm
     value, g = _query(scene, w)
-    turned = g @ R.mT  # R g_a
+    turned = R @ g  # R g_a
     scaled = s * value
-    lever = scaled - (turned * arm).sum(-1)
-    J = torch.cat([-torch.linalg.cross(arm, turned), -turned, lever[..., None]], dim=-1)
+    J = _jacobian(arm, -turned, scaled - _dot(turned, arm))
     r2 = scaled - B.values
-    where = None if unobserved is None else unobserved(w.reshape(-1, 3), r2.reshape(-1)).reshape(r2.shape)
-    return r2, J, _cosine(turned, B.normals.expand_as(turned)), where
+    where = None if unobserved is None else unobserved(_as_points(w), r2.reshape(-1)).reshape(r2.shape)
+    return r2, J, _cosine(turned, B.normals.T), where
 
 
-def _query(model: DistanceModel, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Value (H, N) and gradient (H, N, 3) of the model at points (H, N, 3)."""
-    value, gradient = model.value_and_gradient(points.reshape(-1, 3))
-    return value.reshape(points.shape[:-1]), gradient.reshape(points.shape)
+def _query(model: DistanceModel, places: Tensor) -> tuple[Tensor, Tensor]:
+    """Value (H, N) and gradient (H, 3, N) of the model at places (H, 3, N)."""
+    poses, _, count = places.shape
+    value, gradient = model.value_and_gradient(_as_points(places))
+    return value.reshape(poses, count), gradient.reshape(poses, count, 3).mT.contiguous()
+
+
+def _as_points(places: Tensor) -> Tensor:
+    """(H, 3, N) as points (H N, 3)."""
+    return places.mT.reshape(-1, 3)
+
+
+def _jacobian(arm: Tensor, g: Tensor, lever: Tensor) -> Tensor:
+    """[arm x g, g, lever], (H, 7, N), from (H, 3, N), (H, 3, N) and (H, N)."""
+    J = torch.empty(arm.shape[0], 7, arm.shape[2], dtype=arm.dtype, device=arm.device)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        torch.mul(arm[:, i], g[:, j], out=J[:, k]).addcmul_(arm[:, j], g[:, i], value=-1.0)
+    J[:, 3:6] = g
+    J[:, 6] = lever
+    return J
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    """(H, N), of vectors (..., 3, N): sums over so short an axis are slow, three products are not."""
+    total = a[..., 0, :] * b[..., 0, :]
+    total = total.addcmul_(a[..., 1, :], b[..., 1, :])
+    return total.addcmul_(a[..., 2, :], b[..., 2, :])
 
 
 def _cosine(gradient: Tensor, normals: Tensor) -> Tensor:
-    cosine: Tensor = (gradient * normals).sum(-1) / gradient.norm(dim=-1).clamp_min(1e-6)
-    return cosine
+    return _dot(gradient, normals).div_(_dot(gradient, gradient).sqrt_().clamp_min_(1e-6))
 
 
 def _where(mask: Tensor, first: Tensor | None, second: Tensor | None) -> Tensor | None:

@@ -12,9 +12,10 @@ class Stage:
 
     widths: kernel widths, one iteration each, object diameters; without any, poses are only scored · score_width:
     kernel width of the score · keep: at most so many poses · min_distance: between two kept poses, object diameters ·
-    margin: kept poses score no worse than the best one plus this · adaptive: ``widths`` are lower limits, see
-    :func:`regnf_core.robust.refine.loss.adaptive_width` · copies: of each pose, moved at random, that are refined with
-    it.
+    margin: kept poses score no worse than the best one plus this · widest: where the residuals' spread asks for it,
+    kernels are wider than ``widths``, up to this, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they are
+    not · copies: of each pose that are refined with it, moved at random · spread: standard deviations of their rotation
+    (radians), translation (diameters) and log scale.
     """
 
     points: int
@@ -23,5 +24,6 @@ class Stage:
     keep: int
     min_distance: float = 0.0
     margin: float = math.inf
-    adaptive: bool = False
+    widest: float = 0.0
     copies: int = 0
+    spread: tuple[float, float, float] = (0.0, 0.0, 0.0)

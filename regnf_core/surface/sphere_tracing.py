@@ -50,9 +50,14 @@ def clip_to_region(rays: Rays, low: Tensor, high: Tensor) -> tuple[Tensor, Tenso
 def finite_distance(field: SdfField, points: Tensor) -> Tensor:
     """Signed distance (N,) at points (N, 3). Raises InvalidInputError (FIELD_NOT_FINITE) for NaN or infinity."""
     distance = field.signed_distance(points)
+    require_finite(distance)
+    return distance.to(points)
+
+
+def require_finite(distance: Tensor) -> None:
+    """Raises InvalidInputError (FIELD_NOT_FINITE) for NaN or infinity."""
     if not torch.isfinite(distance).all():
         raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    return distance.to(points)
 
 
 def first_hits(field: SdfField, rays: Rays, entry: Tensor, exit_: Tensor, min_step: float, tolerance: float) -> Hits:

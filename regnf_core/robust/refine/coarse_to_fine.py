@@ -43,7 +43,7 @@ def coarse_to_fine(
     """The candidates that are left after all stages, best first."""
     for stage in stages:
         if stage.copies:
-            candidates = candidates.with_copies(stage.copies, SEARCH.copies_spread, context.generator)
+            candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
         few = surfaces.subsample(stage.points, context.generator)
         numbers = torch.arange(len(candidates))
         parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
@@ -70,7 +70,7 @@ def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context:
         history.append(Step(done.T, done.costs, size[:, :n].mean(1), size[:, n:].mean(1), done.width, stage.points))
         context.on_step()
 
-    settings = Settings(stage.adaptive, context.fix_scale, context.max_offset)
+    settings = Settings(stage.widest, context.fix_scale, context.max_offset)
     refined = minimize(few, candidates.T, stage.widths, settings, candidates.offsets, record)
     scores = disagreement(refined.residuals, stage.score_width) + context.penalty(refined.T)
     return PoseCandidates(refined.T, scores, refined.residuals.offset, tuple(history))

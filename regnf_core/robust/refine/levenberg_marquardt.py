@@ -18,11 +18,12 @@ from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
 class Settings:
     """What may move, and how the kernel widths are meant.
 
-    adaptive: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width` · fix_scale: poses
-    keep their scale · max_offset: of the surfaces, either way, object diameters; 0: the offset stays as it is.
+    widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
+    are · fix_scale: poses keep their scale · max_offset: of the surfaces, either way, object diameters; 0: the offset
+    stays as it is.
     """
 
-    adaptive: bool = False
+    widest: float = 0.0
     fix_scale: bool = False
     max_offset: float = REFINEMENT.max_offset
 
@@ -67,7 +68,7 @@ def minimize(
     damping = torch.full_like(T.scale, REFINEMENT.damping_start, dtype=torch.float64)
     width: Tensor | float = widths[-1]
     for lowest in widths:
-        width = adaptive_width(now, lowest) if settings.adaptive else lowest
+        width = adaptive_width(now, lowest, settings.widest) if settings.widest else lowest
         step = _step(now, width, damping, settings)
         T_tried = T.perturb(step[:, :7])
         tried = residuals(surfaces, T_tried, _moved_offset(now, step, settings))

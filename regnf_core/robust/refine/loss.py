@@ -13,13 +13,14 @@ from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_loss
 from regnf_core.robust.residuals import Residuals
 
 
-def adaptive_width(r: Residuals, lowest: float) -> Tensor:
-    """(H, 1) kernel widths: ``lowest``, or wider where the spread of a pose's residuals asks for it. Object diameters.
+def adaptive_width(r: Residuals, lowest: float, widest: float) -> Tensor:
+    """(H, 1) kernel widths: ``lowest``, or up to ``widest`` where the spread of a pose's residuals asks for it. Object
+    diameters.
 
     With a fixed narrow kernel, fields with errors everywhere would be fitted at the few places without errors.
     """
     spread = torch.quantile(r.values.abs(), REFINEMENT.spread_quantile, dim=1, keepdim=True)
-    return (REFINEMENT.spread_factor * spread).clamp(lowest, max(lowest, REFINEMENT.max_adaptive_width))
+    return (REFINEMENT.spread_factor * spread).clamp(lowest, max(lowest, widest))
 
 
 def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
@@ -27,6 +28,11 @@ def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
     if r.unobserved is None:
         return width
     return torch.where(r.unobserved, REFINEMENT.unobserved_width * width, width)
+
+
+def offset_prior(r: Residuals) -> float:
+    """The weight of "no offset", where one direction's samples weigh 1."""
+    return REFINEMENT.offset_prior if r.unobserved is None else REFINEMENT.offset_prior_partial
 
 
 def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
@@ -39,24 +45,24 @@ def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
     cost = 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
     if r.offset is None:
         return cost
-    prior: Tensor = 0.5 * REFINEMENT.offset_prior * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
+    prior: Tensor = 0.5 * offset_prior(r) * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
     return cost + prior
 
 
 def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tensor]:
-    """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64; each direction has the same total influence.
+    """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64, summed in the residuals' own precision.
 
-    An offset is the eighth unknown.
+    Each direction has the same total influence. An offset is the eighth unknown.
     """
     n, m = r.scene_count, r.values.shape[1] - r.scene_count
     weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
     weights = torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
-    J = r.jacobian_with_offset()
-    weighted = (J * weights[..., None]).mT.double()
-    H, b = weighted @ J.double(), (weighted @ r.values.double()[..., None]).squeeze(-1)
+    J = r.jacobian_with_offset().mT
+    weighted = J * weights[:, None]
+    H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()
     if r.offset is not None:
-        H[:, 7, 7] += REFINEMENT.offset_prior
-        b[:, 7] += REFINEMENT.offset_prior * r.offset
+        H[:, 7, 7] += offset_prior(r)
+        b[:, 7] += offset_prior(r) * r.offset
     return H, b
 
 

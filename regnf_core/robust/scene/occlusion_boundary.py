@@ -69,6 +69,8 @@ def _refined(viewpoint: Tensor, points: Tensor, normals: Tensor) -> Tensor:
 
 def _cosines(points: Tensor, normals: Tensor, viewpoints: Tensor) -> Tensor:
     """(K, N) cosines between the normals at points (N, 3) and the lines of sight to viewpoints (K, 3)."""
-    sight = viewpoints[:, None] - points
-    cosines: Tensor = (sight * normals).sum(-1) / sight.norm(dim=-1).clamp_min(1e-9)
+    along = viewpoints @ normals.T - (points * normals).sum(-1)
+    squares = torch.addmm(points.square().sum(-1), viewpoints, points.T, alpha=-2.0)
+    squares.add_(viewpoints.square().sum(-1, keepdim=True)).clamp_min_(torch.finfo(squares.dtype).tiny)
+    cosines: Tensor = along.div_(squares.sqrt_())
     return cosines

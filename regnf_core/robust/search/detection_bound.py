@@ -18,7 +18,8 @@ class DetectionBound:
     """Bounds the extent of the posed object by the detection box. Working frames: the box's center is 0.
 
     points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
-    box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge.
+    box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge. The edges of
+    flat boxes count as SEARCH.min_face_distance there: a flat thing's field may be much thicker than its box.
     """
 
     points: Tensor
@@ -36,17 +37,22 @@ class DetectionBound:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
         low, high = placed.amin(-2), placed.amax(-2)
-        reach = (0.5 + self.tolerance) * self.edges
+        reach = self.edges / 2 + self.tolerance * self._lengths
         within = (low >= -reach).all(-1) & (high <= reach).all(-1)
-        size = ((high - low) / self.edges).amax(-1)
+        size = ((high - low) / self._lengths).amax(-1)
         return within & (size >= SEARCH.min_share_of_detection)
 
     def penalty(self, T: Sim3) -> Tensor:
         """(H,): how badly the posed object fills the box, as a score: a Geman-McClure loss over the box's six faces."""
         placed = T.inverse().apply(self.points) @ self.axes  # (H, E, 3)
-        length = self.edges.clamp_min(SEARCH.min_face_distance)
-        off = torch.cat([placed.amin(-2) + self.edges / 2, placed.amax(-2) - self.edges / 2], -1) / length.repeat(2)
+        off = torch.cat([placed.amin(-2) + self.edges / 2, placed.amax(-2) - self.edges / 2], -1)
+        off = off / self._lengths.repeat(2)
         return SEARCH.box_weight * geman_mcclure_loss(off, SEARCH.box_width).mean(-1)
+
+    @property
+    def _lengths(self) -> Tensor:
+        """(3,): what distances from the faces are compared with."""
+        return self.edges.clamp_min(SEARCH.min_face_distance)
 
     def loosened(self, factor: float) -> DetectionBound:
         """The bound with ``factor`` times the tolerance."""

@@ -25,28 +25,36 @@ class DistanceGrid:
     def __init__(self, points: Tensor, normals: Tensor, spacing: float, margin: float) -> None:
         low, high = points.amin(0) - margin, points.amax(0) + margin
         self.low, self.high = low, high
-        self.counts = torch.full((3,), _CELLS)
-        self.edge = (high - low) / self.counts
+        self.edge = (high - low) / _CELLS
         axes = [low[k] + (torch.arange(_CELLS) + 0.5) * self.edge[k] for k in range(3)]
         centers = torch.cartesian_prod(*axes)
         value, gradient = nearest_sample_distance(points, normals, spacing, centers)
-        self._table = torch.cat([value[:, None], gradient], 1).contiguous()  # (V, 4)
-        self._centers = centers
+        at_zero = value - (gradient * centers).sum(-1)  # each cell holds a plane: at_zero + gradient . point
+        self._planes = torch.cat([at_zero[:, None], gradient], 1).view(-1)  # (4 V,)
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (M,) and gradient (M, 3): the nearest cell's, carried on to the point."""
-        inside = torch.minimum(torch.maximum(points, self.low), self.high)
-        cell = ((inside - self.low) / self.edge).long().clamp_(min=0)
-        cell = torch.minimum(cell, self.counts - 1)
-        index = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
-        entry = self._table.index_select(0, index)
-        gradient = entry[:, 1:]
-        offset = inside - self._centers.index_select(0, index)
-        beyond = points - inside
-        outside = beyond.norm(dim=-1)
-        value = entry[:, 0] + (gradient * offset).sum(-1) + outside
-        away = beyond / outside.clamp_min(1e-9)[:, None]
-        return value, torch.where((outside > 0)[:, None], away, gradient)
+        places = points.T.contiguous()
+        low, high, edge = (corner[:, None] for corner in (self.low, self.high, self.edge))
+        inside = torch.minimum(torch.maximum(places, low), high)
+        cell = ((inside - low) / edge).int().clamp_(0, _CELLS - 1)
+        index = cell[0].mul_(_CELLS).add_(cell[1]).mul_(_CELLS).add_(cell[2]).mul_(4)
+        value = self._planes.index_select(0, index)
+        gradient = torch.empty_like(places)
+        for k in range(3):
+            torch.index_select(self._planes, 0, index.add_(1), out=gradient[k])
+            value.addcmul_(gradient[k], inside[k])
+        self._go_on(value, gradient, places - inside)
+        return value, gradient.T
+
+    @staticmethod
+    def _go_on(value: Tensor, gradient: Tensor, beyond: Tensor) -> None:
+        """Outside of the grid, in place: the distance to the grid in addition, and the gradient away from it."""
+        out = beyond.any(0).nonzero().squeeze(-1)
+        away = beyond[:, out]
+        distance = away.norm(dim=0)
+        value[out] += distance
+        gradient[:, out] = away / distance.clamp_min(1e-9)
 
 
 def distance_grid(samples: Samples, spacing: float) -> DistanceGrid:

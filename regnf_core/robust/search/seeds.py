@@ -69,7 +69,9 @@ def _from_extents(
 def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest coordinates (K, 3) of the object along the box's axes, for every rotation."""
     parts = -(-len(rotations) * len(object_points) // _POINTS_AT_ONCE)
-    found = [_extremes(object_points @ (part @ box_axes)) for part in rotations.tensor_split(max(1, parts))]
+    rows = object_points.T.contiguous()
+    turns = (rotations @ box_axes).mT  # (K, 3, 3)
+    found = [_row_extremes(part.bmm(rows.expand(len(part), -1, -1))) for part in turns.tensor_split(max(1, parts))]
     low, high = (torch.cat(ends) for ends in zip(*found, strict=True))
     return low, high
 
@@ -77,6 +79,12 @@ def _object_extents(object_points: Tensor, rotations: Tensor, box_axes: Tensor) 
 def _extremes(points: Tensor) -> tuple[Tensor, Tensor]:
     """Lowest and highest coordinates (K, 3) of point sets (K, N, 3)."""
     return points.amin(1), points.amax(1)
+
+
+def _row_extremes(rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Lowest and highest numbers (K, 3) of rows (K, 3, N)."""
+    low, high = rows.aminmax(dim=2)
+    return low, high
 
 
 def _radius(points: Tensor, center: Tensor) -> Tensor:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import COVARIANCE, REFINEMENT
+from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.kernel import geman_mcclure_curvature, geman_mcclure_weight
-from regnf_core.robust.refine.loss import kernel_widths
+from regnf_core.robust.refine.loss import kernel_widths, offset_prior
 from regnf_core.robust.residuals import Residuals
 from regnf_core.robust.working_frame import WorkingFrame
 
@@ -53,15 +53,15 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     variances = _likely_variances(inliers.first(COVARIANCE.likelihood_samples))  # (lengths, nuggets)
     curvature = _curvature(inliers)
     if r.offset is not None:
-        curvature[7, 7] += REFINEMENT.offset_prior
+        curvature[7, 7] += offset_prior(r)
     B = torch.linalg.solve(curvature, (inliers.J * inliers.weights[:, None]).mT)[:7]  # (7, N)
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)
     rough = (variances * nuggets).sum()
     cov: Tensor = rough * (B @ B.mT)
-    distances = torch.cdist(inliers.points, inliers.points).float()
+    squares = torch.cdist(inliers.points, inliers.points).square_().float()
     for length, smooth in zip(COVARIANCE.lengths, (variances * (1.0 - nuggets)).sum(1), strict=True):
         if smooth > _TINY * variances.sum():
-            cov = cov + smooth * (B @ _smooth(distances, length).double() @ B.mT)
+            cov = cov + smooth * (B @ _smooth(squares, length).double() @ B.mT)
     symmetric: Tensor = (cov + cov.mT) / 2.0
     return scales[:7, None] * symmetric * scales[:7]
 
@@ -96,8 +96,9 @@ def _curvature(inliers: _Inliers) -> Tensor:
     return 0.5 * gauss_newton + floor
 
 
-def _smooth(distances: Tensor, length: Tensor | float) -> Tensor:
-    return torch.exp(-0.5 * (distances / length).square())
+def _smooth(squares: Tensor, length: Tensor | float) -> Tensor:
+    """The kernel at squared distances."""
+    return (squares * (-0.5 / length**2)).exp_()
 
 
 def _likely_variances(inliers: _Inliers) -> Tensor:
@@ -105,7 +106,7 @@ def _likely_variances(inliers: _Inliers) -> Tensor:
     lengths = torch.tensor(COVARIANCE.lengths, dtype=torch.float64)[:, None, None]
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)[:, None, None]
     alone = torch.eye(len(inliers.points), dtype=torch.float64)
-    smooth = _smooth(torch.cdist(inliers.points, inliers.points), lengths)[:, None]
+    smooth = _smooth(torch.cdist(inliers.points, inliers.points).square(), lengths)[:, None]
     K = (1.0 - nuggets) * smooth + (nuggets + _TINY) * alone  # (lengths, nuggets, N, N)
     factor = torch.linalg.cholesky(K)
     both = torch.cat([inliers.J, inliers.residuals[:, None]], 1).expand(*K.shape[:2], -1, -1)

@@ -10,17 +10,19 @@ from torch import Tensor
 from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import Alternative, Verdict
+from regnf_core.result import Alternative, Considered, Verdict
 from regnf_core.robust.constants import REFINEMENT, VERDICT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
+from regnf_core.robust.verdict.considered import considered_poses
 from regnf_core.robust.verdict.covariance import covariance, in_object_units
 from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
-from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
+from regnf_core.robust.verdict.evidence import gather_evidence
+from regnf_core.robust.verdict.lead import apart
 from regnf_core.robust.verdict.pose_features import pose_features
-from regnf_core.robust.verdict.probability import probability_model
+from regnf_core.robust.verdict.probability import pose_odds
 from regnf_core.robust.verdict.relation import relation
 
 
@@ -36,76 +38,90 @@ class Evaluation:
     """T_object_scene, in the fields' own frames."""
     metrics: dict[str, float]
     alternatives: list[Alternative]
+    considered: Considered
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Smaller is better: rejections last, then by the score."""
-        return self.verdict == "rejected", self.metrics["score"]
+        """Smaller is better: rejections last, then the less likely."""
+        return self.verdict == "rejected", -self.metrics["probability"]
 
 
 def evaluate_candidates(
     problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions
 ) -> Evaluation:
-    """Choose the best candidate by the held-out samples, and decide on its verdict. Needs surface offsets."""
+    """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets."""
     assert candidates.offsets is not None, "candidates refined on the fields have offsets"
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust)
-    winner = int(evidence.scores.argmin())
-    rivals = rival_numbers(problem, candidates, evidence, options.robust.rival_margin)
-    found, metrics = _verdict(problem, candidates[torch.tensor([winner])], evidence, (winner, len(rivals)), options)
+    features = pose_features(problem, candidates.T, candidates.offsets)
+    elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
+    alone, among = pose_odds().log_odds(features, elsewhere)
+    ranking = Ranking(evidence.scores.double(), alone)
+    winner = ranking.winner
+    rivals = rival_numbers(problem, candidates, ranking, options.robust.rival_margin)
+    unexplained = float(features["unexplained"][winner])
+    probability = float(among[winner].sigmoid())
+    quality = SceneQuality(problem.view.normal_roughness, unexplained)
+    found = evaluate_pose(evidence, winner, len(rivals), options.robust, quality, probability)
+    if not bool(problem.bound.admits(candidates.T[torch.tensor([winner])])[0]):
+        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
     T = problem.in_field_frames(candidates.T[winner])
-    alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, evidence, rivals, T)
+    alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, ranking, rivals, T)
     metrics = {
         **evidence.of(winner),
-        **metrics,
+        "probability": probability,
+        "unexplained_share_scene": unexplained,
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
         "occlusion_boundary_share_scene": problem.view.occlusion_boundary_share,
         "iterations": float(len(candidates.history)),
         "pose_candidates": float(len(candidates)),
     }
-    return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives)
+    considered = considered_poses(
+        problem, candidates, evidence, ranking.demerits, features["unexplained"], among, options.robust
+    )
+    return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered)
 
 
-def _verdict(
-    problem: RegistrationProblem,
-    best: PoseCandidates,
-    evidence: Evidence,
-    numbers: tuple[int, int],
-    options: RegistrationOptions,
-) -> tuple[PoseVerdict, dict[str, float]]:
-    """The verdict on the best pose (1,), and what else it rests on. numbers: of the pose in the evidence, of rivals."""
-    assert best.offsets is not None
-    features = pose_features(problem, best.T, best.offsets)
-    unexplained = float(features["unexplained"][0])
-    winner, rivals = numbers
-    quality = SceneQuality(problem.view.normal_roughness, unexplained)
-    probability = float(probability_model().logit(features).sigmoid()[0])
-    found = evaluate_pose(evidence, winner, rivals, options.robust, quality, probability)
-    if not bool(problem.bound.admits(best.T)[0]):
-        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
-    return found, {"probability": probability, "unexplained_share_scene": unexplained}
+@dataclass(frozen=True, eq=False)
+class Ranking:
+    """What candidates are compared by, on held-out samples: scores (H,), smaller is better, and the log odds (H,) of
+    being right, of each alone."""
+
+    scores: Tensor
+    log_odds: Tensor
+
+    @property
+    def demerits(self) -> Tensor:
+        """(H,), smaller is better: by the odds, which are the same for all that fits well; there, by the score."""
+        return self.scores - self.log_odds
+
+    @property
+    def winner(self) -> int:
+        """The number of the best one."""
+        return int(self.demerits.argmin())
 
 
 def rival_numbers(
-    problem: RegistrationProblem, candidates: PoseCandidates, evidence: Evidence, rival_margin: float
+    problem: RegistrationProblem, candidates: PoseCandidates, ranking: Ranking, rival_margin: float
 ) -> list[int]:
     """Numbers of the other poses that explain the held-out samples as well as the best one, best first."""
-    best = float(evidence.scores.min())
-    close = evidence.scores <= best + rival_margin + VERDICT.rival_margin_per_score * best
+    winner, scores = ranking.winner, ranking.scores
+    best = float(scores[winner])
+    close = scores <= best + rival_margin + VERDICT.rival_margin_per_score * best
+    close &= ranking.log_odds >= ranking.log_odds[winner] - VERDICT.rival_log_odds
     points = problem.model.extremal_points
-    ranked = distinct(candidates.T, evidence.scores, points, VERDICT.rivals_min_distance, len(candidates))
-    winner = int(evidence.scores.argmin())
+    ranked = distinct(candidates.T, ranking.demerits, points, VERDICT.rivals_min_distance, len(candidates))
     return [number for number in ranked.tolist() if number != winner and close[number]]
 
 
 def _alternatives(
-    problem: RegistrationProblem, candidates: PoseCandidates, evidence: Evidence, rivals: list[int], T_best: Sim3
+    problem: RegistrationProblem, candidates: PoseCandidates, ranking: Ranking, rivals: list[int], T_best: Sim3
 ) -> list[Alternative]:
     axis = problem.model.symmetry.axis
     alternatives = []
     for number in rivals:
         T = problem.in_field_frames(candidates.T[number])
-        alternatives.append(Alternative(T, float(evidence.scores[number]), relation(T, T_best, axis)))
+        alternatives.append(Alternative(T, float(ranking.scores[number]), relation(T, T_best, axis)))
     return alternatives
 
 
@@ -117,5 +133,6 @@ def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Ten
     r = residuals(problem.fit, candidates.T[best], offset)
     A, B = problem.fit.scene_samples, problem.fit.object_samples
     places = torch.cat([T.apply(A.points.double()), B.points.double()])
-    cov = covariance(r, adaptive_width(r, REFINEMENT.last_stage.widths[-1]), places)
+    last = REFINEMENT.last_stages[-1]
+    cov = covariance(r, adaptive_width(r, last.widths[-1], last.widest), places)
     return in_object_units(cov, T, problem.view.frame, problem.model.frame)

@@ -45,6 +45,10 @@ class Evidence:
     """Scene samples, near or not, that the object explains at twice the inlier distance."""
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
+    scene_signs: Tensor
+    """(H, N) uint8, see :class:`regnf_core.result.Considered`."""
+    object_signs: Tensor
+    """(H, M) uint8, likewise."""
     partial: bool = False
     """Part of the scene is known not to have been observed. That part is left out; the rest was measured."""
 
@@ -74,6 +78,7 @@ def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: Ro
     visible = (~occluded).sum(1).clamp_min(1)
     near = r.scene_to_object.abs() <= EVIDENCE.near
     coarse, explained_coarsely = _coarse(r, near, observed, EVIDENCE.coarse_distance * limit)
+    free = (to_scene > limit) & observed
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
     return Evidence(
         scores=disagreement(r, EVIDENCE.score_width),
@@ -81,14 +86,24 @@ def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: Ro
         share_scene=inlier[:, :n].sum(1) / near.sum(1).clamp_min(1),
         share_explained=inlier[:, :n].float().mean(1),
         occluded=occluded.float().mean(1),
-        violations=((to_scene > limit) & observed).sum(1) / visible,
+        violations=free.sum(1) / visible,
         residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
         coarse=coarse,
         tail_ratio=_tail_ratio(r),
         explained_coarsely=explained_coarsely,
         offsets=offsets,
+        scene_signs=_signs((~inlier[:, :n] & near, 1), (~inlier[:, :n] & ~near, 2)),
+        object_signs=_signs((~inlier[:, n:], 3), (occluded, 2), (free, 1)),
         partial=r.unobserved is not None,
     )
+
+
+def _signs(*marked: tuple[Tensor, int]) -> Tensor:
+    """(H, N) uint8: the number of the last that marks each sample; 0 where none does."""
+    signs = torch.zeros_like(marked[0][0], dtype=torch.uint8)
+    for where, number in marked:
+        signs[where] = number
+    return signs
 
 
 def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> tuple[Tensor, Tensor]:

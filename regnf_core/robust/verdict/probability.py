@@ -2,6 +2,9 @@
 
     logit P(right) = b + sum_k f_k(x_k),    f_k piecewise linear, increasing or decreasing as SPEAKS_FOR says
 
+There are two such sums. One knows the pose ``alone``. The other knows the candidates ``among`` which it is: its further
+feature is the pose's lead, how far its log odds alone lie above those of the next other answer (:mod:`.lead`).
+
 "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make equal.
 The functions are data: ``probability.json``, made by ``python -m benchmarks.worlds train`` from random worlds
 (docs/verdict.md).
@@ -18,8 +21,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from regnf_core.robust.verdict.lead import leads
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 
+LEAD = "lead"
+SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
 _FILE = "probability.json"
 
 
@@ -55,7 +61,7 @@ class ProbabilityModel:
             for name, one in stored["terms"].items()
         )
         for term in terms:
-            steps = term.values.diff() * (1 if SPEAKS_FOR[term.feature] else -1)
+            steps = term.values.diff() * (1 if SPEAKS_FOR_AMONG[term.feature] else -1)
             if not (bool((steps >= 0).all()) and bool((term.knots.diff() > 0).all())):
                 raise ValueError(f"the term of {term.feature} is not monotone")
         return cls(float(stored["bias"]), terms)
@@ -74,7 +80,24 @@ def _worst_if_nan(term: Term, x: Tensor) -> Tensor:
     return torch.where(x.isnan(), term.values.min(), term(x.nan_to_num(0.0)))
 
 
+@dataclass(frozen=True, eq=False)
+class PoseOdds:
+    """Both models of the file."""
+
+    alone: ProbabilityModel
+    among: ProbabilityModel
+
+    def log_odds(self, features: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
+        """(H,) and (H,): log odds of the candidates alone, and among each other.
+
+        features: each (H,) · apart: (H, H) bool, which candidates are other answers than which.
+        """
+        alone = self.alone.logit(features)
+        return alone, self.among.logit({**features, LEAD: leads(alone, apart)})
+
+
 @cache
-def probability_model() -> ProbabilityModel:
-    """The model that is shipped."""
-    return ProbabilityModel.from_dict(json.loads(files(__package__).joinpath(_FILE).read_text()))
+def pose_odds() -> PoseOdds:
+    """The models that are shipped."""
+    stored = json.loads(files(__package__).joinpath(_FILE).read_text())
+    return PoseOdds(*(ProbabilityModel.from_dict(stored[name]) for name in ("alone", "among")))

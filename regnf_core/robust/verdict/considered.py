@@ -1,0 +1,55 @@
+"""The poses that a registration has looked at to the end, with what speaks for and against each: for people to look at.
+
+Nothing is evaluated for it: the held-out samples tell it that the verdict rests on.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from regnf_core.geometry.pose_distance import distinct
+from regnf_core.options import RobustOptions
+from regnf_core.result import Considered, ConsideredPose
+from regnf_core.robust.constants import VERDICT
+from regnf_core.robust.problem import RegistrationProblem
+from regnf_core.robust.refine.pose_candidates import PoseCandidates
+from regnf_core.robust.verdict.criteria import SceneQuality, evaluate_pose
+from regnf_core.robust.verdict.evidence import Evidence
+
+_MOST = 6
+
+
+def considered_poses(
+    problem: RegistrationProblem,
+    candidates: PoseCandidates,
+    evidence: Evidence,
+    demerits: Tensor,
+    unexplained: Tensor,
+    log_odds: Tensor,
+    options: RobustOptions,
+) -> Considered:
+    """The best of the candidates that differ, the likeliest first. demerits, unexplained, log_odds: (H,) of each."""
+    points = problem.model.extremal_points
+    numbers = distinct(candidates.T, demerits, points, VERDICT.rivals_min_distance, len(candidates))[:_MOST].tolist()
+    poses = []
+    for number in numbers:
+        probability = float(log_odds[number].sigmoid())
+        quality = SceneQuality(problem.view.normal_roughness, float(unexplained[number]))
+        found = evaluate_pose(evidence, number, 0, options, quality, probability)
+        if not bool(problem.bound.admits(candidates.T[torch.tensor([number])])[0]):
+            reason = "OUTSIDE_DETECTION"
+        else:
+            reason = found.reason
+        metrics = {**evidence.of(number), "probability": probability}
+        metrics["unexplained_share_scene"] = float(unexplained[number])
+        poses.append(ConsideredPose(problem.in_field_frames(candidates.T[number]), reason, metrics))
+    chosen = torch.tensor(numbers)
+    scene, obj = problem.held_out.scene_samples, problem.held_out.object_samples
+    return Considered(
+        poses,
+        problem.view.frame.out_of(scene.points).float(),
+        problem.model.frame.out_of(obj.points).float(),
+        evidence.scene_signs[chosen],
+        evidence.object_signs[chosen],
+    )
