@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.fields.positional_encoding import PositionalEncoding
 from regnf_fit.options import NetworkOptions
 

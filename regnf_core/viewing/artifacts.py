@@ -14,22 +14,16 @@ from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.geometry.symmetry import Symmetries
-from regnf_core.result import RegistrationResult
+from regnf_core.result import Considered, RegistrationResult
 from regnf_core.viewing.document import result_document, trace_document
 from regnf_core.viewing.ply import write_ply
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
 
 CONTEXT_COLOR = (0.80, 0.82, 0.85)
-_ALWAYS = (
-    "scene_points.ply",
-    "object_points.ply",
-    "aligned.ply",
-    "residuals.npz",
-    "trace.json",
-    "transform.npy",
-    "preview.png",
-    "result.json",
-)
+_CLOUDS = ("scene_points.ply", "object_points.ply", "aligned.ply", "residuals.npz")
+_CONTEXT, _PICTURE = "context_points.ply", "preview.png"
+PICTURES = (*_CLOUDS, _CONTEXT, _PICTURE)
+"""What ``write_pictures`` may write."""
 
 
 def write_artifacts(
@@ -44,30 +38,59 @@ def write_artifacts(
     """Write every artifact of ``result`` into the existing ``directory`` and return the files' names.
 
     ``truth``, ``symmetries``, ``object_name``, ``candidates`` and ``fields`` are for the result document.
+    """
+    said: dict[str, Any] = {"object_name": object_name, "candidates": candidates, "fields": fields}
+    return write_pictures(result, directory) + write_result(result, directory, truth, symmetries, **said)
+
+
+def write_result(
+    result: RegistrationResult,
+    directory: Path,
+    truth: Sim3 | None = None,
+    symmetries: Symmetries | None = None,
+    **said: Any,
+) -> list[str]:
+    """What was found: trace.json, transform.npy (T_object_scene, 4x4), considered.npz (what the held-out samples say of
+    each pose that was judged, if the result has it), result.json. said: as ``result_document``.
+    """
+    _write_json(directory / "trace.json", trace_document(result.trace))
+    np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
+    document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)
+    _write_json(directory / "result.json", document)
+    names = ["trace.json", "transform.npy", "result.json"]
+    if result.considered is not None:
+        _write_considered(directory / "considered.npz", result.considered)
+        names.append("considered.npz")
+    return names
+
+
+def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
+    """What people look at, of a result with clouds.
 
     scene_points.ply (scene frame), object_points.ply (object frame), aligned.ply (both, scene frame, colored by
-    source), context_points.ply (the scene around the detection, if the result has it), residuals.npz,
-    trace.json, transform.npy (T_object_scene, 4x4), preview.png, result.json.
+    source), context_points.ply (the scene around the detection, if the result has it), residuals.npz, preview.png.
     """
     scene, obj = result.scene_samples, result.object_samples
     placed = obj.transformed(result.T_object_scene.inverse())
     _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
     _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))
-    names = list(_ALWAYS)
+    names = list(_CLOUDS)
     if result.surroundings is not None and len(result.surroundings.points):
-        _write_cloud(directory / "context_points.ply", (result.surroundings, CONTEXT_COLOR))
-        names.append("context_points.ply")
+        _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
+        names.append(_CONTEXT)
     arrays: dict[str, Any] = {name: _float32(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
-    _write_json(directory / "trace.json", trace_document(result.trace))
-    np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
-    registration_picture(result).save(directory / "preview.png")
-    device = scene.points.device
-    said: dict[str, Any] = {"object_name": object_name, "candidates": candidates, "fields": fields}
-    document = result_document(result, truth, symmetries, device, **said)
-    _write_json(directory / "result.json", document)
-    return names
+    registration_picture(result).save(directory / _PICTURE)
+    return [*names, _PICTURE]
+
+
+def _write_considered(path: Path, considered: Considered) -> None:
+    """The held-out samples, and what they say of each pose that was judged."""
+    points = {name: _float32(getattr(considered, name)) for name in ("scene_points", "object_points")}
+    signs = {name: getattr(considered, name).cpu().numpy() for name in ("scene_signs", "object_signs")}
+    arrays: dict[str, Any] = points | signs
+    np.savez(path, **arrays)
 
 
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:

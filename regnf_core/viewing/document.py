@@ -15,7 +15,7 @@ from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.hints import HINTS
-from regnf_core.result import Alternative, IterationRecord, RegistrationResult
+from regnf_core.result import Alternative, ConsideredPose, IterationRecord, RegistrationResult
 from regnf_core.verdicts import VERDICT_REASONS
 from regnf_core.version import __version__
 from regnf_core.viewing.uncertainty import COVARIANCE_ORDERING, uncertainty
@@ -52,6 +52,7 @@ def result_document(
         "T_scene_object": result.T_object_scene.inverse().to_dict(),
         "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
         "alternatives": [_alternative(other) for other in result.alternatives],
+        "considered": None if result.considered is None else [_considered(one) for one in result.considered.poses],
         **_covariance(result.covariance),
         "symmetry": None if result.symmetry is None else asdict(result.symmetry),
         "metrics": {name: _json_number(value) for name, value in metrics.items()},
@@ -113,6 +114,15 @@ def _covariance(covariance: Tensor | None) -> dict[str, Any]:
         "covariance": rows,
         "covariance_ordering": list(COVARIANCE_ORDERING),
         "uncertainty": uncertainty(covariance),
+    }
+
+
+def _considered(one: ConsideredPose) -> dict[str, Any]:
+    return {
+        "T_object_scene": one.T_object_scene.to_dict(),
+        "reason": one.reason,
+        "detail": VERDICT_REASONS.get(one.reason, ""),
+        "metrics": {name: _json_number(value) for name, value in one.metrics.items()},
     }
 
 

@@ -80,13 +80,17 @@ def _placed(samples: SurfaceSamples, T_object_scene: Sim3, color: tuple[float, f
     return _surfels(samples.transformed(T_object_scene.inverse()), color)
 
 
+def residual_colors_of(result: RegistrationResult, name: str) -> Floats:
+    """(N, 3) colors of the result's residuals of that name: ``scene_residuals`` or ``object_residuals``."""
+    sizes = result.residuals[name].double().abs().cpu().numpy()
+    return residual_colors(sizes / (_RAMP_TOP * result.metrics["object_diameter"]))
+
+
 def _residual_surfels(result: RegistrationResult, scene: Surfels, placed: Surfels) -> Surfels:
-    top = _RAMP_TOP * result.metrics["object_diameter"]
-    parts = []
-    for cloud, name in ((scene, "scene_residuals"), (placed, "object_residuals")):
-        sizes = result.residuals[name].double().abs().cpu().numpy()
-        parts.append(Surfels(cloud.points, cloud.normals, residual_colors(sizes / top)))
-    return Surfels.join(*parts)
+    return Surfels.join(
+        Surfels(scene.points, scene.normals, residual_colors_of(result, "scene_residuals")),
+        Surfels(placed.points, placed.normals, residual_colors_of(result, "object_residuals")),
+    )
 
 
 def _best_direction(scene: Surfels, up: Floats) -> Floats:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import render_weights
 from regnf_fit.images.rays import PixelRays

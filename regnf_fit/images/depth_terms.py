@@ -13,7 +13,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_fit.images.depth_supervision import DepthSupervision
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.rays import PixelRays

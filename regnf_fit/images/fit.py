@@ -16,16 +16,20 @@ import torch
 from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.observation import Observation
+from regnf_core.schema.color import COLOR
 from regnf_core.schema.observation_grid import OBSERVATION
 from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
+from regnf_fit.images.color_export import stored_color
+from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
+from regnf_fit.images.held_out_images import held_out_images, likeness
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
-from regnf_fit.images.preparation import prepare
+from regnf_fit.images.preparation import PreparedImages, prepare
 from regnf_fit.images.sdfstudio_export import write_sdfstudio
 from regnf_fit.images.trainer import Trainer
 from regnf_fit.options import FitProgress
@@ -78,12 +82,15 @@ def reconstruct(
     held_out = prepared.held_out.to(torch_device)
     pose_shift = None
     if trainer.poses is not None:
-        seen = observe(trainer.poses.corrected(images), options.observation_voxels, prepared.spread)
+        images = trainer.poses.corrected(images)
+        seen = observe(images, options.observation_voxels, prepared.spread)
         write = replace(write, observation=seen)
         with torch.no_grad():
             held_out = trainer.poses.correct(held_out)
         pose_shift = trainer.poses.median_shift()
-    write(trainer.averaged, files.output)
+    chosen = held_out_images(len(images.colors))
+    color = _fit_color(trainer, prepared, chosen, seed)
+    write(trainer, files.output, color)
     if files.pictures:
         _draw(trainer.averaged, prepared.bounds, files.output.with_suffix(".png"))
     if files.sdfstudio is not None:
@@ -91,13 +98,28 @@ def reconstruct(
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
     errors = evaluate(trainer.averaged, held_out, prepared.size)
+    alike = None if color is None else likeness(trainer.averaged, color, images, chosen, prepared.size)
     return ReconstructionReport(
         loss=loss,
+        psnr=None if alike is None else alike.psnr,
+        ssim=None if alike is None else alike.ssim,
         pose_shift=pose_shift,
         iterations=options.iterations,
         seconds=time.monotonic() - started,
         **asdict(errors),
     )
+
+
+def _fit_color(trainer: Trainer, prepared: PreparedImages, held_out: list[int], seed: int) -> SurfaceColor | None:
+    """The color of the finished geometry, without the images ``held_out``; None where no color is wanted or seen."""
+    if not trainer.learns_color:
+        return None
+    rays = prepared.training
+    rays = rays.take(~torch.isin(rays.images, torch.tensor(held_out, dtype=rays.images.dtype)))
+    rays = rays.to(trainer.field.table.device)
+    with torch.no_grad():
+        rays = rays if trainer.poses is None else trainer.poses.correct(rays)
+    return fit_color(trainer.averaged, rays, prepared.size, seed)
 
 
 def pick_device(name: str) -> torch.device:
@@ -131,7 +153,7 @@ def _train(
         if (done in snapshots or done in pictures) and not trainer.is_finite():
             raise FitDivergedError(f"the fit diverged before iteration {done}")
         if done in snapshots:
-            write(trainer.averaged, snapshot_path(files.output, snapshots[done]))
+            write(trainer, snapshot_path(files.output, snapshots[done]))
         if done in pictures:
             drawn = snapshot_path(files.output, pictures[done]).with_suffix(".png")
             _draw(trainer.averaged, write.bounds, drawn)
@@ -166,9 +188,16 @@ class _Writer:
     source: dict[str, Any]
     observation: Observation | None
 
-    def __call__(self, field: RadianceField, path: Path) -> None:
+    def __call__(self, trainer: Trainer, path: Path, color: SurfaceColor | None = None) -> None:
+        """The moving average of what ``trainer`` has learned. color: the geometry's, where it is finished."""
+        field = trainer.averaged
         description = field.description(self.bounds, self.label, self.source)
         tensors = field.tensors()
+        description["inverse_deviation"] = float(trainer.sharpness().detach())
+        if trainer.learns_color:
+            half = field.options.half_table
+            description[COLOR], colors = stored_color(field) if color is None else color.stored(half)
+            tensors |= colors
         if self.observation is not None:
             grid, tensors[OBSERVATION] = self.observation.stored()
             description[OBSERVATION] = asdict(grid)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -20,9 +19,8 @@ _BISECTIONS = 6
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """psnr: decibels, over rays that met a surface · depth errors: field units, where a depth was measured too."""
+    """Depth errors: field units, of rays that met a surface, where a depth was measured too."""
 
-    psnr: float | None
     depth_error: float | None
     depth_error_median: float | None
     eikonal_error: float
@@ -30,11 +28,10 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class FirstHits:
-    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3) · colors (R, 3)."""
+    """Of R rays: depths (R,) of the first surface, 0 where none was met · normals (R, 3), not of unit length."""
 
     depths: Tensor
     normals: Tensor
-    colors: Tensor
 
 
 @torch.no_grad()
@@ -43,8 +40,8 @@ def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
     parts = [_traced(field, rays.take(index), size) for index in _chunks(len(rays))]
     if not parts:
         empty = torch.zeros(0, 3)
-        return FirstHits(empty[:, 0], empty, empty)
-    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals", "colors")))
+        return FirstHits(empty[:, 0], empty)
+    return FirstHits(*(torch.cat([getattr(p, name) for p in parts]) for name in ("depths", "normals")))
 
 
 @torch.no_grad()
@@ -53,15 +50,10 @@ def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutError
     rays = rays.take(~rays.background)
     hits = first_hits(field, rays, size)
     met = hits.depths > 0.0
-    psnr = None
-    if met.any():
-        error = (hits.colors[met] - rays.colors[met]).square().mean()
-        psnr = -10.0 * math.log10(max(float(error), 1e-10))
     both = met & (rays.depths > 0.0)
     depth_error = (hits.depths - rays.depths).abs()[both]
     norms = hits.normals[met].norm(dim=1)
     return HeldOutErrors(
-        psnr=psnr,
         depth_error=float(depth_error.mean()) if both.any() else None,
         depth_error_median=float(depth_error.median()) if both.any() else None,
         eikonal_error=float((norms - 1.0).abs().mean()) if met.any() else 1.0,
@@ -95,8 +87,4 @@ def _traced(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
         low, high = torch.where(matter, low, middle), torch.where(matter, middle, high)
     points = rays.at(high[:, None])[:, 0]
     normals = function.value_and_gradient(points)[1]
-    directions = torch.nn.functional.normalize(rays.directions, dim=1)
-    colors = field.color(
-        points, directions, torch.nn.functional.normalize(normals, dim=1), field.distance_and_feature(points)[1]
-    )
-    return FirstHits(torch.where(hit, high, 0.0), normals, colors)
+    return FirstHits(torch.where(hit, high, 0.0), normals)

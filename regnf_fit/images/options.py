@@ -97,7 +97,9 @@ class ReconstructionReport:
     loss: float
     """Mean over the last iterations."""
     psnr: float | None
-    """Of the colors, decibels; None: no ray met a surface."""
+    """Of the field's pictures to whole images held out, decibels, where they show the thing; None: none was."""
+    ssim: float | None
+    """Their mean structural similarity, up to 1."""
     depth_error: float | None
     """Mean |rendered - measured depth|, field units, where both are; None without depth. Sensor noise is part of it."""
     depth_error_median: float | None

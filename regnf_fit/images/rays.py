@@ -82,3 +82,9 @@ def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: Local
         deviations=picked(None if planes is None else planes.deviations),
         images=torch.from_numpy(image),
     )
+
+
+def pixel_axes(images: PosedImages) -> Tensor:
+    """(N, 2, 3) float32: by what a ray's direction changes to the pixel right of its own, and to the one below it."""
+    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
+    return torch.from_numpy(T_world_pixel[:, :, :2].transpose(0, 2, 1).copy()).float()

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from regnf_core.fields.neus_facto import NeusFactoFunction
+from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_fit.images.camera_poses import CameraPoses, expected_errors
 from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
 from regnf_fit.images.depth_supervision import DepthSupervision, supervise
@@ -67,6 +67,11 @@ class Trainer:
             self.poses = CameraPoses(prepared.images, errors).to(device)
             self.optimizer.add_param_group({"params": [self.poses.steps], "lr": options.pose_rate})
         self._rates = [group["lr"] for group in self.optimizer.param_groups]
+
+    @property
+    def learns_color(self) -> bool:
+        """Whether the color's network is fitted at all."""
+        return self._data is None or self.options.color_rays > 0
 
     def mean_loss(self) -> float:
         """Of the iterations since the last call; NaN before the first."""

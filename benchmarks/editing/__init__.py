@@ -1,0 +1,1 @@
+"""Edited scenes: pictures of them, and how near they come to the truth (docs/editing.md)."""

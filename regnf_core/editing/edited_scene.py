@@ -1,0 +1,187 @@
+"""An edited scene as a field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from regnf_core.editing.clearing import Clearing
+from regnf_core.editing.parts import SCENE_PART, Part, PartedField
+from regnf_core.editing.placed_object import PlacedObject
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import has_color, inverse_deviation_of
+from regnf_core.fields.observation import Observation
+from regnf_core.geometry.box import OrientedBox
+
+_PLAIN = 0.8
+"""Color of a part that has none, where another has."""
+
+
+@dataclass
+class _Found:
+    """At N points: distance (N,), gradient (N, 3), part (N,)."""
+
+    distance: Tensor
+    gradient: Tensor
+    part: Tensor
+
+    @classmethod
+    def nothing_at(cls, points: Tensor) -> _Found:
+        distance = torch.zeros_like(points[:, 0])
+        return cls(distance, torch.zeros_like(points), torch.full_like(distance, SCENE_PART, dtype=torch.int64))
+
+    def at(self, index: Tensor) -> _Found:
+        return _Found(self.distance[index], self.gradient[index], self.part[index])
+
+    def enter(self, index: Tensor, values: _Found) -> None:
+        self.distance[index], self.gradient[index], self.part[index] = values.distance, values.gradient, values.part
+
+
+class EditedScene:
+    """The scene less what was cleared, and the objects: as solids, so the smallest distance counts.
+
+    clearings: places that the edits clear · objects: each with the number of its part · parts: the scene's, then one an
+    edit · places: the box of each edit's thing, scene frame · observation: of the edited scene; None where the scene
+    has none. Made by ``compose``.
+    """
+
+    def __init__(
+        self,
+        scene: SdfField,
+        clearings: Sequence[Clearing],
+        objects: Sequence[tuple[int, PlacedObject]],
+        parts: Sequence[Part],
+        places: Sequence[OrientedBox] = (),
+        observation: Observation | None = None,
+    ) -> None:
+        self.scene = scene
+        self.clearings = tuple(clearings)
+        self.objects = tuple(objects)
+        self.parts = tuple(parts)
+        self.places = tuple(places)
+        self.observation = observation
+        if any(has_color(part.field) for part in self.parts):
+            self.color = self._color
+
+    @property
+    def bounds(self) -> Tensor:
+        """(2, 3) float64 on the CPU: the scene's, and what objects reach beyond them."""
+        boxes = torch.stack([self.scene.bounds, *(thing.bounds for _, thing in self.objects)])
+        return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
+
+    @property
+    def device(self) -> torch.device:
+        """That of the scene."""
+        return self.scene.device
+
+    @property
+    def inverse_deviation(self) -> float | None:
+        """The scene's own."""
+        return inverse_deviation_of(self.scene)
+
+    def to(self, device: torch.device | str) -> EditedScene:
+        """The same with all parameters on another device."""
+        moved = [(number, thing.to(device)) for number, thing in self.objects]
+        parts = [Part(part.field.to(device), part.T_field_scene, part.tint, part.name) for part in self.parts]
+        return EditedScene(self.scene.to(device), self.clearings, moved, parts, self.places, self.observation)
+
+    @torch.no_grad()
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """Signed distance (N,) float32 at points (N, 3), scene units."""
+        return self._evaluate(points, False)[0]
+
+    @torch.no_grad()
+    def signed_distance_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and its gradient (N, 3) at points (N, 3)."""
+        return self._evaluate(points, True)[:2]
+
+    def part_at(self, points: Tensor) -> Tensor:
+        """(N,) int64, which part is nearest to points (N, 3)."""
+        return self.signed_distance_and_part(points)[1]
+
+    @torch.no_grad()
+    def signed_distance_and_part(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (N,) and the nearest part (N,) int64 at points (N, 3)."""
+        distance, _, part = self._evaluate(points, False)
+        if isinstance(self.scene, PartedField):
+            own = (part == SCENE_PART).nonzero().squeeze(-1)
+            part[own] = self.scene.part_at(points.to(part.device)[own])
+        return distance, part
+
+    def _evaluate(self, points: Tensor, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Distance (N,), gradient (N, 3), 0 unless it is asked for, and part (N,) at points (N, 3)."""
+        points = points.to(device=self.device, dtype=torch.float32)
+        asked = torch.ones(len(points), dtype=torch.bool, device=points.device)
+        found = _Found.nothing_at(points)
+        if self.clearings:
+            inside = torch.stack([clearing.reaches(points) < 0.0 for clearing in self.clearings]).any(0)
+            within = inside.nonzero().squeeze(-1)
+            without_scene, decided = self._without_scene(points[within], with_gradient)
+            found.enter(within[decided], without_scene.at(decided))
+            asked[within[decided]] = False
+        rest = asked.nonzero().squeeze(-1)
+        found.enter(rest, self._with_scene(points[rest], with_gradient))
+        return found.distance, found.gradient, found.part
+
+    def _without_scene(self, points: Tensor, with_gradient: bool) -> tuple[_Found, Tensor]:
+        """What is at points (N, 3) if the scene's own distance does not count, and whether it does not (N,).
+
+        With no matter of the scene anywhere near, and with nothing but it: where objects and continued ground are
+        nearer than the second of these, the result is the same for all distances of the scene.
+        """
+        empty, full = _Found.nothing_at(points), _Found.nothing_at(points)
+        empty.distance.fill_(torch.inf)
+        full.distance.fill_(-torch.inf)
+        for clearing in self.clearings:
+            limits = clearing.limits(points, with_gradient)
+            for bound in (empty, full):
+                bound.distance, bound.gradient = limits.apply(bound.distance, bound.gradient)
+        self._add_objects(empty, points, full.distance.clamp_min(0.0), with_gradient)
+        return empty, empty.distance <= full.distance
+
+    def _with_scene(self, points: Tensor, with_gradient: bool) -> _Found:
+        found = _Found.nothing_at(points)
+        if with_gradient:
+            distance, gradient = self.scene.signed_distance_and_gradient(points)
+            found.gradient = gradient.to(points)
+        else:
+            distance = self.scene.signed_distance(points)
+        found.distance = distance.to(points)
+        for clearing in self.clearings:
+            near = (clearing.reaches(points) < found.distance.abs()).nonzero().squeeze(-1)
+            changed = clearing.limits(points[near], with_gradient).apply(found.distance[near], found.gradient[near])
+            found.distance[near], found.gradient[near] = changed
+        self._add_objects(found, points, found.distance.clamp_min(0.0), with_gradient)
+        return found
+
+    def _add_objects(self, found: _Found, points: Tensor, reach: Tensor, with_gradient: bool) -> None:
+        """Join the objects whose boxes are no farther from points (N, 3) than ``reach`` (N,)."""
+        for number, thing in self.objects:
+            near = (thing.distance_to_box(points) <= reach).nonzero().squeeze(-1)
+            if with_gradient:
+                here, slope = thing.signed_distance_and_gradient(points[near])
+            else:
+                here, slope = thing.signed_distance(points[near]), found.gradient[near]
+            nearer = here < found.distance[near]
+            parts = torch.full_like(near[nearer], number)
+            found.enter(near[nearer], _Found(here[nearer], slope[nearer], parts))
+
+    @torch.no_grad()
+    def _color(self, points: Tensor, directions: Tensor) -> Tensor:
+        """Color (N, 3) of points (N, 3) seen along unit directions (N, 3): that of the nearest part."""
+        points, directions = (values.to(device=self.device, dtype=torch.float32) for values in (points, directions))
+        numbers = self.part_at(points)
+        colors = torch.full_like(points, _PLAIN)
+        for number in torch.unique(numbers).tolist():
+            part = self.parts[number]
+            if has_color(part.field):
+                chosen = (numbers == number).nonzero().squeeze(-1)
+                at, along = points[chosen], directions[chosen]
+                if part.T_field_scene is not None:
+                    at = part.T_field_scene.apply(at.double()).float()
+                    along = along @ part.T_field_scene.rotation.to(along).T
+                colors[chosen] = part.field.color(at, along).to(points)
+        return colors

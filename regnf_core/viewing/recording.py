@@ -1,0 +1,36 @@
+"""A recording of a registration for the viewer of rerun (https://rerun.io), which the extra ``rerun`` brings."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from regnf_core.errors import MissingExtraError
+from regnf_core.files import RECORDING_SUFFIX, atomic_path, new_file
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.result import RegistrationResult
+
+
+def write_recording(
+    result: RegistrationResult,
+    path: str | Path,
+    detection: OrientedBox | None = None,
+    object_name: str | None = None,
+) -> Path:
+    """Write the recording of a result with clouds, whole or not at all; its path.
+
+    detection: scene frame, drawn if it is known · object_name: for the text of the verdict.
+    Neither is a viewer started nor a connection opened.
+    Raises MissingExtraError, InvalidOptionsError (no name of a recording), InvalidInputError (FILE_IS_FOLDER,
+    RECORDING_DISABLED), OSError.
+    """
+    target = new_file(path, RECORDING_SUFFIX)
+    if find_spec("rerun") is None:
+        raise MissingExtraError.of(["rerun"], ["rerun"])
+    from regnf_core.viewing.recording_content import recorded
+
+    content = recorded(result, detection, object_name)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(target) as part:
+        part.write_bytes(content)
+    return target

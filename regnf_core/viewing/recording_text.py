@@ -1,0 +1,40 @@
+"""The texts of a recording: the verdict as Markdown, and what is said of a pose that was judged."""
+
+from __future__ import annotations
+
+from regnf_core.hints import HINTS
+from regnf_core.result import ConsideredPose, RegistrationResult
+from regnf_core.verdicts import VERDICT_REASONS
+
+
+def label_of(one: ConsideredPose) -> str:
+    """Probability and reason, short."""
+    return f"{_percent(one.metrics.get('probability'))}, {one.reason}"
+
+
+def verdict_text(result: RegistrationResult, object_name: str | None = None) -> str:
+    """Verdict, reason, probability, hint, the transform and the poses that were judged, as Markdown."""
+    reason = result.verdict_reason
+    lines = [f"# {result.verdict}", "", f"**{reason}**: {VERDICT_REASONS.get(reason, '')}", ""]
+    if (hint := HINTS.get(reason)) is not None:
+        lines += [hint, ""]
+    if object_name is not None:
+        lines += [f"Object: `{object_name}`", ""]
+    if result.probability is not None:
+        lines += [f"Probability that the pose is right: {_percent(result.probability)}", ""]
+    lines += ["T_scene_object (object coordinates to scene coordinates):", "", "```"]
+    lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_object_scene.inverse().matrix().tolist()]
+    lines += ["```", ""]
+    if result.considered is not None:
+        lines += ["Poses that were judged (`scene/considered`):", "", "| | probability | reason | |"]
+        lines += ["|---|---|---|---|"]
+        lines += [
+            f"| {number} | {_percent(one.metrics.get('probability'))} | {one.reason} | "
+            f"{VERDICT_REASONS.get(one.reason, '')} |"
+            for number, one in enumerate(result.considered.poses)
+        ]
+    return "\n".join(lines)
+
+
+def _percent(probability: float | None) -> str:
+    return "no probability" if probability is None else f"{100 * probability:.1f} %"

@@ -1,0 +1,131 @@
+"""The color of a field whose geometry is done: a hash grid and a small network, fitted to pixels at the surface.
+
+The geometry does not change. Where rays meet it is computed once, so that an iteration is cheap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from regnf_core.fields.color_head import Appearance, ColorHead
+from regnf_core.fields.hash_encoding import HashEncoding
+from regnf_core.schema.color import TABLE, DirectionEncoding, NetworkColor, color_tensors
+from regnf_core.schema.hash_grid_config import HashGridConfig
+from regnf_fit.images.held_out import first_hits
+from regnf_fit.images.network import RadianceField
+from regnf_fit.images.rays import PixelRays
+from regnf_fit.network import GRID_RADIUS, random_layers
+
+_RAYS = 60_000
+"""At most so many pixels are fitted to."""
+_BATCH = 2048
+_ITERATIONS = 600
+_TABLE_RATE, _NETWORK_RATE = 1e-2, 2e-3
+_TABLE_SPREAD = 1e-4
+_DIRECTIONS = 2
+"""Frequencies of the direction: highlights of a fitted color are wide."""
+_SAME_SURFACE = 0.01
+"""Diagonals between where a ray meets the field and the depth that was measured."""
+_CHUNK = 1 << 14
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What N rays meet: the surface as a color sees it, unit directions (N, 3), the pixels' colors (N, 3)."""
+
+    appearance: Appearance
+    directions: Tensor
+    colors: Tensor
+
+    def take(self, index: Tensor) -> _Seen:
+        one = self.appearance
+        picked = Appearance(one.position[index], one.gradient[index], one.hidden[index])
+        return _Seen(picked, self.directions[index], self.colors[index])
+
+
+class SurfaceColor(nn.Module):
+    """A trainable :class:`ColorHead`. hidden: what the geometry's last layer is given · grid: of its own table."""
+
+    def __init__(self, hidden: int, width: int, grid: HashGridConfig, generator: torch.Generator) -> None:
+        super().__init__()
+        direction = DirectionEncoding("frequency", _DIRECTIONS)
+        self.form = NetworkColor("network", direction=direction, gradient="unit", hash=grid, grid_radius=GRID_RADIUS)
+        weights, biases = random_layers([self.form.own_width + hidden, width, width, 3], generator)
+        self.weights, self.biases = nn.ParameterList(weights), nn.ParameterList(biases)
+        table = torch.rand(grid.entries, grid.features_per_level, generator=generator)
+        self.table = nn.Parameter((2.0 * table - 1.0) * _TABLE_SPREAD)
+
+    def head(self) -> ColorHead:
+        """The color of the present parameters, differentiable with respect to them."""
+        assert self.form.hash is not None
+        return ColorHead(self.form, tuple(self.weights), tuple(self.biases), HashEncoding(self.form.hash, self.table))
+
+    def stored(self, half_table: bool) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """The description's entry, and the tensors by their names in the file."""
+        table = self.table.detach()
+        tensors = {TABLE: table.half() if half_table else table}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"] = weight.detach(), bias.detach()
+        return asdict(self.form), color_tensors({name: tensor.cpu().numpy() for name, tensor in tensors.items()})
+
+
+def fit_color(field: RadianceField, rays: PixelRays, size: float, seed: int) -> SurfaceColor | None:
+    """The color of ``field``'s surface in the pixels of ``rays``; None where no ray meets it. size: of the bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    device = rays.origins.device
+    shown = _of_one_surface(rays).nonzero()[:, 0]
+    chosen = shown[torch.randperm(len(shown), generator=generator)[:_RAYS].to(device)]
+    seen = _seen(field, rays.take(chosen), size)
+    if seen is None:
+        return None
+    hidden = seen.appearance.hidden.shape[1]
+    color = SurfaceColor(hidden, field.options.hidden_width, field.options.grid, generator).to(device)
+    networks = [*color.weights, *color.biases]
+    groups = [{"params": [color.table], "lr": _TABLE_RATE, "eps": 1e-15}, {"params": networks, "lr": _NETWORK_RATE}]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _ITERATIONS)
+    for _ in range(_ITERATIONS):
+        batch = seen.take(torch.randint(len(seen.colors), (_BATCH,), generator=generator).to(device))
+        loss = (color.head()(batch.appearance, batch.directions) - batch.colors).square().mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+    return color.requires_grad_(False)
+
+
+@torch.no_grad()
+def appearance_of(field: RadianceField, points: Tensor) -> Appearance:
+    """What a color sees of the geometry at points (N, 3)."""
+    function, parts = field.function(), []
+    for part in torch.split(points, _CHUNK):
+        _, gradient = function.value_and_gradient(part)
+        parts.append((gradient, function.mlp.hidden(function.encode(part))))
+    gradients, hidden = (torch.cat(column) for column in zip(*parts, strict=True))
+    return Appearance(points, gradients, hidden)
+
+
+def _of_one_surface(rays: PixelRays) -> Tensor:
+    """Which rays (R,) show one surface alone: on the edge of what is near, a pixel mixes its color with what is behind.
+
+    Where there are depths: those with a plane through their neighbors. Otherwise all that no mask excludes.
+    """
+    plain = ~rays.background & (rays.cosines > 0.0)
+    return plain if bool(plain.any()) else ~rays.background
+
+
+def _seen(field: RadianceField, rays: PixelRays, size: float) -> _Seen | None:
+    hits = first_hits(field, rays, size)
+    met = hits.depths > 0.0
+    if rays.depths.any():  # a ray that meets another surface than the camera saw has another's color
+        met &= (hits.depths - rays.depths).abs() * rays.directions.norm(dim=1) < _SAME_SURFACE * size
+    if not met.any():
+        return None
+    rays, depths = rays.take(met), hits.depths[met]
+    directions = torch.nn.functional.normalize(rays.directions, dim=1)
+    return _Seen(appearance_of(field, rays.at(depths[:, None])[:, 0]), directions, rays.colors)
