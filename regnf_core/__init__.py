@@ -1,9 +1,9 @@
 """regnf_core: registration of neural signed distance fields.
 
-    from regnf_core import OrientedBox, RegistrationOptions, open_field, register
+    from regnf_core import OrientedBox, register
 
-    result = register(open_field("outputs/room/neus/run/"), open_field("chair.ply"),
-                      OrientedBox.from_corners([-0.4, -0.3, 0.0], [0.1, 0.2, 0.4]))
+    box = OrientedBox.from_corners([-0.4, -0.3, 0.0], [0.1, 0.2, 0.4])
+    result = register("outputs/room/neus/run/", "chair.ply", box)
     result.T_object_scene.matrix()   # (4, 4): scene coordinates to object coordinates
 
 Names are resolved on first use, so that importing a torch-free part (options, errors) does not load torch.
@@ -17,40 +17,73 @@ from typing import TYPE_CHECKING
 from regnf_core.version import __version__
 
 if TYPE_CHECKING:
+    from regnf_core.api.picturing import compose, render
+    from regnf_core.api.registered import Registered
+    from regnf_core.api.registering import BatchOutcome, register, register_batch
+    from regnf_core.api.searching import Search, search
+    from regnf_core.editing.edits import Insertion, Removal, Replacement, Substitution
     from regnf_core.errors import RegnfError
     from regnf_core.fields.base import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
     from regnf_core.loading import FieldWarning, open_field
     from regnf_core.options import RegistrationOptions
-    from regnf_core.registration import WarmStart, register
+    from regnf_core.rendering.camera import Camera
+    from regnf_core.rendering.options import RenderOptions
     from regnf_core.result import RegistrationResult
+    from regnf_core.robust.pipeline import WarmStart
 
 _HOMES = {
+    "BatchOutcome": "regnf_core.api.registering",
+    "Camera": "regnf_core.rendering.camera",
     "FieldWarning": "regnf_core.loading",
+    "Insertion": "regnf_core.editing.edits",
     "OrientedBox": "regnf_core.geometry.box",
+    "Registered": "regnf_core.api.registered",
     "RegistrationOptions": "regnf_core.options",
     "RegistrationResult": "regnf_core.result",
     "RegnfError": "regnf_core.errors",
+    "Removal": "regnf_core.editing.edits",
+    "RenderOptions": "regnf_core.rendering.options",
+    "Replacement": "regnf_core.editing.edits",
     "SdfField": "regnf_core.fields.base",
+    "Search": "regnf_core.api.searching",
     "Sim3": "regnf_core.geometry.sim3",
+    "Substitution": "regnf_core.editing.edits",
     "WarmStart": "regnf_core.robust.pipeline",
+    "compose": "regnf_core.api.picturing",
     "open_field": "regnf_core.loading",
-    "register": "regnf_core.registration",
+    "register": "regnf_core.api.registering",
+    "register_batch": "regnf_core.api.registering",
+    "render": "regnf_core.api.picturing",
+    "search": "regnf_core.api.searching",
 }
 
 __all__ = [
+    "BatchOutcome",
+    "Camera",
     "FieldWarning",
+    "Insertion",
     "OrientedBox",
+    "Registered",
     "RegistrationOptions",
     "RegistrationResult",
     "RegnfError",
+    "Removal",
+    "RenderOptions",
+    "Replacement",
     "SdfField",
+    "Search",
     "Sim3",
+    "Substitution",
     "WarmStart",
     "__version__",
+    "compose",
     "open_field",
     "register",
+    "register_batch",
+    "render",
+    "search",
 ]
 
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import TypeVar
 
-from regnf_core.errors import CancelledError, InvalidInputError, RegnfError
+from regnf_core.errors import CancelledError, RegnfError
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
+from regnf_core.pairs import pairs_of
 from regnf_core.result import Phase, ProgressCallback, RegistrationResult
 from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
@@ -62,10 +62,7 @@ def register_batch(
     """
     options = options or RegistrationOptions()
     options.require_robust("registers a batch")
-    wanted = list(product(range(len(detections)), range(len(objects)))) if pairs is None else list(pairs)
-    for d, o in wanted:
-        if not (0 <= d < len(detections) and 0 <= o < len(objects)):
-            raise InvalidInputError(f"no pair ({d}, {o}) among the detections and objects", reason="PAIR_UNKNOWN")
+    wanted = pairs_of(pairs, len(detections), len(objects))
     batch = _Batch(scene, detections, objects, options, seed)
     outcomes = []
     for number, (d, o) in enumerate(wanted):

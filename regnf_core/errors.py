@@ -9,6 +9,7 @@
     ├── NoSurfaceError               NO_SURFACE_IN_DETECTION, NO_SURFACE_IN_OBJECT
     ├── InitializationError          NO_INITIAL_TRANSFORM
     ├── FitDivergedError             FIT_DIVERGED
+    ├── MissingExtraError            EXTRA_MISSING
     └── CancelledError               CANCELLED
 
 This module imports nothing heavy: the HTTP front end uses it without loading torch.
@@ -125,3 +126,15 @@ class CancelledError(RegnfError):
     """The caller asked for the work to stop."""
 
     reason = "CANCELLED"
+
+
+class MissingExtraError(RegnfError):
+    """An extra of the package that is needed is not installed, or only in part."""
+
+    unavailable = True
+    reason = "EXTRA_MISSING"
+
+    @classmethod
+    def of(cls, modules: Sequence[str], extras: Sequence[str]) -> MissingExtraError:
+        """Names the modules that are not there, and the extras that bring them."""
+        return cls(f"not installed: {', '.join(modules)}; pip install 'regnf[{','.join(extras)}]'")

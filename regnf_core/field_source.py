@@ -16,10 +16,14 @@ from regnf_core.field_files import require_field_file, require_file
 from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, sniff_format
 from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
 from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
+from regnf_core.importing.run.settings_names import DATA_FILES
 
 Role = Literal["scene", "object"]
 SettingsChoice = str | Path | bool | None
-"""A file of settings or an archive of them; None or True: those that lie beside the checkpoint; False: none."""
+"""A file of settings or an archive of them; None or True: those that lie beside the checkpoint; False: none.
+
+A file of the dataset (meta_data.json, dataparser_transforms.json ...) joins those that lie beside the checkpoint.
+"""
 _WITHOUT_SETTINGS = frozenset({*MESH_FORMATS, *RUN_ARCHIVES, "safetensors"})
 """Formats that no trainer's settings say anything about, and archives, which have their own."""
 _FOUND_BESIDE = "They were found beside the checkpoint: --no-config (in Python settings=False) leaves them unread."
@@ -96,23 +100,32 @@ def find_source(
 
     Raises InvalidInputError (FILE_NOT_FOUND) and FieldFormatError naming the path: what ``find_run`` does of a folder.
     """
-    run, file, config = None, path, None
+    run, file = None, path
     if path.is_dir():
         with naming(path):
             run = find_run(path)
         file = run.checkpoint
     require_field_file(file)
     format_ = format_of(file)
-    if isinstance(settings, str | Path):
-        run, config = None, Path(settings)
-        require_file(config)
-    elif settings is False:
-        run = None
-    elif run is None and format_ not in _WITHOUT_SETTINGS:
+    if run is None and format_ not in _WITHOUT_SETTINGS and settings is not False:
         with naming(path):
             run = Run(file.resolve(), settings_beside(file))
+    run, config = _settings_of(run, settings)
     said = dict(description or {})
     return FieldSource(path, file, run, config, said, assumed_role(said, format_, role).get("as"), role)
+
+
+def _settings_of(run: Run | None, chosen: SettingsChoice) -> tuple[Run | None, Path | None]:
+    """What is read of the settings found beside, and the file that is read in place of them."""
+    if chosen is False:
+        return None, None
+    if not isinstance(chosen, str | Path):
+        return run, None
+    named = Path(chosen)
+    require_file(named)
+    if run is not None and run.settings and named.name in DATA_FILES:
+        return run.joined_by(named), None
+    return None, named
 
 
 def assumed_role(said: Mapping[str, Any], format_: str | None, role: Role | None) -> dict[str, Role]:

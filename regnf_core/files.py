@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Files that appear complete or not at all, and the names that they may have."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
+
+RECORDING_SUFFIX = ".rrd"
+"""Of recordings for the viewer of rerun."""
 
 
 @contextmanager
@@ -24,6 +29,20 @@ def atomic_path(path: str | os.PathLike[str], durable: bool = False) -> Iterator
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def new_file(path: str | os.PathLike[str], suffix: str) -> Path:
+    """The path of a file to write, whose name ends in ``suffix``.
+
+    Raises InvalidOptionsError for another name, InvalidInputError (FILE_IS_FOLDER) where there is a folder.
+    """
+    target = Path(path)
+    if target.is_dir():
+        hint = f"Name a file in it: {target / 'result'}{suffix}"
+        raise InvalidInputError(f"{target}: a folder, expected a file to write", reason="FILE_IS_FOLDER", hint=hint)
+    if target.suffix != suffix:
+        raise InvalidOptionsError(f"{target}: expected a name that ends in {suffix}")
+    return target
 
 
 def _flush_to_disk(path: Path) -> None:

@@ -5,7 +5,7 @@ Every length is in normalized field units unless its name says otherwise, as in 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -121,8 +121,8 @@ class RobustOptions:
     object_samples: Annotated[int, Ge(200), Le(100_000)] = 2500
     """Maximum number of samples of the object's surface. Increase it for thin parts."""
     box_tolerance: Annotated[float, Ge(0), Le(10)] = 1.0
-    """How far the object may reach beyond each face of the detection box, as a share of the box's edge. Increase it for
-    boxes around a part of the object only."""
+    """How far the object may reach beyond each face of the detection box, as a share of the box's edge (of a fifth
+    of its diagonal, where the edge is shorter). Increase it for boxes around a part of the object only."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
     reliable and the pose less accurate."""
@@ -197,6 +197,22 @@ class RegistrationOptions:
             raise InvalidOptionsError(
                 f"only the preset `robust` {feature}; the options name `{self.preset}`", reason=reason
             )
+
+
+OptionsLike = RegistrationOptions | Mapping[str, Any] | None
+"""Options, or a dictionary of those that are not to have their defaults."""
+
+
+def options_of(options: OptionsLike) -> RegistrationOptions:
+    """The options that a caller means. Raises InvalidOptionsError naming the first faulty one."""
+    if options is None:
+        return RegistrationOptions()
+    if isinstance(options, RegistrationOptions):
+        return options
+    if isinstance(options, Mapping):
+        return RegistrationOptions.from_dict(dict(options))
+    hint = 'Write {"up_axis": "z"} or RegistrationOptions(up_axis="z"); docs/api.md lists every option with its range.'
+    raise InvalidOptionsError(f"options is a {type(options).__name__}, expected a dictionary", hint=hint)
 
 
 def did_you_mean(location: Sequence[str | int]) -> str:

@@ -11,7 +11,7 @@ from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
 from regnf_core.run import Run
 from regnf_core.surface.result_clouds import with_clouds
 
-__all__ = ["WarmStart", "register"]
+__all__ = ["WarmStart", "register", "with_late_clouds"]
 
 
 def register(
@@ -40,11 +40,19 @@ def register(
     run = Run(progress)
     if options.preset == "robust":
         result = register_robust(scene, obj, detection, options, seed, run, warm_start)
-        region = cloud_region(detection)
     else:
         result = paper.register_paper(scene, obj, detection, options, seed, run)
-        region = paper.cloud_region(detection, options)
-    return run.finish(result, (lambda found: with_clouds(found, scene, obj, detection, region)) if clouds else None)
+    return run.finish(
+        result, (lambda found: with_late_clouds(found, scene, obj, detection, options)) if clouds else None
+    )
+
+
+def with_late_clouds(
+    result: RegistrationResult, scene: SdfField, obj: SdfField, detection: OrientedBox, options: RegistrationOptions
+) -> RegistrationResult:
+    """The result of ``register`` without clouds as it returns it with them, but for the seconds of this phase."""
+    region = cloud_region(detection) if options.preset == "robust" else paper.cloud_region(detection, options)
+    return with_clouds(result, scene, obj, detection, region)
 
 
 def _check_warm_start(warm_start: WarmStart, options: RegistrationOptions) -> None:

@@ -46,6 +46,32 @@ class Alternative:
 
 
 @dataclass(frozen=True)
+class ConsideredPose:
+    """One pose that was refined and judged by itself, whatever rivals it has. reason: as of a verdict."""
+
+    T_object_scene: Sim3
+    reason: str
+    metrics: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Considered:
+    """Poses that were judged, the likeliest first, and what the samples held out for that say of each of the K.
+
+    scene_points (N, 3), object_points (M, 3): the samples, each in its field's frame · scene_signs (K, N) uint8: 0 the
+    object explains the scene's surface there, 1 it does not although it is near, 2 it is not near · object_signs (K, M)
+    uint8: 0 the scene confirms the object's surface there, 1 the scene is free there, 2 nothing was seen there, 3 the
+    surfaces differ by a little.
+    """
+
+    poses: list[ConsideredPose]
+    scene_points: Tensor
+    object_points: Tensor
+    scene_signs: Tensor
+    object_signs: Tensor
+
+
+@dataclass(frozen=True)
 class ObjectSymmetry:
     """The rotations that map the object onto itself. order: how many there are, the identity included.
 
@@ -85,6 +111,8 @@ class RegistrationResult:
     s e^(d log s), exp(omega) R, t + dt; radians and object units. None from the preset `paper`."""
     symmetry: ObjectSymmetry | None = None
     """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
+    considered: Considered | None = None
+    """The poses that were judged, for viewers. None from the preset `paper`."""
     surroundings: SurfaceSamples | None = None
     """The scene's surface around the detection, for viewers."""
 

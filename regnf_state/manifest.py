@@ -1,13 +1,16 @@
 """The result of a job in the blob store: files under the attempt that wrote them, and a manifest that makes them count.
 
-The manifest is written last and never changed. It names the attempt and lists its files.
+The manifest is written after these files and never changed. It names the attempt and lists its files, and the names of
+those that are to come: pictures and clouds, which are made once the result is out. A second document, the rest, lists
+what has become of them. It is written once as well.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from regnf_state.blobs.base import BlobStore
@@ -15,20 +18,37 @@ from regnf_state.record_format import FORMAT, check_json_format
 from regnf_state.records import UnreadableRecordError
 
 _BINARY = "application/octet-stream"
+EDITED_FIELD = "edited.safetensors"
+"""A rendering's scene with its edits, as a field."""
 ARTIFACTS: dict[str, str] = {
     "scene_points.ply": _BINARY,
     "object_points.ply": _BINARY,
     "aligned.ply": _BINARY,
     "context_points.ply": _BINARY,
     "residuals.npz": _BINARY,
+    "considered.npz": _BINARY,
     "trace.json": "application/json",
     "transform.npy": _BINARY,
     "aligned.glb": "model/gltf-binary",
     "recording.rrd": _BINARY,
     "preview.png": "image/png",
     "result.json": "application/json",
+    "before-after.png": "image/png",
+    "animation.webp": "image/webp",
+    "composite.glb": "model/gltf-binary",
+    EDITED_FIELD: _BINARY,
+    "render.json": "application/json",
 }
-"""Every name that an artifact can have, with its media type. The service serves no other."""
+"""Names that an artifact can have, with its media type."""
+_FRAMES = {".png": "image/png", "-depth.png": "image/png", "-normal.png": "image/png", "-depth.npy": _BINARY}
+_FRAME = re.compile(rf"(?:frame|before)-[0-9]{{4}}(?P<what>{'|'.join(map(re.escape, _FRAMES))})")
+MEDIA_TYPES = frozenset({*ARTIFACTS.values(), *_FRAMES.values()})
+
+
+def media_type_of(name: str) -> str | None:
+    """The media type of an artifact; None for a name that no artifact has, and the service serves none of these."""
+    frame = _FRAME.fullmatch(name)
+    return ARTIFACTS.get(name) if frame is None else _FRAMES[frame["what"]]
 
 
 @dataclass(frozen=True)
@@ -41,7 +61,7 @@ class Artifact:
 
     @property
     def media_type(self) -> str:
-        return ARTIFACTS.get(self.name, _BINARY)
+        return media_type_of(self.name) or _BINARY
 
 
 @dataclass(frozen=True)
@@ -51,6 +71,10 @@ class Manifest:
     job_id: str
     attempt: int
     artifacts: tuple[Artifact, ...]
+    pending: tuple[str, ...] = ()
+    """Names of files that are still to come, if their making does not fail."""
+    missing: tuple[str, ...] = ()
+    """Names of files that were to come and do not."""
 
     def key(self, name: str) -> str:
         """Where the blob store holds a file."""
@@ -58,22 +82,46 @@ class Manifest:
 
     def served(self) -> dict[str, Artifact]:
         """The files that the service serves, by name."""
-        return {one.name: one for one in self.artifacts if one.name in ARTIFACTS}
+        return {one.name: one for one in self.artifacts if media_type_of(one.name) is not None}
 
     def keys(self) -> Iterable[str]:
         """Where everything that counts is held, the manifest included."""
-        return (manifest_key(self.job_id), *(self.key(one.name) for one in self.artifacts))
+        own = (self.key(one.name) for one in self.artifacts)
+        return (manifest_key(self.job_id), rest_key(self.job_id), *own)
 
     def to_json(self) -> bytes:
-        listed = [
-            {"name": one.name, "bytes": one.bytes, "media_type": one.media_type, "sha256": one.sha256}
-            for one in self.artifacts
-        ]
-        return json.dumps({"format": FORMAT, "attempt": self.attempt, "artifacts": listed}, indent=1).encode()
+        """The document of a result as it is published."""
+        document = {"attempt": self.attempt, "artifacts": _listed(self.artifacts)}
+        return _document(document | ({"pending": list(self.pending)} if self.pending else {}))
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What has become of the files that were to come."""
+
+    artifacts: tuple[Artifact, ...] = ()
+    missing: tuple[str, ...] = ()
+
+    def to_json(self) -> bytes:
+        return _document({"artifacts": _listed(self.artifacts), "missing": list(self.missing)})
+
+
+def _document(members: dict[str, Any]) -> bytes:
+    return json.dumps({"format": FORMAT} | members, indent=1).encode()
+
+
+def _listed(artifacts: Iterable[Artifact]) -> list[dict[str, Any]]:
+    return [
+        {"name": one.name, "bytes": one.bytes, "media_type": one.media_type, "sha256": one.sha256} for one in artifacts
+    ]
 
 
 def manifest_key(job_id: str) -> str:
     return f"jobs/{job_id}/manifest.json"
+
+
+def rest_key(job_id: str) -> str:
+    return f"jobs/{job_id}/rest.json"
 
 
 def artifact_key(job_id: str, attempt: int, name: str) -> str:
@@ -81,19 +129,49 @@ def artifact_key(job_id: str, attempt: int, name: str) -> str:
 
 
 def read_manifest(blobs: BlobStore, job_id: str) -> Manifest | None:
-    """The manifest of a job's result; None while there is none. Raises UnreadableRecordError."""
+    """The manifest of a job's result with what has come since; None while there is none.
+
+    Raises UnreadableRecordError.
+    """
+    document = _read(blobs, job_id, manifest_key(job_id))
+    if document is None:
+        return None
+    attempt = document.get("attempt")
+    if not isinstance(attempt, int):
+        raise UnreadableRecordError(job_id, "its manifest is damaged")
+    published = Manifest(job_id, attempt, _artifacts(document, job_id), _names(document, "pending", job_id))
+    rest = _read(blobs, job_id, rest_key(job_id)) if published.pending else None
+    if rest is None:
+        return published
+    artifacts = published.artifacts + _artifacts(rest, job_id)
+    return replace(published, artifacts=artifacts, pending=(), missing=_names(rest, "missing", job_id))
+
+
+def _read(blobs: BlobStore, job_id: str, key: str) -> dict[str, Any] | None:
     try:
-        with blobs.open(manifest_key(job_id)) as file:
-            document = check_json_format(job_id, json.load(file))
-        attempt = document["attempt"]
-        listed = [Artifact(one["name"], one["bytes"], one["sha256"]) for one in document["artifacts"]]
+        with blobs.open(key) as file:
+            return check_json_format(job_id, json.load(file))
     except FileNotFoundError:
         return None
-    except (ValueError, KeyError, TypeError) as error:
+    except ValueError as error:
         raise UnreadableRecordError(job_id, "its manifest is damaged") from error
-    if not (isinstance(attempt, int) and all(_is_sound(one) for one in listed)):
+
+
+def _artifacts(document: dict[str, Any], job_id: str) -> tuple[Artifact, ...]:
+    try:
+        listed = tuple(Artifact(one["name"], one["bytes"], one["sha256"]) for one in document["artifacts"])
+    except (KeyError, TypeError) as error:
+        raise UnreadableRecordError(job_id, "its manifest is damaged") from error
+    if not all(map(_is_sound, listed)):
         raise UnreadableRecordError(job_id, "its manifest is damaged")
-    return Manifest(job_id, attempt, tuple(listed))
+    return listed
+
+
+def _names(document: dict[str, Any], member: str, job_id: str) -> tuple[str, ...]:
+    names = document.get(member, [])
+    if not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise UnreadableRecordError(job_id, "its manifest is damaged")
+    return tuple(names)
 
 
 def _is_sound(one: Artifact) -> bool:

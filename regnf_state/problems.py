@@ -23,3 +23,8 @@ def problem_document(reason: str, detail: str | None = None, *, hint: str | None
         **({} if hint is None else {"hint": hint}),
         **more,
     }
+
+
+def whole_problem(error: dict[str, Any]) -> dict[str, Any]:
+    """A stored problem with every member that a problem has."""
+    return problem_document(str(error.get("reason", "INTERNAL"))) | error

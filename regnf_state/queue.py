@@ -14,6 +14,7 @@ REGISTER_FUNCTION = "regnf_worker.jobs.run_registration"
 IMPORT_FUNCTION = "regnf_worker.jobs.run_import"
 
 Kind = Literal["import", "registration"]
+"""What the transport tells apart. A "registration" is a job of any kind: its record says which."""
 _ATTEMPT = r"(?P<attempt>[1-9][0-9]{0,8})"
 _NAMES: dict[Kind, re.Pattern[str]] = {
     "import": re.compile(rf"import-(?P<argument>[0-9a-f]{{64}}(?:_[a-z0-9][a-z0-9-]{{0,31}})?)-{_ATTEMPT}"),

@@ -85,6 +85,15 @@ REASONS: dict[str, Reason] = {
         408, "Upload stalled", "The body sent nothing, or too little, for too long. Nothing was kept."
     ),
     "UPLOAD_TOO_LARGE": Reason(413, "Upload too large", "The file exceeds the service's limit. Nothing was kept."),
+    "UPLOAD_OFFSET_MISMATCH": Reason(
+        409,
+        "Another piece is expected",
+        "The piece does not begin where the upload stopped: `offset` says how many bytes have arrived.",
+    ),
+    "UPLOAD_NOT_FINISHED": Reason(
+        409, "Upload not finished", "The file's pieces are not all here: `offset` says how many bytes have arrived."
+    ),
+    "TOO_MANY_PIECES": Reason(409, "Too many pieces", "The upload has too many pieces. Send larger ones."),
     "FIELD_NOT_RECOGNIZED": Reason(
         415, "Not a field file", "The file is not a field in any format that the service reads."
     ),
@@ -109,8 +118,17 @@ REASONS: dict[str, Reason] = {
     "FIELD_PREVIEW_NOT_FOUND": Reason(
         404,
         "No picture",
-        "Only fields that are `ready` have a picture, and not all of them do. Of a rejected field, candidates have one "
-        "while its upload is kept.",
+        "Only fields that are `ready` have a picture, and not all of them do. With `Retry-After` it is still to be "
+        "made. Of a rejected field, candidates have one while its upload is kept.",
+    ),
+    "DEMO_NOT_FOUND": Reason(
+        404, "No demo", "This service offers no demo: `regnf serve` does. Upload fields of your own."
+    ),
+    "FIELD_MESH_NOT_FOUND": Reason(
+        404,
+        "No mesh",
+        "Only fields that are `ready` have a mesh to look at, and not those that are too slow for it. With "
+        "`Retry-After` it is still to be made.",
     ),
     "FIELD_IN_USE": Reason(409, "Field in use", "Active jobs need the field. Wait for them, or cancel them."),
     "FIELD_DESCRIPTION_DIFFERS": Reason(
@@ -129,6 +147,25 @@ REASONS: dict[str, Reason] = {
         422, "Field was rejected", "The import refused the file; `GET /fields/{sha256}` says why in `error`."
     ),
     "INVALID_DESCRIPTION": Reason(422, "Invalid description", "`errors` points at the members that are wrong."),
+    # the library
+    "LIBRARY_ENTRY_NOT_FOUND": Reason(
+        404, "No such entry", "Your library has no entry of this name. `GET /library` lists them."
+    ),
+    "LIBRARY_NAME_TAKEN": Reason(
+        409, "Name taken", "Another entry of your library has the name. Choose another one, or remove that entry."
+    ),
+    "FIELD_IN_LIBRARY": Reason(
+        409,
+        "Field in the library",
+        "The field is an entry of your library already, or still: `GET /fields/{sha256}` has its name in `library`.",
+    ),
+    "LIBRARY_ENTRY_INVALID": Reason(
+        422, "Invalid library entry", "`detail` says what is wrong with the name, a tag, the note or the symmetry."
+    ),
+    "LIBRARY_EMPTY": Reason(422, "No objects in the library", "No entry of your library is meant. Check the tags."),
+    "LIBRARY_TOO_LARGE": Reason(
+        422, "Too many objects", "More entries are meant than one search takes. Name fewer, or a tag that fewer have."
+    ),
     # registration requests
     "INVALID_IDEMPOTENCY_KEY": Reason(
         400, "Invalid idempotency key", "The key is empty, longer than 255 characters, or not printable ASCII."
@@ -174,6 +211,56 @@ REASONS: dict[str, Reason] = {
         429, "Quota of jobs used up", "You have the maximum number of active jobs. Wait for one to end."
     ),
     "QUOTA_WEBHOOKS": Reason(409, "Quota of webhooks used up", "The job has 16 webhooks, or 4 kB. Ask for its state."),
+    # renderings
+    "CAMERA_INVALID": Reason(
+        422,
+        "Invalid camera",
+        "A camera's pose, lens or size is none, or its path has no frame. `detail` says which.",
+    ),
+    "CAMERA_IN_MATTER": Reason(
+        422,
+        "Camera in matter",
+        "A camera stands inside of something. Move it, or set the option `cut_away`.",
+    ),
+    "COLORS_MISSING": Reason(
+        422,
+        "No colors",
+        "Colors are asked for, and no field has any. Let them be shaded: `coloring` `auto`.",
+    ),
+    "EDIT_INVALID": Reason(
+        422,
+        "Invalid edit",
+        "The edit is no substitution, replacement, removal or insertion, or its job is no registration in this scene. "
+        "`detail` says which.",
+    ),
+    "EDIT_POSE_REJECTED": Reason(
+        422,
+        "Pose was rejected",
+        "The registration that an edit names rejected its pose. To use it all the same, give `object` and "
+        "`T_object_scene` instead of `job`.",
+    ),
+    "EDIT_OUTSIDE_SCENE": Reason(
+        422,
+        "Edit outside the scene",
+        "What the edit changes lies outside of the scene's bounds. Check the transform's direction and the units.",
+    ),
+    "EDITS_OVERLAP": Reason(
+        422,
+        "Edits overlap",
+        "Two edits take away the same thing, or put matter in one place. Leave one out.",
+    ),
+    "NO_SURFACE_IN_SCENE": Reason(
+        422,
+        "No surface in the scene",
+        "The scene's field has no zero level within its bounds.",
+    ),
+    "RENDER_TOO_LARGE": Reason(
+        422,
+        "Rendering too large",
+        "Too many frames or pixels, or more memory, time or files than one job may have; `detail` has both numbers. "
+        "Ask for fewer or smaller frames.",
+    ),
+    "FIELD_NOT_FINITE": Reason(422, "Field not finite", "The field gives values that are not finite."),
     # jobs
     "JOB_NOT_FOUND": Reason(404, "No such job", "The id is unknown, or the job was deleted."),
     "ARTIFACT_NOT_FOUND": Reason(404, "No such artifact", "The result's `artifacts` list names what the job wrote."),
@@ -188,7 +275,25 @@ REASONS: dict[str, Reason] = {
     "JOB_EXPIRED": Reason(
         410, "Job has expired", "The job was deleted after its retention time. Post the request again."
     ),
+    "ARTIFACT_NOT_READY": Reason(
+        409, "Artifact not made yet", "Pictures and clouds follow the result. Retry after `Retry-After`."
+    ),
     "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
+    # batches
+    "BATCH_NOT_FOUND": Reason(404, "No such batch", "The id is unknown, or the batch was deleted."),
+    "BATCH_EXPIRED": Reason(
+        410, "Batch has expired", "The batch was deleted after its retention time. Post its pairs again."
+    ),
+    "BATCH_ACTIVE": Reason(409, "Batch is active", "Cancel the batch before you delete it."),
+    "BATCH_FINISHED": Reason(409, "Batch has finished", "A batch that has finished can no longer be cancelled."),
+    "BATCH_EMPTY": Reason(422, "Batch without pairs", "The body has no line. Send one request a line."),
+    "TOO_MANY_PAIRS": Reason(
+        413, "Too many pairs", "The batch has more lines than the service takes. Send them as several batches."
+    ),
+    "LINE_TOO_LARGE": Reason(413, "Line too large", "A line of a batch may have 65,536 bytes."),
+    "QUOTA_BATCHES": Reason(
+        429, "Quota of batches used up", "You have the maximum number of batches, and none has ended. Wait for one."
+    ),
     # what a job can end with
     "NO_SURFACE_IN_DETECTION": Reason(
         422, "No surface in the detection", "Too few surface points were found in the box. Check the box, or the scene."

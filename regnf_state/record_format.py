@@ -13,11 +13,15 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from regnf_core.errors import InvalidInputError
+from regnf_core.library_entries import EntryNotes
 from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 
 FORMAT = 1
 """Raised by a release whose documents an earlier one must not touch: another meaning, another status."""
 _UNKNOWN = "unknown_members"
+_NEW = ("library",)
+"""Members that the release before this one does not know."""
 LAST_TIME = 253402300800.0
 """The year 10000: what no calendar shows."""
 _TIMES = ("created", "updated", "started", "finished", "heartbeat", "phase_since", "original_until")
@@ -30,8 +34,12 @@ _Record = TypeVar("_Record", JobRecord, FieldRecord)
 
 
 def document_of(record: JobRecord | FieldRecord) -> dict[str, Any]:
-    """The members of a record as they are written. Exactly those that the release before this one knows."""
+    """The members of a record as they are written: those that the release before this one knows, and newer ones where
+    they say something. That release keeps what it does not know."""
     document = asdict(record)
+    for name in _NEW:
+        if document.get(name, ...) is None:
+            del document[name]
     document.update(document.pop(_UNKNOWN))
     return document
 
@@ -96,15 +104,25 @@ def _check(record: JobRecord | FieldRecord, name: str) -> None:
         raise UnreadableRecordError(name, "error: a member has the wrong type")
     if isinstance(record, JobRecord):
         _check_request(record.request, name)
+    elif record.library is not None:
+        _check_entry(record.library, name)
+
+
+def _check_entry(entry: dict[str, Any], name: str) -> None:
+    added = entry.get("added")
+    try:
+        EntryNotes.from_dict(entry)
+    except InvalidInputError as error:
+        raise UnreadableRecordError(name, f"library: {error}") from error
+    if not (isinstance(added, int | float) and math.isfinite(added) and 0 <= added < LAST_TIME):
+        raise UnreadableRecordError(name, "library: a time is out of range")
 
 
 def _check_request(request: dict[str, Any], name: str) -> None:
-    candidates = request.get("candidates") or []
-    named = [
-        request.get("scene", ""),
-        request.get("object") or "",
-        *(candidates if isinstance(candidates, list) else [0]),
-    ]
+    named = [request.get("scene", ""), request.get("object") or ""]
+    for several in ("candidates", "objects"):
+        listed = request.get(several) or []
+        named += listed if isinstance(listed, list) else [0]
     if not all(isinstance(one, str) for one in named):
         raise UnreadableRecordError(name, "request: a field is named by something else than a text")
     webhook = request.get("webhook", {"url": ""})

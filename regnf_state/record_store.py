@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
+from regnf_core.library_entries import EntryNotes
+from regnf_state.library import LibraryEntry
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.pages import Page, Position
 from regnf_state.records import NO_QUOTA, FieldRecord, JobEvent, JobNews, JobRecord, Quota
@@ -36,6 +38,10 @@ class RecordStore(Protocol):
         ...
 
     def get_job(self, job_id: str) -> JobRecord | None: ...
+
+    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | None]:
+        """Several jobs in one round trip, in the order asked for."""
+        ...
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         """Whether a job of this id and owner was kept once and has outlived its retention."""
@@ -158,8 +164,34 @@ class RecordStore(Protocol):
 
     def delete_field(self, sha256: str) -> bool: ...
 
+    # libraries: an entry is a part of the record of its field
+    def set_entry(self, known: FieldRecord, notes: EntryNotes | None) -> FieldRecord:
+        """Make the field an entry of its owner's library, change the entry, or (None) take it out.
+
+        Raises NameTakenError, and StaleAttemptError when the entry is no longer as it was ``known``.
+        """
+        ...
+
+    def entries_named(self, owner: str, names: Sequence[str]) -> list[LibraryEntry | None]:
+        """An owner's entries by their names, in the order asked for."""
+        ...
+
+    def list_entries(
+        self, owner: str, tag: str | None, part: str | None, limit: int, before: Position | None
+    ) -> Page[FieldRecord]:
+        """An owner's entries, the one added last first: those with the tag, and with ``part`` in their names."""
+        ...
+
     def validating_fields(self) -> list[FieldRecord]:
         """Every field whose import has not ended."""
+        ...
+
+    def undrawn_fields(self) -> list[str]:
+        """The ready fields whose mesh and picture are to be made, those asked for last first."""
+        ...
+
+    def draw_next(self, sha256: str) -> None:
+        """Note that somebody wants to see a field whose mesh and picture are to be made."""
         ...
 
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:

@@ -14,6 +14,7 @@ from regnf_state.ownership import ANONYMOUS, owner_of
 
 JobStatus = Literal["accepted", "running", "successful", "failed", "dismissed"]
 FieldState = Literal["validating", "ready", "rejected"]
+ViewState = Literal["pending", "ready", "none"]
 ACTIVE: frozenset[str] = frozenset({"accepted", "running"})
 FINISHED: frozenset[str] = frozenset({"successful", "failed", "dismissed"})
 
@@ -119,6 +120,8 @@ class JobRecord:
 
 ORIGINAL_UNTIL = "original_until"
 """In a rejected field's error or a ready field's report: until when the upload itself is kept."""
+VIEWS, DRAWINGS = "views", "drawings"
+"""In a ready field's report: what has become of its mesh and picture, and how often their making was begun."""
 CANDIDATES = "candidates"
 """In a rejected field's error: what its upload may be, each with its name, the entries of a description that choose it,
 and whether its picture is stored for as long as the upload is kept."""
@@ -164,6 +167,8 @@ class FieldRecord:
     """How often this upload was handed out again because its worker vanished."""
     symmetry: dict[str, Any] | None = None
     """The turns that carry the object onto itself, once a job has used the field as an object: see the contract."""
+    library: dict[str, Any] | None = None
+    """What its owner's library says of it: see ``regnf_state.library``. None: it is no entry of it."""
     unknown_members: dict[str, Any] = field(default_factory=dict)
     """As in JobRecord."""
 
@@ -197,6 +202,21 @@ class FieldRecord:
             case {"name": str() as name, "sha256": str() as sha256, "bytes": int() as size}:
                 return SettingsFile(name, sha256, size)
         return None
+
+    @property
+    def views(self) -> ViewState | None:
+        """Of a ready field: whether its mesh and picture are still to be made, are there, or cannot be made.
+
+        None: of an import by an earlier release, which made them itself where it could.
+        """
+        state = self.report.get(VIEWS) if self.state == "ready" else None
+        return state if state in ("pending", "ready", "none") else None
+
+    @property
+    def drawings(self) -> int:
+        """How often the making of mesh and picture was begun."""
+        begun = self.report.get(DRAWINGS)
+        return begun if isinstance(begun, int) else 0
 
     @property
     def original_until(self) -> float | None:

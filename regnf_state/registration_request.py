@@ -38,6 +38,8 @@ class RegistrationRequest:
     """T_object_scene that the metrics compare with."""
     webhook: str | None = None
     """Address of the message about the job's end."""
+    pictures: bool = True
+    """Whether clouds and pictures of the result are made."""
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -74,6 +76,8 @@ class RegistrationRequest:
             "initial_transform": self.initial_transform,
             "ground_truth": None if self.ground_truth is None else {"T_object_scene": self.ground_truth},
         }
+        if not self.pictures:  # a request that says nothing of them keeps the id that it has always had
+            values["pictures"] = False
         return values if self.webhook is None else values | {"webhook": {"url": self.webhook}}
 
     def to_record(self) -> dict[str, Any]:
@@ -96,6 +100,7 @@ class RegistrationRequest:
             initial_transform=record["initial_transform"],
             ground_truth=None if truth is None else truth["T_object_scene"],
             webhook=None if webhook is None else webhook["url"],
+            pictures=record.get("pictures", True),
         )
 
 

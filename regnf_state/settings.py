@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
@@ -43,6 +44,8 @@ class Settings(BaseSettings):
     """0 asks the system for a free port; the address is printed once it listens."""
     state_dir: Path = Field(default_factory=_default_state_dir)
     """Blobs, the embedded Redis' files and temporary uploads live under it."""
+    demo_dir: Path | None = None
+    """Where the demo's files lie, which the home page offers. `regnf serve` sets it; unset: no demo."""
     redis_url: str | None = Field(default=None, repr=False)
     """Unset: `regnf serve` starts a private server of its own."""
     queue_key: Annotated[Annotated[str, Field(min_length=16)] | None, BeforeValidator(lambda given: given or None)] = (
@@ -56,8 +59,11 @@ class Settings(BaseSettings):
     """Where registrations run; auto: on the GPU if torch can use one."""
     threads: int | None = Field(default=None, ge=1, le=256)
     """Threads of each job's process; unset: cores / workers."""
-    preload: bool = False
-    """Workers load the engine once and for all jobs: each begins sooner, and an idle worker holds more memory."""
+    preload: bool = sys.platform.startswith("linux")
+    """Workers load the engine once and for all jobs: each begins sooner, and an idle worker holds more memory.
+
+    Elsewhere it is not known whether what is loaded starts threads, which a fork leaves behind.
+    """
     api_tokens: frozenset[str] = Field(default=frozenset(), repr=False)
     """JSON list of `name:token`, or of tokens. Empty: no token needed, which is allowed on loopback only."""
     api_tokens_file: Path | None = None
@@ -69,6 +75,8 @@ class Settings(BaseSettings):
 
     Loopback's names and the address that a connection arrives on need not be listed.
     """
+    cors_origins: frozenset[str] = frozenset()
+    """JSON list of other sites whose pages may call this service: `https://name[:port]`. Empty: none."""
     allow_unauthenticated: bool = False
     """Serve beyond loopback without tokens. Say so only behind something that authenticates."""
     max_upload_bytes: int = Field(default=4096 * MIB, ge=1)
@@ -106,6 +114,11 @@ class Settings(BaseSettings):
     """Imports of each caller that wait or run."""
     quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
     """What each caller's imports and jobs may cost the workers in an hour."""
+    quota_batches: int = Field(default=100, ge=1)
+    """Of each caller; beyond this its oldest batch that has ended goes."""
+    max_batch_pairs: int = Field(default=10_000, ge=1)
+    max_batch_bytes: int = Field(default=64 * MIB, ge=1024)
+    """Largest body of a batch."""
     caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
     """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""
     worker_reserve_s: float = Field(default=300.0, ge=0, le=86400)
@@ -152,6 +165,10 @@ class Settings(BaseSettings):
     """How long."""
     keep_originals_bytes: int = Field(default=8192 * MIB, ge=0)
     """Of each caller; beyond this the oldest go."""
+    keep_pieces_s: int = Field(default=24 * 3600, ge=60)
+    """How long an upload that came in pieces waits for the next one."""
+    keep_pieces_bytes: int = Field(default=8192 * MIB, ge=0)
+    """Of each caller's unfinished uploads; beyond this the oldest go."""
     storage_cap_bytes: int | None = Field(default=None, ge=1)
     """Beyond this the oldest finished jobs and unused fields go, before their time."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")

@@ -5,7 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from regnf_state.records import ACTIVE, FINISHED, FieldRecord, JobRecord, QuotaError, StaleAttemptError
+from regnf_state.records import (
+    ACTIVE,
+    DRAWINGS,
+    FINISHED,
+    VIEWS,
+    FieldRecord,
+    JobRecord,
+    QuotaError,
+    StaleAttemptError,
+)
 
 MAX_WEBHOOKS = 16
 """How many addresses one job tells of its end."""
@@ -18,7 +27,9 @@ _MOVES: dict[str, frozenset[str]] = {
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
 _CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker", "verdict"})
-_CHANGEABLE_IN_FIELD = frozenset({"state", "label", "description", "report", "error", "bytes", "symmetry"})
+_IN_REPORT = frozenset({VIEWS, DRAWINGS})
+"""What is changed by itself and stands in a field's report: the release before knows no such members of a record."""
+_CHANGEABLE_IN_FIELD = _IN_REPORT | {"state", "label", "description", "report", "error", "bytes", "symmetry"}
 
 
 def _refuse_unknown(changes: dict[str, Any], allowed: frozenset[str]) -> None:
@@ -150,7 +161,17 @@ def changed_field(record: FieldRecord, attempt: int | None, changes: dict[str, A
         _require_attempt(record, attempt)
     if "state" in changes and record.state != "validating":
         raise StaleAttemptError(f"a field that is {record.state} cannot become {changes['state']}")
-    return replace(record, version=record.version + 1, updated=now, **changes)
+    return replace(record, version=record.version + 1, updated=now, **_with_report(record, changes))
+
+
+def _with_report(record: FieldRecord, changes: dict[str, Any]) -> dict[str, Any]:
+    """The changes with those that stand in the report within it."""
+    said = {name: value for name, value in changes.items() if name in _IN_REPORT}
+    plain = {name: value for name, value in changes.items() if name not in _IN_REPORT}
+    if not said and "report" not in plain:
+        return plain
+    held = {name: value for name, value in record.report.items() if name in _IN_REPORT}
+    return plain | {"report": plain.get("report", record.report) | held | said}
 
 
 def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldRecord | None:
@@ -158,7 +179,7 @@ def restarted_field(record: FieldRecord, new: FieldRecord, now: float) -> FieldR
     if record.state != "rejected":
         return None
     again = replace(new, created=record.created, updated=now, version=record.version + 1, attempt=record.attempt + 1)
-    return replace(again, unknown_members=record.unknown_members)
+    return replace(again, library=record.library, unknown_members=record.unknown_members)
 
 
 def reimported_field(
@@ -178,6 +199,7 @@ def reimported_field(
         label=label,
         description=description,
         attempt=record.attempt + 1,
+        library=record.library,
     )
     return replace(again, unknown_members=record.unknown_members)
 
@@ -202,7 +224,8 @@ def retried_field(record: FieldRecord, attempt: int, now: float, lost: bool) -> 
 def fields_of(record: JobRecord) -> list[str]:
     """The fields that the job reads."""
     request = record.request
-    named = (request.get("scene"), request.get("object"), *(request.get("candidates") or ()))
+    several = (*(request.get("candidates") or ()), *(request.get("objects") or ()))
+    named = (request.get("scene"), request.get("object"), *several)
     return [name for name in named if name]
 
 

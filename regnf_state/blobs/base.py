@@ -5,9 +5,13 @@ Keys in use:
     fields/{sha256}/settings-{sha256}      the trainer's settings that came with it, for as long
     fields/{sha256}/field.safetensors      the safe field that workers open
     fields/{sha256}/object-model-{n}.safetensors   its model as an object by revision n of the engine; the first job
-                                           that needs the model makes it
+                                           that needs the model makes it, or a library's entry
+    fields/{sha256}/preview.png, mesh.glb, mesh-coarse.glb   what people look at; workers make it when they have time
     jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
-    jobs/{id}/manifest.json                written last, atomically: the job's result is exactly what it lists
+    jobs/{id}/manifest.json                written after the result, atomically: what it lists counts
+    jobs/{id}/rest.json                    the same for pictures and clouds, which come later
+    uploads/{caller}/{sha256}/{offset}     the pieces of an upload that is not finished: see regnf_state.pieces
+    batches/...                            batches of registrations and their results: see regnf_state.batches
     journal/jobs/{id}/{attempt}-{event}    what was accepted and how it ended: see regnf_state.journal.journal
     journal/fields/{sha256}                a field's record as it was last written
 """

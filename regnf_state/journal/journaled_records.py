@@ -13,6 +13,7 @@ from typing import Any
 
 from redis import Redis
 
+from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.generation import Generation
 from regnf_state.journal.journal import Journal
@@ -180,6 +181,11 @@ class JournaledRecordStore(RedisRecordStore):
 
     def undo_reimport(self, before: FieldRecord, attempt: int) -> FieldRecord:
         field = super().undo_reimport(before, attempt)
+        self.journal.keep_field(field)
+        return field
+
+    def set_entry(self, known: FieldRecord, notes: EntryNotes | None) -> FieldRecord:
+        field = super().set_entry(known, notes)
         self.journal.keep_field(field)
         return field
 

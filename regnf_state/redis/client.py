@@ -14,6 +14,8 @@ from redis.retry import Retry
 SOCKET_TIMEOUT_S = 10.0
 RETRIES = 6
 """About four seconds in all, where a server refuses connections; each attempt at one that is silent takes ten."""
+WORKER_RETRIES = 20
+"""A worker has nothing else to do: some twenty seconds, in which a Redis that was started with it comes up."""
 
 
 def connect(url: str, *, retries: int = RETRIES, socket_timeout_s: float = SOCKET_TIMEOUT_S) -> Redis:

@@ -15,12 +15,15 @@ from regnf_state.records import NO_QUOTA, FieldRecord, Quota, QuotaError, StaleA
 from regnf_state.redis import counters
 from regnf_state.redis.documents import Cap, Command, Kind, text
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.library_index import listed, unlisted
 from regnf_state.redis.owners import OWNERS, Owners
 from regnf_state.redis.rejections import RedisRejections
 from regnf_state.redis.unreadable import Stored
 
 _CREATED = f"{PREFIX}fields:created"
 _VALIDATING = f"{PREFIX}fields:validating"
+_UNDRAWN = f"{PREFIX}fields:undrawn"
+"""Ready fields whose mesh and picture are to be made, by the time they were asked for."""
 _ATTEMPTS_KEPT_S = str(48 * 3600)
 """How long a deleted field's count of attempts is kept: longer than anything else that names them."""
 _LOOKED_AT = 256
@@ -85,8 +88,13 @@ class RedisFieldRecords(RedisRejections):
             ("SADD", OWNERS, record.owner),
             *((place, each, record.sha256) for each in (_VALIDATING, _importing_key(record.owner))),
             *(("ZADD", each, repr(record.created), record.sha256) for each in _created_keys(record.sha256)),
+            *listed(record),
         ]
         indexes += more
+        if record.views == "pending":
+            indexes.append(("ZADD", _UNDRAWN, repr(record.updated), record.sha256))
+        else:
+            indexes.append(("ZREM", _UNDRAWN, record.sha256))
         rejected, until = _rejected_key(record.owner), record.original_until
         if record.state == "rejected":
             indexes.append(("ZADD", rejected, repr(record.updated), record.sha256))
@@ -124,6 +132,7 @@ class RedisFieldRecords(RedisRejections):
         super()._heal(kind, name, stored, error)
         if kind is FIELD and not error.newer:
             self._redis.srem(_VALIDATING, name)
+            self._redis.zrem(_UNDRAWN, name)
             self._redis.hdel(_stored_key(owner_of(name)), name)
             self._redis.zrem(_originals_key(owner_of(name)), name)
 
@@ -178,6 +187,13 @@ class RedisFieldRecords(RedisRejections):
         names = sorted(text(name) for name in self._redis.smembers(_VALIDATING))
         return self._read_many(FIELD, names)
 
+    def undrawn_fields(self) -> list[str]:
+        names: Any = self._redis.zrevrange(_UNDRAWN, 0, -1)
+        return [text(name) for name in names]
+
+    def draw_next(self, sha256: str) -> None:
+        self._redis.zadd(_UNDRAWN, {sha256: self.now()}, xx=True)
+
     def retry_import(self, sha256: str, attempt: int, *, lost: bool = True) -> FieldRecord:
         return self._change_field(sha256, lambda known, now: transitions.retried_field(known, attempt, now, lost))
 
@@ -204,9 +220,11 @@ class RedisFieldRecords(RedisRejections):
                 ("DEL", FIELD.key(sha256)),
                 *(("ZREM", each, sha256) for each in _created_keys(sha256)),
                 *(("SREM", each, sha256) for each in (_VALIDATING, _importing_key(owner_of(sha256)))),
+                ("ZREM", _UNDRAWN, sha256),
                 ("ZREM", _rejected_key(owner_of(sha256)), sha256),
                 ("HDEL", _stored_key(owner_of(sha256)), sha256),
                 ("ZREM", _originals_key(owner_of(sha256)), sha256),
+                *unlisted(known),
                 ("SET", _attempts_key(sha256), str(known.attempt), "EX", _ATTEMPTS_KEPT_S),
             ]
             if self._compare_and_set(FIELD.key(sha256), known.version, commands) == "OK":

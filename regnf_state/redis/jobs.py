@@ -34,8 +34,8 @@ from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
 from regnf_state.redis.documents import Cap, Command, Kind, ask, stored_in, text
 from regnf_state.redis.events import events_in, start_of
-from regnf_state.redis.fields import RedisFieldRecords
 from regnf_state.redis.keys import PREFIX
+from regnf_state.redis.library import RedisLibrary
 from regnf_state.redis.owners import OWNERS
 from regnf_state.redis.unreadable import Stored
 
@@ -79,7 +79,7 @@ def _gone_key(job_id: str) -> str:
     return f"{PREFIX}job:{job_id}:gone"
 
 
-class RedisRecordStore(RedisFieldRecords):
+class RedisRecordStore(RedisLibrary):
     """A RecordStore that any number of processes share. Its clock is the Redis server's."""
 
     def __init__(self, redis: Redis, retention_s: int = 7 * 24 * 3600) -> None:
@@ -201,6 +201,10 @@ class RedisRecordStore(RedisFieldRecords):
         if found is None:
             self._require_known(JOB, job_id)
         return found
+
+    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | None]:
+        found = [self._readable(JOB, name, held) for name, held in self._fetch(JOB, job_ids)]
+        return [record or self.get_job(name) for name, record in zip(job_ids, found, strict=True)]
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         with self._redis.pipeline(transaction=False) as pipeline:

@@ -1,0 +1,98 @@
+"""regnf: where a known object stands in a scanned room, from neural signed distance fields.
+
+    import regnf
+
+    box = regnf.OrientedBox.from_corners([-0.84, -0.59, -0.50], [-0.29, 0.02, 0.02])
+    result = regnf.register("room.ckpt", "chair.glb", box)
+    print(result.verdict, result.scale)
+
+The work is done here; ``regnf.Client`` has a service do it. Names are resolved on first use, so that a program which
+uses the client alone loads no torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from regnf_core.version import __version__
+
+if TYPE_CHECKING:
+    from regnf.fitting import fit
+    from regnf_client import AsyncClient, Client, Pair, PairResult
+    from regnf_core import (
+        BatchOutcome,
+        Camera,
+        FieldWarning,
+        Insertion,
+        OrientedBox,
+        Registered,
+        RegistrationOptions,
+        RegistrationResult,
+        RegnfError,
+        Removal,
+        RenderOptions,
+        Replacement,
+        SdfField,
+        Search,
+        Sim3,
+        Substitution,
+        WarmStart,
+        compose,
+        open_field,
+        register,
+        register_batch,
+        render,
+        search,
+    )
+
+_HOMES = {
+    "AsyncClient": "regnf_client",
+    "Client": "regnf_client",
+    "Pair": "regnf_client",
+    "PairResult": "regnf_client",
+    "fit": "regnf.fitting",
+}
+"""Every other name is regnf_core's."""
+
+__all__ = [
+    "AsyncClient",
+    "BatchOutcome",
+    "Camera",
+    "Client",
+    "FieldWarning",
+    "Insertion",
+    "OrientedBox",
+    "Pair",
+    "PairResult",
+    "Registered",
+    "RegistrationOptions",
+    "RegistrationResult",
+    "RegnfError",
+    "Removal",
+    "RenderOptions",
+    "Replacement",
+    "SdfField",
+    "Search",
+    "Sim3",
+    "Substitution",
+    "WarmStart",
+    "__version__",
+    "compose",
+    "fit",
+    "open_field",
+    "register",
+    "register_batch",
+    "render",
+    "search",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name in __all__:
+        return getattr(importlib.import_module(_HOMES.get(name, "regnf_core")), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

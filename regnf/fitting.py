@@ -1,0 +1,74 @@
+"""``fit`` as users call it: a neural field from a mesh or from posed images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.field_files import require_file
+from regnf_core.fields.base import SdfField
+from regnf_core.hints import suggestion
+from regnf_data.sdfstudio import load_dataset
+from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
+from regnf_fit.mesh.file import mesh_target
+from regnf_fit.mesh.fit import fit_field
+from regnf_fit.mesh.options import FitOptions, FitReport
+
+Progress = Callable[[int, float, float], None]
+"""Called with the iteration, the loss and the seconds left."""
+
+
+def fit(
+    source: str | Path | SdfField,
+    output: str | Path,
+    options: Mapping[str, Any] | None = None,
+    extent: float | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    label: str | None = None,
+) -> FitReport | ReconstructionReport:
+    """Fit a field, write it to ``output``, a .safetensors file, and say how well it agrees.
+
+    source: a mesh file, any field, or a folder of posed RGB-D images (docs/fitting.md) · options: entries of
+    FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its longest edge after it
+    has been moved to the origin.
+    Raises InvalidOptionsError, InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET ...).
+    """
+    path = _checked_output(Path(output))
+    if isinstance(source, SdfField):
+        return fit_field(source, path, _options(FitOptions, options), seed, progress, label)
+    given = Path(source)
+    if given.is_dir():
+        if extent is not None:
+            raise InvalidOptionsError("extent is for meshes: a dataset has its own frame", hint="Leave extent out.")
+        files = FitFiles(path, path.with_suffix(".checkpoint"))
+        chosen = _options(ReconstructionOptions, options)
+        named = {"dataset": given.resolve().name}
+        return reconstruct(load_dataset(given), files, chosen, seed=seed, progress=progress, label=label, source=named)
+    require_file(given)
+    target = mesh_target(given, extent)
+    return fit_field(target.field, path, _options(FitOptions, options), seed, progress, label, target.source)
+
+
+def _checked_output(path: Path) -> Path:
+    """Refuse before the work what would fail after it."""
+    if path.suffix != ".safetensors":
+        hint = f"Write {path.with_suffix('.safetensors')}."
+        raise InvalidOptionsError(f"{path}: expected a name that ends in .safetensors", hint=hint)
+    if not path.parent.is_dir():
+        hint = f"Make it: mkdir -p {path.parent}"
+        raise InvalidInputError(f"{path.parent}: no such folder", reason="FILE_NOT_FOUND", hint=hint)
+    return path
+
+
+def _options(kind: Any, given: Mapping[str, Any] | None) -> Any:
+    known = [one.name for one in fields(kind)]
+    for name in given or {}:
+        if name not in known:
+            hint = suggestion(name, known) or f"The options are {', '.join(known)}."
+            raise InvalidOptionsError(f"options.{name}: no such option", hint=hint)
+    return kind(**(given or {}))

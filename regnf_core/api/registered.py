@@ -1,0 +1,134 @@
+"""A registration's result as a user holds it: it prints, draws and saves itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from regnf_core.errors import InvalidInputError
+from regnf_core.field_notes import FieldNotes
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.result import RegistrationResult
+from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.viewing.artifacts import write_artifacts
+from regnf_core.viewing.document import result_document
+from regnf_core.viewing.recording import write_recording
+from regnf_core.viewing.registration_picture import registration_picture
+from regnf_core.viewing.window import show
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+@dataclass(frozen=True, repr=False)
+class Registered(RegistrationResult):
+    """The outcome of one registration, with what is needed to show it.
+
+    object_name: the object's path, if it was given by one · notes: what the imports of scene and object said ·
+    detection: the box, scene frame.
+    """
+
+    object_name: str | None = None
+    notes: Mapping[str, FieldNotes] | None = None
+    detection: OrientedBox | None = None
+
+    @classmethod
+    def of(
+        cls,
+        result: RegistrationResult,
+        object_name: str | None = None,
+        notes: Mapping[str, FieldNotes] | None = None,
+        detection: OrientedBox | None = None,
+    ) -> Registered:
+        """The engine's result."""
+        values = {one.name: getattr(result, one.name) for one in fields(RegistrationResult)}
+        return cls(**values, object_name=object_name, notes=notes, detection=detection)
+
+    @property
+    def scale(self) -> float:
+        """Object units per scene unit."""
+        return float(self.T_object_scene.scale)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(4, 4): scene coordinates to object coordinates."""
+        return np.asarray(self.T_object_scene, dtype=np.float64)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result document: plain values, as result.json has them."""
+        return result_document(self, object_name=self.object_name, fields=self.notes)
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write result.json, the clouds, the pose and a picture into a folder, as ``regnf register --output`` does."""
+        self._require_clouds()
+        target = Path(folder)
+        if target.exists() and not target.is_dir():
+            hint = "Name a folder; it is made if need be."
+            raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
+        target.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target) as made:
+            names = write_artifacts(self, Path(made), object_name=self.object_name, fields=self.notes)
+            return [(Path(made) / name).replace(target / name) for name in names]
+
+    def plot(self, path: str | Path | None = None, window: bool | None = None) -> Image:
+        """The picture of the registration, written to ``path`` too if there is one.
+
+        window: whether a window of PyVista or Open3D is opened, where one of them and a display are there; None: only
+        if no ``path`` is given.
+        """
+        self._require_clouds()
+        picture = registration_picture(self)
+        if path is not None:
+            picture.save(path)
+        if window or (window is None and path is None):
+            show(self)
+        return picture
+
+    def save_recording(self, path: str | Path) -> Path:
+        """Write how the registration went as a recording (.rrd) for the viewer of rerun; the path.
+
+        Needs the extra ``rerun``. See docs/how-to/recording.md for what it holds.
+        Raises MissingExtraError, InvalidOptionsError, and InvalidInputError (NO_CLOUDS, FILE_IS_FOLDER,
+        RECORDING_DISABLED).
+        """
+        self._require_clouds()
+        return write_recording(self, path, self.detection, self.object_name)
+
+    def _require_clouds(self) -> None:
+        if not self.residuals:
+            hint = "Register without clouds=False."
+            raise InvalidInputError("the result has no point clouds to show", reason="NO_CLOUDS", hint=hint)
+
+    def __repr__(self) -> str:
+        sure = "" if self.probability is None else f", probability {self.probability:.3f}"
+        return f"<{self.verdict}: {self.verdict_reason}, scale {self.scale:.4g}{sure}>"
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks."""
+        if not self.residuals:
+            return None
+        stream = io.BytesIO()
+        registration_picture(self).save(stream, "PNG")
+        return stream.getvalue()
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        reason = VERDICT_REASONS.get(self.verdict_reason, self.verdict_reason)
+        rows = "".join(
+            "<tr>" + "".join(f"<td style='text-align:right'>{value:.4f}</td>" for value in row) + "</tr>"
+            for row in self.matrix
+        )
+        png = self._repr_png_()
+        data = "" if png is None else base64.b64encode(png).decode()
+        picture = f"<img alt='registration' src='data:image/png;base64,{data}'>" if data else ""
+        words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}."
+        return f"<div><p>{words}</p><table><caption>T_object_scene</caption>{rows}</table>{picture}</div>"

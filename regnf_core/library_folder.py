@@ -1,0 +1,213 @@
+"""A library in a folder: safe fields, their pictures, and an index. Torch-free but for adding.
+
+library.json              names, tags, units, notes, symmetries
+{sha256}.safetensors      a safe field, by the digest of its bytes
+{sha256}.png              its picture, where there is one
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from regnf_core.errors import InvalidInputError, NoSurfaceError
+from regnf_core.field_source import FieldSource
+from regnf_core.files import atomic_path
+from regnf_core.library_entries import EntryNotes, checked_symmetry
+
+INDEX = "library.json"
+FORMAT = 1
+_DIGITS = 64
+
+
+@dataclass(frozen=True)
+class FolderEntry:
+    """field: SHA-256 of the safe field · detected: the symmetry that was found; None: there is no surface."""
+
+    notes: EntryNotes
+    field: str
+    detected: dict[str, Any] | None = None
+
+    @property
+    def symmetry(self) -> dict[str, Any] | None:
+        """The one that holds: what people say goes before what was detected."""
+        return self.notes.symmetry or self.detected
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain (JSON) values."""
+        return self.notes.to_dict() | {"field": self.field, "detected_symmetry": self.detected}
+
+    @classmethod
+    def from_dict(cls, values: Any) -> FolderEntry:
+        """Of an index. Raises InvalidInputError (LIBRARY_ENTRY_INVALID)."""
+        notes = EntryNotes.from_dict(values)
+        field = values.get("field")
+        if not (isinstance(field, str) and len(field) == _DIGITS and set(field) <= set("0123456789abcdef")):
+            raise InvalidInputError("a field is named by its SHA-256", reason="LIBRARY_ENTRY_INVALID")
+        return cls(notes, field, checked_symmetry(values.get("detected_symmetry")))
+
+
+def index_text(entries: list[FolderEntry]) -> str:
+    """An index as a file holds it."""
+    return json.dumps({"format": FORMAT, "entries": [one.to_dict() for one in entries]}, ensure_ascii=False, indent=1)
+
+
+def index_of(text: bytes, named: str) -> list[FolderEntry]:
+    """The entries of an index. Raises InvalidInputError (LIBRARY_INDEX_INVALID), which names the file."""
+    try:
+        document = json.loads(text)
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise ValueError(f"expected an index of format {FORMAT}")
+        entries = [FolderEntry.from_dict(values) for values in document["entries"]]
+    except (ValueError, KeyError, TypeError, RecursionError, InvalidInputError) as error:
+        raise _invalid(f"{named}: no index of a library: {error}") from error
+    for what in ({one.notes.name for one in entries}, {one.field for one in entries}):
+        if len(what) < len(entries):
+            raise _invalid(f"{named}: two entries share a name or a field")
+    return entries
+
+
+class LibraryFolder:
+    """One library. Any number of processes may use it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @classmethod
+    def usual(cls) -> LibraryFolder:
+        """The user's own: REGNF_LIBRARY, else below XDG_DATA_HOME or ~/.local/share."""
+        named = os.environ.get("REGNF_LIBRARY")
+        base = os.environ.get("XDG_DATA_HOME")
+        return cls(
+            Path(named) if named else (Path(base) if base else Path.home() / ".local/share") / "regnf" / "library"
+        )
+
+    @staticmethod
+    def is_one(folder: Path) -> bool:
+        """Whether a folder is a library."""
+        return (folder / INDEX).is_file()
+
+    def entries(self, tag: str | None = None, part: str | None = None) -> list[FolderEntry]:
+        """By name: those with the tag, and with ``part`` in their names. Raises InvalidInputError."""
+        try:
+            held = index_of((self.folder / INDEX).read_bytes(), str(self.folder / INDEX))
+        except FileNotFoundError:
+            return []
+        found = [one for one in held if tag is None or tag in one.notes.tags]
+        found = [one for one in found if part is None or part.casefold() in one.notes.name.casefold()]
+        return sorted(found, key=lambda one: one.notes.name.casefold())
+
+    def get(self, name: str) -> FolderEntry:
+        """Raises InvalidInputError (LIBRARY_ENTRY_NOT_FOUND)."""
+        for one in self.entries():
+            if one.notes.name == name:
+                return one
+        raise InvalidInputError(
+            f"{self.folder}: no entry {name!r}",
+            reason="LIBRARY_ENTRY_NOT_FOUND",
+            hint="`regnf library list` shows all names.",
+        )
+
+    def file(self, entry: FolderEntry) -> Path:
+        """The safe field."""
+        return self.folder / f"{entry.field}.safetensors"
+
+    def picture(self, entry: FolderEntry) -> Path:
+        """Where its picture lies, if it has one."""
+        return self.folder / f"{entry.field}.png"
+
+    def add(self, source: FieldSource, notes: EntryNotes) -> FolderEntry:
+        """Import the field through the gate, find its symmetry, and keep it.
+
+        Raises FieldFormatError naming the file, InvalidInputError (LIBRARY_NAME_TAKEN, FIELD_IN_LIBRARY).
+        """
+        from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+        from regnf_core.importing.gate.picture import PICTURE_NAME
+
+        self._require_free(self.entries(), FolderEntry(notes, ""))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".adding-", dir=self.folder) as made:
+            with source.naming(), source.packed_settings() as settings:
+                said = source.description or None
+                import_field(source.file, Path(made), said, ImportLimits(), picture=True, settings=settings)
+            field = Path(made) / FIELD_NAME
+            entry = FolderEntry(notes, digest_of(field), _symmetry_of(field))
+            with self._changing() as held:
+                self._require_free(held, entry)
+                os.replace(field, self.file(entry))
+                if (Path(made) / PICTURE_NAME).exists():
+                    os.replace(Path(made) / PICTURE_NAME, self.picture(entry))
+                held.append(entry)
+        return entry
+
+    def change(self, name: str, notes: EntryNotes) -> FolderEntry:
+        """Raises InvalidInputError (LIBRARY_ENTRY_NOT_FOUND, LIBRARY_NAME_TAKEN)."""
+        with self._changing() as held:
+            known = self.get(name)
+            changed = FolderEntry(notes, known.field, known.detected)
+            held.remove(known)
+            self._require_free(held, changed)
+            held.append(changed)
+        return changed
+
+    def remove(self, name: str) -> None:
+        """The entry and its field. Raises InvalidInputError (LIBRARY_ENTRY_NOT_FOUND)."""
+        with self._changing() as held:
+            entry = self.get(name)
+            held.remove(entry)
+        for path in (self.file(entry), self.picture(entry)):
+            path.unlink(missing_ok=True)
+
+    @contextmanager
+    def _changing(self) -> Iterator[list[FolderEntry]]:
+        """The entries, to be changed; written at the end. One process at a time."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / ".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            held = self.entries()
+            yield held
+            with atomic_path(self.folder / INDEX, durable=True) as path:
+                path.write_text(index_text(held), encoding="utf-8")
+
+    def _require_free(self, held: list[FolderEntry], entry: FolderEntry) -> None:
+        for one in held:
+            if one.notes.name == entry.notes.name:
+                message = f"{self.folder}: there is an entry {one.notes.name!r}"
+                hint = "Choose another name, or remove that entry first."
+                raise InvalidInputError(message, reason="LIBRARY_NAME_TAKEN", hint=hint)
+            if one.field == entry.field:
+                message = f"the field is the entry {one.notes.name!r}"
+                hint = "Change that entry: `regnf library edit`."
+                raise InvalidInputError(message, reason="FIELD_IN_LIBRARY", hint=hint)
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file's bytes."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _symmetry_of(field: Path) -> dict[str, Any] | None:
+    """Of the object in a safe field; its model is kept for searches. None for what has no surface."""
+    from regnf_core.object_models import object_model
+    from regnf_core.options import RobustOptions
+
+    try:
+        group = object_model(FieldSource(field, field), RobustOptions()).symmetry.group()
+    except (NoSurfaceError, InvalidInputError):
+        return None
+    found = asdict(group)
+    return found | {"axis": None if group.axis is None else list(group.axis)}
+
+
+def _invalid(detail: str) -> InvalidInputError:
+    hint = "Restore the file from a copy, or import an archive of the library into another folder."
+    return InvalidInputError(detail, reason="LIBRARY_INDEX_INVALID", hint=hint)
