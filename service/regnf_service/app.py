@@ -15,6 +15,7 @@ from regnf_service.http import problems
 from regnf_service.http.buckets import Buckets
 from regnf_service.http.connections import Connections
 from regnf_service.http.contract import build_contract
+from regnf_service.http.cross_origin import cors_layer, cors_origins
 from regnf_service.http.hosts import allowed_hosts
 from regnf_service.http.middleware import RequestContext, TokenGate
 from regnf_service.http.origin_gate import OriginGate
@@ -90,9 +91,18 @@ def _middleware(
         limits.append(Middleware(WriteGate, buckets=Buckets(settings.writes_per_s, settings.write_limit_burst)))
     if limiter is not None:
         limits.append(Middleware(RateGate, limiter=limiter))
-    hosts = Middleware(OriginGate, hosts=allowed_hosts(settings))
+    origins = cors_origins(settings)
+    hosts = Middleware(OriginGate, hosts=allowed_hosts(settings), origins=origins)
     turns = Middleware(TurnGate, callers=callers if settings.needs_token else {})
-    return [Middleware(RequestContext), Middleware(Measured, metrics=metrics), turns, hosts, gate, *limits]
+    return [
+        Middleware(RequestContext),
+        Middleware(Measured, metrics=metrics),
+        turns,
+        hosts,
+        *cors_layer(origins),
+        gate,
+        *limits,
+    ]
 
 
 def _include_routers(app: FastAPI, **how: Any) -> None:

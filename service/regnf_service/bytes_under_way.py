@@ -16,13 +16,13 @@ class Claim:
         self._claimed = claimed
         self._caller = caller
         self._room = room
-        self._arrived = 0
+        self.arrived = 0
         self._held = 0
 
     def arrive(self, size: int) -> None:
         """Count bytes that came. Raises Problem QUOTA_STORED_BYTES."""
-        self._arrived += size
-        self.hold(self._arrived)
+        self.arrived += size
+        self.hold(self.arrived)
 
     def hold(self, size: int) -> None:
         """Hold this many bytes at least. Raises Problem QUOTA_STORED_BYTES."""

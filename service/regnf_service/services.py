@@ -14,11 +14,15 @@ from regnf_service.concurrency import Slots, Waiters
 from regnf_service.job_watch import JobWatch
 from regnf_service.upload_slots import UploadSlots
 from regnf_service.webhooks.policy import Webhooks
+from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.originals import Originals
+from regnf_state.pieces import Pieces
 from regnf_state.queue import JobQueue
+from regnf_state.quota import quota_of
 from regnf_state.records import Quota
+from regnf_state.redis.batch_index import BatchIndex
 from regnf_state.room import Room
 from regnf_state.settings import Settings
 
@@ -28,7 +32,10 @@ _LOOK_THREADS = 2
 
 @dataclass(frozen=True)
 class Services:
-    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
+    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too.
+
+    ``batch_posted`` is set when a batch has pairs to hand out, so that nobody waits for the feeder's next round.
+    """
 
     settings: Settings
     redis: Redis
@@ -37,6 +44,7 @@ class Services:
     queue: JobQueue
     webhooks: Webhooks
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
+    batch_posted: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
     # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
@@ -46,14 +54,7 @@ class Services:
     @cached_property
     def quota(self) -> Quota:
         """What each caller may have."""
-        chosen = self.settings
-        return Quota(
-            active_jobs=chosen.quota_active_jobs,
-            share_jobs=chosen.needs_token,
-            imports=chosen.max_imports_per_caller,
-            fields=chosen.quota_fields,
-            stored_bytes=chosen.quota_stored_bytes,
-        )
+        return quota_of(self.settings)
 
     @cached_property
     def room(self) -> Room:
@@ -64,6 +65,16 @@ class Services:
     def originals(self) -> Originals:
         """The uploads that stay after their import."""
         return Originals(self.records, self.blobs, self.settings)
+
+    @cached_property
+    def pieces(self) -> Pieces:
+        """Uploads that come in pieces and are not finished."""
+        return Pieces(self.blobs, self.settings)
+
+    @cached_property
+    def batches(self) -> Batches:
+        """Batches of registrations."""
+        return Batches(self.blobs, BatchIndex(self.redis), self.settings.retention_s)
 
     @cached_property
     def requests(self) -> Slots:

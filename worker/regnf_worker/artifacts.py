@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from regnf_state.blobs.base import BlobStore
-from regnf_state.manifest import Artifact, Manifest, artifact_key, manifest_key, read_result
+from regnf_state.manifest import Artifact, Manifest, Rest, artifact_key, manifest_key, read_result, rest_key
 from regnf_state.records import UnreadableRecordError
 
 _CHUNK_BYTES = 1 << 20
@@ -23,15 +23,21 @@ def verdict_of(blobs: BlobStore, manifest: Manifest) -> str | None:
     return verdict if verdict in _VERDICTS else None
 
 
-def store_artifacts(blobs: BlobStore, job_id: str, attempt: int, folder: Path, names: Sequence[str]) -> Manifest:
+def store_artifacts(
+    blobs: BlobStore, job_id: str, attempt: int, folder: Path, names: Sequence[str]
+) -> tuple[Artifact, ...]:
     """Copy files into the store under the attempt. They do not count before the manifest is published."""
-    stored = tuple(_store(blobs, artifact_key(job_id, attempt, name), folder / name) for name in names)
-    return Manifest(job_id, attempt, stored)
+    return tuple(_store(blobs, artifact_key(job_id, attempt, name), folder / name) for name in names)
 
 
 def publish(blobs: BlobStore, manifest: Manifest) -> bool:
     """Make the result count. False when another attempt has published one already: a job has one result, ever."""
     return blobs.put_if_absent(manifest_key(manifest.job_id), manifest.to_json())
+
+
+def publish_rest(blobs: BlobStore, job_id: str, rest: Rest) -> bool:
+    """Say what has become of the files that were to come. False when that is said already: it is said once."""
+    return blobs.put_if_absent(rest_key(job_id), rest.to_json())
 
 
 def discard(blobs: BlobStore, job_id: str, attempt: int) -> None:

@@ -12,14 +12,26 @@ from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.field_notes import NO_NOTES, FieldNotes
 from regnf_core.importing.gate.gate import ImportLimits, import_field
 from regnf_core.options import RegistrationOptions
+from regnf_core.rendering.request import RenderRequest
 from regnf_state.registration_request import RegistrationRequest
 
 Report = Callable[[str, float], None]
 Importer = Callable[[Path, Path, dict[str, Any], Path | None, Path | None], dict[str, Any]]
-"""(upload, folder, description, settings, cameras) -> report; writes folder/field.safetensors, and folder/preview.png
-if it can.
+"""(upload, folder, description, settings, cameras) -> report; writes folder/field.safetensors.
 
 Raises FieldFormatError."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """What the engine has written of a result, by name, and what it has yet to write when ``finish`` is called.
+
+    ``finish`` returns the names of what it wrote: ``to_come`` or fewer.
+    """
+
+    names: Sequence[str]
+    to_come: Sequence[str] = ()
+    finish: Callable[[], Sequence[str]] = tuple
 
 
 Notes = Mapping[str, FieldNotes]
@@ -41,8 +53,8 @@ class Candidate:
     fault: str | None = None
 
 
-class RegistrationEngine(Protocol):
-    """Registers safe field files. Everything may raise RegnfError."""
+class Engine(Protocol):
+    """Registers and renders safe field files. Everything may raise RegnfError."""
 
     def describe(self) -> dict[str, Any]:
         """Version and device, for the job's record."""
@@ -57,8 +69,8 @@ class RegistrationEngine(Protocol):
         report: Report,
         folder: Path,
         notes: Notes,
-    ) -> list[str]:
-        """Do what a request asks for, artifacts into ``folder``; their names. ``model`` saves making one."""
+    ) -> Made:
+        """Do what a request asks for, artifacts into ``folder``. ``model`` saves making one."""
         ...
 
     def search(
@@ -69,8 +81,19 @@ class RegistrationEngine(Protocol):
         report: Report,
         folder: Path,
         notes: Notes,
-    ) -> list[str]:
+    ) -> Made:
         """The same for a request with candidates."""
+        ...
+
+    def render(
+        self,
+        scene: Path,
+        objects: Mapping[str, Callable[[], Path]],
+        request: RenderRequest,
+        report: Report,
+        folder: Path,
+    ) -> list[str]:
+        """The same for a rendering. objects: what opens the safe field file of each object that edits name."""
         ...
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
@@ -115,28 +138,27 @@ class CoreEngine:
         report: Report,
         folder: Path,
         notes: Notes,
-    ) -> list[str]:
+    ) -> Made:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.geometry.sim3 import Sim3
-        from regnf_core.registration import WarmStart, register
-        from regnf_core.viewing import write_artifacts
+        from regnf_core.registration import WarmStart, register, with_late_clouds
+        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         start, truth = request.initial_transform, request.ground_truth
-        result = register(
-            open_field(scene, self.device),
-            open_field(object_, self.device),
-            OrientedBox.from_quaternion(**asdict(request.detection)),
-            request.options,
-            request.seed,
-            report,
-            WarmStart(Sim3.from_matrix(start) if start else None, model),
-        )
-        report("exporting", 0.95)
+        fields = open_field(scene, self.device), open_field(object_, self.device)
+        box, options = OrientedBox.from_quaternion(**asdict(request.detection)), request.options
+        warm = WarmStart(Sim3.from_matrix(start) if start else None, model)
+        # errors against a truth are those of the clouds' points
+        result = register(*fields, box, options, request.seed, report, warm, clouds=bool(truth))
         T_true = Sim3.from_matrix(truth) if truth else None
         said: dict[str, Any] = {"object_name": request.object, "fields": _fields(notes, request.object)}
-        names: list[str] = write_artifacts(result, folder, truth=T_true, **said)
-        return names
+        names = write_result(result, folder, truth=T_true, **said)
+
+        def finish() -> list[str]:
+            return write_pictures(result if truth else with_late_clouds(result, *fields, box, options), folder)
+
+        return Made(names, PICTURES, finish) if request.pictures else Made(names)
 
     def search(
         self,
@@ -146,11 +168,12 @@ class CoreEngine:
         report: Report,
         folder: Path,
         notes: Notes,
-    ) -> list[str]:
+    ) -> Made:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.library import LibraryObject, search_library
-        from regnf_core.viewing import ranking_document, write_artifacts
+        from regnf_core.viewing import ranking_document
+        from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
         def opener(one: Candidate) -> Callable[[], Any]:
             return lambda: open_field(one.open(), self.device)
@@ -167,8 +190,30 @@ class CoreEngine:
         report("exporting", 0.95)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
         said: dict[str, Any] = {"object_name": winner, "candidates": ranking, "fields": _fields(notes, winner)}
-        names: list[str] = write_artifacts(found.result, folder, **said)
-        return names
+        names = write_result(found.result, folder, **said)
+        pictures = Made(names, PICTURES, lambda: write_pictures(found.result, folder))
+        return pictures if request.pictures else Made(names)
+
+    def render(
+        self,
+        scene: Path,
+        objects: Mapping[str, Callable[[], Path]],
+        request: RenderRequest,
+        report: Report,
+        folder: Path,
+    ) -> list[str]:
+        from regnf_core.fields.build import open_field
+        from regnf_core.rendering.job import phase_of, run_render
+        from regnf_worker.rendering_result import write_result
+
+        made = run_render(
+            open_field(scene, self.device),
+            request,
+            lambda name: open_field(objects[name](), self.device),
+            folder,
+            lambda share: report(phase_of(share), share),
+        )
+        return write_result(folder, request, made, self.describe())
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
         from regnf_core.fields.build import open_field
@@ -197,6 +242,7 @@ def core_importer(limits: ImportLimits) -> Importer:
         upload: Path, folder: Path, description: dict[str, Any], settings: Path | None, cameras: Path | None
     ) -> dict[str, Any]:
         said = description or None
-        return import_field(upload, folder, said, limits, picture=True, settings=settings, cameras=cameras).to_dict()
+        report = import_field(upload, folder, said, limits, settings=settings, cameras=cameras, ask_by_picture=True)
+        return report.to_dict()
 
     return run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -29,24 +30,31 @@ class Fields:
         self._stack = stack
         self._deadline = time.monotonic() + _WAIT_BEFORE_GIVING_BACK_S
 
-    def ready(self, sha256: str) -> FieldRecord:
-        """The field's record, once its import has ended.
+    def ready(self, references: Sequence[str]) -> list[FieldRecord]:
+        """The fields' records, once their imports have ended; all of them are asked for at once.
 
         Raises InvalidInputError (FIELD_NOT_FOUND, FIELD_REJECTED, FIELD_IMPORT_TIMEOUT), FieldsNotReadyError.
         """
-        while (field := self._usable(sha256)).state == "validating":
+        while True:
+            found = self._usable(references)
+            awaited = next((one.sha256 for one in found if one.state == "validating"), None)
+            if awaited is None:
+                return found
             self._heartbeat.check()
             if time.monotonic() > self._deadline:
-                raise FieldsNotReadyError(sha256)
+                raise FieldsNotReadyError(awaited)
             time.sleep(_POLL_S)
-        return field
 
     def file(self, sha256: str) -> Path:
         """The safe field file of a field that is ready."""
         return self._stack.enter_context(self._context.blobs.local_copy(f"fields/{sha256}/field.safetensors"))
 
-    def _usable(self, sha256: str) -> FieldRecord:
-        field, name = self._context.records.get_field(sha256), sha256_of(sha256)
+    def _usable(self, references: Sequence[str]) -> list[FieldRecord]:
+        found = self._context.records.get_fields(references)
+        return [self._checked(field, sha256_of(name)) for field, name in zip(found, references, strict=True)]
+
+    def _checked(self, field: FieldRecord | None, name: str) -> FieldRecord:
+        """One that may still become, or is, ready."""
         if field is None:
             raise InvalidInputError(f"field {name} was deleted", reason="FIELD_NOT_FOUND")
         if field.state == "rejected":

@@ -16,7 +16,6 @@ from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import FieldFormatError, RegnfError
 from regnf_core.field_candidates import Candidate
-from regnf_core.importing.gate.picture import PICTURE_NAME
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.originals import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
@@ -76,7 +75,8 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         if ORIGINAL_UNTIL not in ended:
             delete_upload(context.blobs, field)
         retry_until_available(
-            f"the record of import {sha256}", lambda: _end(context, sha256, attempt, state="ready", report=ended)
+            f"the record of import {sha256}",
+            lambda: _end(context, sha256, attempt, state="ready", report=ended, views="pending", drawings=0),
         )
 
 
@@ -153,8 +153,6 @@ def _work(context: Context, field: FieldRecord, importer: Importer) -> dict[str,
             report: dict[str, Any] = importer(upload, folder, field.said, settings, cameras)
         _require_current(context, field)
         delete_all_but_upload(context.blobs, field)  # an object's model, of what the field was before
-        if (folder / PICTURE_NAME).exists():
-            context.blobs.put(f"fields/{sha256}/{PICTURE_NAME}", (folder / PICTURE_NAME).read_bytes())
         with (folder / "field.safetensors").open("rb") as source, context.blobs.writer() as writer:
             while chunk := source.read(1 << 20):
                 writer.write(chunk)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, MutableMapping
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 _PR_SET_PDEATHSIG = 1
 _OOM_SCORE = "500"
@@ -43,13 +43,14 @@ class Exit(NamedTuple):
     peak_memory: int = 0
 
 
-def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | None:
-    """Wait for a child to end, for so many seconds at most; None when it still runs.
+def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | Literal["spoken"] | None:
+    """Wait for a child to end or to say something, for so many seconds at most; None when it still runs.
 
     ``ended`` is the reading end of a pipe whose writing end only the child holds open.
     """
     deadline = time.monotonic() + seconds
-    select.select([ended], [], [], seconds)
+    if select.select([ended], [], [], seconds)[0] and os.read(ended, 1):
+        return "spoken"
     while True:
         try:
             pid, status, usage = os.wait4(child, os.WNOHANG)

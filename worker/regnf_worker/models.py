@@ -1,4 +1,4 @@
-"""The model of an object, made by the first registration that uses it and kept beside its field."""
+"""The model of an object, made by the first registration that uses it, or for a library, and kept beside its field."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from regnf_core.errors import RegnfError
 from regnf_core.options import RegistrationOptions
 from regnf_state.records import FieldRecord, StaleAttemptError
 from regnf_worker.context import Context
-from regnf_worker.engine import Model, RegistrationEngine
+from regnf_worker.engine import Engine, Model
 
 logger = logging.getLogger(__name__)
 
@@ -30,9 +30,7 @@ class ObjectModels:
     Only models by the default options are kept: others are made for the job alone, in ``folder``.
     """
 
-    def __init__(
-        self, context: Context, engine: RegistrationEngine, options: RegistrationOptions, folder: Path
-    ) -> None:
+    def __init__(self, context: Context, engine: Engine, options: RegistrationOptions, folder: Path) -> None:
         self._context = context
         self._engine = engine
         self._options = options

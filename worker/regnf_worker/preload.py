@@ -15,15 +15,17 @@ from pathlib import Path
 
 _MODULES = (
     "regnf_worker.engine",
-    "regnf_worker.registration",
+    "regnf_worker.attempt",
     "regnf_core.geometry.box",
     "regnf_core.viewing",
     "regnf_core.fields.build",
     "regnf_core.library",
     "regnf_core.registration",
+    "regnf_core.rendering.job",
     "regnf_core.geometry.sim3",
+    "PIL.PngImagePlugin",
 )
-"""What regnf_worker.engine imports where it needs it."""
+"""What regnf_worker.engine imports where it needs it, and what Pillow does."""
 
 
 class PreloadError(RuntimeError):

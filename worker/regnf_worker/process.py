@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -26,16 +27,20 @@ from rq.timeouts import JobTimeoutException
 from rq.utils import now
 from rq.worker import WorkerStatus
 
+from regnf_core.importing.gate.fair_clock import LONGEST
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis import payload
 from regnf_state.redis.address import redis_address
-from regnf_state.redis.client import connect
+from regnf_state.redis.client import WORKER_RETRIES, connect
 from regnf_state.redis.fair_queue import FairQueue
-from regnf_worker import jobs, kernel
+from regnf_worker import jobs, kernel, worker_pipe
 from regnf_worker.context import Context
+from regnf_worker.field_drawer import Draw, FieldDrawer
+from regnf_worker.finishing import ChildAtPictures, Finishing
 from regnf_worker.job_limits import JobLimits
 from regnf_worker.resilient_worker import ResilientWorker
+from regnf_worker.rest import give_up_rest
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from regnf_worker.taking import Taking
@@ -56,9 +61,14 @@ class RegnfWorker(ResilientWorker):
     """One worker of the service. ``monitor_s`` is how often it checks the child that it runs."""
 
     def __init__(
-        self, context: Context, scratch: Scratch, monitor_s: int = 1, functions: Mapping[Kind, Function] = FUNCTIONS
+        self,
+        context: Context,
+        scratch: Scratch,
+        monitor_s: int = 1,
+        functions: Mapping[Kind, Function] = FUNCTIONS,
+        draw: Draw = jobs.run_drawing,
     ) -> None:
-        redis = connect(redis_address(context.settings), retries=20)
+        redis = connect(redis_address(context.settings), retries=WORKER_RETRIES)
         super().__init__(
             [IMPORT_QUEUE_NAME, QUEUE_NAME],
             connection=redis,
@@ -77,10 +87,12 @@ class RegnfWorker(ResilientWorker):
             "registration": settle_registration,
         }
         self._limits: dict[Kind, int] = {
-            "import": context.settings.import_timeout_s + _IMPORT_MARGIN_S,
+            "import": round(LONGEST * context.settings.import_timeout_s) + _IMPORT_MARGIN_S,
             "registration": context.settings.job_timeout_s,
         }
         self._job_limits = JobLimits.of(context.settings)
+        self._finishing = Finishing()
+        self._drawer = FieldDrawer(redis, context.settings, draw)
         self._exceeded: str | None = None
         self._niceness = 0
         self._started = 0.0
@@ -97,6 +109,9 @@ class RegnfWorker(ResilientWorker):
             self.work(logging_level=None)
         except StopRequested:
             self.teardown()
+        finally:
+            self._drawer.end()
+            self._finishing.end(self._context.settings.shutdown_grace_s)
 
     def dequeue_job_and_maintain_ttl(self, timeout: int | None, max_idle_time: int | None = None) -> Any:  # noqa: ARG002
         """The next job and its queue, waited for; None when there is none and no ``timeout`` to wait for."""
@@ -105,7 +120,11 @@ class RegnfWorker(ResilientWorker):
             self.heartbeat()
             if self.should_run_maintenance_tasks:
                 self.run_maintenance_tasks()
-            taken = self._until_available("taking a job", lambda: self._taking.pop(timeout))
+            taken = self._until_available("taking a job", partial(self._taking.pop, None))
+            if taken is None and timeout is not None:
+                busy = self._drawer.go_on() or not self._finishing.is_free() or self._scratch.drop_left()
+                wait_s = 1 if busy else timeout
+                taken = self._until_available("waiting for a job", partial(self._taking.pop, wait_s))
             if taken is None and timeout is None:
                 return None
             if taken is not None:
@@ -129,15 +148,18 @@ class RegnfWorker(ResilientWorker):
         oom_kills = kernel.oom_kills()
         self._niceness = self._niceness_of(work)
         self.begin_job(job)
+        folder = self._scratch.of_job()
         try:
-            end = self._run_child(job, queue)
+            end = self._run_child(job, queue, folder)
         finally:
-            self._scratch.empty()
             self._charge(work)
+        if end is not None:
+            self._scratch.drop(folder)
         try:
             self.finish_job(job)
         finally:
-            self._settle(work, end, kernel.oom_kills() > oom_kills)
+            if end is not None:
+                self._settle(work, end, kernel.oom_kills() > oom_kills)
             if work.kind == "import":
                 self._if_possible("queueing what waited", lambda: self._fair.release(work.argument))
 
@@ -173,8 +195,8 @@ class RegnfWorker(ResilientWorker):
         finally:
             os._exit(status)
 
-    def _run_child(self, job: Any, queue: Any) -> kernel.Exit:
-        """Fork a child for the job and wait for its end."""
+    def _run_child(self, job: Any, queue: Any, folder: Path) -> kernel.Exit | None:
+        """Fork a child for the job and wait for its end; None when it has said that the worker may go on."""
         limited = queue.name != IMPORT_QUEUE_NAME  # an import's process has limits of its own
         ended, held_by_child = os.pipe()
         parent = os.getpid()
@@ -184,9 +206,11 @@ class RegnfWorker(ResilientWorker):
             kernel.die_with_parent(parent)
             kernel.prefer_as_oom_victim()
             kernel.give_way(self._niceness)
-            self._scratch.use()
+            os.close(ended)
+            worker_pipe.hold(held_by_child)
             if limited:
                 self._job_limits.hold_here()
+            self._scratch.use(folder)
             self.main_work_horse(job, queue)
         os.close(held_by_child)
         with suppress(OSError):
@@ -194,16 +218,30 @@ class RegnfWorker(ResilientWorker):
         self._horse_pid = child
         job.started_at = now()
         job.timeout = -1  # the limit is kept here, by the monotonic clock: RQ uses the wall clock
-        try:
-            while (exit_ := kernel.wait_for_exit(child, ended, self.job_monitoring_interval)) is None:
-                self._limit_child(limited)
-                self.report_running(job)
-        finally:
-            os.close(ended)
+        while (exit_ := kernel.wait_for_exit(child, ended, self.job_monitoring_interval)) is None:
+            self._limit_child(limited, folder)
+            self.report_running(job)
+            self._finishing.is_free()
         self._horse_pid = 0
+        if exit_ == "spoken":
+            self._let_finish(Work.named(queue.name, job.id), child, ended, folder)
+            return None
+        os.close(ended)
         return exit_
 
-    def _limit_child(self, limited: bool) -> None:
+    def _let_finish(self, work: Work, child: int, ended: int, folder: Path) -> None:
+        """Leave a child to itself whose result is out; the one before it is waited for, so there is one at most."""
+
+        def settle() -> None:
+            self._scratch.drop(folder)
+            self._write_down(work, lambda: give_up_rest(self._context, work.argument))
+
+        until = time.monotonic() + self._context.settings.lost_after_s
+        while not self._finishing.is_free(self.job_monitoring_interval):
+            self._if_possible("a sign of life", self._report_now)
+        self._finishing.take(ChildAtPictures(child, ended, until, settle))
+
+    def _limit_child(self, limited: bool, folder: Path) -> None:
         """Kill a child that is past its time limit, past the time that a worker which stops grants it, or, ``limited``,
         over a limit of its memory or disk space."""
         now_s = time.monotonic()
@@ -214,7 +252,7 @@ class RegnfWorker(ResilientWorker):
             self._given_back = True
             self.kill_horse()
         elif limited:
-            self._exceeded = self._job_limits.exceeded_by(self._horse_pid, self._scratch.folder)
+            self._exceeded = self._job_limits.exceeded_by(self._horse_pid, folder)
             if self._exceeded is not None:
                 self.kill_horse()
 
@@ -231,12 +269,12 @@ class RegnfWorker(ResilientWorker):
         )
         settle = self._settlers[work.kind]
 
+        self._write_down(work, lambda: settle(self._context, work.argument, work.attempt, self.name, end))
+
+    def _write_down(self, work: Work, settle: Callable[[], None]) -> None:
         def write_down() -> None:
             try:
-                self._until_available(
-                    f"settling job {work.name}",
-                    lambda: settle(self._context, work.argument, work.attempt, self.name, end),
-                )
+                self._until_available(f"settling job {work.name}", settle)
             except (RedisError, OSError, UnreadableRecordError) as error:
                 self.log.error("job %s could not be settled: %s", work.name, error)  # the reaper will
 

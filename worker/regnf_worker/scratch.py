@@ -28,29 +28,40 @@ class Scratch:
             self.folder.mkdir(mode=0o700)
             self._lock = (self.folder / _LOCK).open("a")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
+        self._left: list[Path] = []
 
-    def empty(self) -> None:
-        """Delete whatever a job has left. What cannot be deleted now goes when the next worker starts."""
+    def of_job(self) -> Path:
+        """A folder for one job, which its process makes with ``use``."""
+        return self.folder / f"job-{uuid4().hex}"
+
+    def drop(self, folder: Path) -> None:
+        """Delete whatever a job has left. What cannot be deleted now goes with ``drop_left``."""
         try:
-            self._empty()
+            shutil.rmtree(folder)
+        except FileNotFoundError:
+            if not self.folder.exists():  # the volume is away, and comes back with what is on it
+                self._left.append(folder)
         except OSError as error:
             logger.warning("temporary files stay for now: %s", error)
+            self._left.append(folder)
 
-    def _empty(self) -> None:
-        for entry in self.folder.iterdir():
-            if entry.name == _LOCK:
-                continue
-            if entry.is_dir() and not entry.is_symlink():
-                shutil.rmtree(entry, ignore_errors=True)
-            else:
-                entry.unlink(missing_ok=True)
+    def drop_left(self) -> bool:
+        """Delete what could not be deleted before, once the folder is there: whether anything is left."""
+        if self._left and self.folder.exists():
+            left, self._left = self._left, []
+            for folder in left:
+                shutil.rmtree(folder, ignore_errors=True)
+                self._left += [folder] if folder.exists() else []
+        return bool(self._left)
 
-    def use(self) -> None:
-        """Have this process' temporary files made here."""
+    @staticmethod
+    def use(folder: Path) -> None:
+        """Have this process' temporary files made here. Raises OSError."""
         import tempfile
 
-        os.environ["TMPDIR"] = str(self.folder)
-        tempfile.tempdir = str(self.folder)
+        folder.mkdir(mode=0o700)
+        os.environ["TMPDIR"] = str(folder)
+        tempfile.tempdir = str(folder)
 
     def remove(self) -> None:
         """The worker ends."""

@@ -12,9 +12,11 @@ from regnf_state.problems import problem_document
 from regnf_state.records import ACTIVE, JobRecord, StaleAttemptError
 from regnf_worker.artifacts import discard, verdict_of
 from regnf_worker.context import Context
+from regnf_worker.edited_fields import keep_edited_field
 from regnf_worker.imports import claim_import, reject
 from regnf_worker.job_limits import JobLimits
 from regnf_worker.problems import OVER_LIMIT, over_limit
+from regnf_worker.rest import give_up_rest
 
 logger = logging.getLogger(__name__)
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM)
@@ -69,7 +71,10 @@ def settle_registration(context: Context, job_id: str, attempt: int, worker: str
     attempt. In all other cases the job has failed.
     """
     record = context.records.get_job(job_id)
-    if record is None or record.attempt != attempt or record.status not in ACTIVE:
+    if record is None or record.attempt != attempt:
+        return
+    if record.status not in ACTIVE:
+        give_up_rest(context, job_id)
         return
     try:
         if record.status == "accepted":  # it died before it could claim its job
@@ -85,8 +90,10 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
     job_id, attempt = record.id, record.attempt
     manifest = read_manifest(context.blobs, job_id)
     if manifest is not None:
+        keep_edited_field(context, record.owner, manifest)
         verdict = verdict_of(context.blobs, manifest)
         context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
+        give_up_rest(context, job_id)
         return
     discard(context.blobs, job_id, attempt)
     changes: dict[str, Any]

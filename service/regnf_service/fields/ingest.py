@@ -81,8 +81,8 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
 
     Returns the room for its bytes, as ``room_for_bytes``.
     """
-    known = _known(services, reference_of(caller, sha256))
-    if known is not None and known.state != "rejected":
+    known = held_field(services, caller, sha256)
+    if known is not None:
         return room_for_bytes(services, caller, known)
     check_workers(services, caller, CLOSE)
     most = services.quota.fields
@@ -92,15 +92,23 @@ def check_room(services: Services, caller: str, sha256: str) -> int | None:
     return room_for_bytes(services, caller)
 
 
+def held_field(services: Services, caller: str, sha256: str) -> FieldRecord | None:
+    """The caller's field of these bytes, unless it was rejected."""
+    known = _known(services, reference_of(caller, sha256))
+    return None if known is None or known.state == "rejected" else known
+
+
 def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = None) -> int | None:
     """How many bytes the caller may have under way: its quota less what it has stored. None: any number.
 
-    A field that is sent ``again`` takes no more than it has. Uploads that are kept after their import make room.
+    A field that is sent ``again`` takes no more than it has. Uploads that are kept after their import make room; pieces
+    of uploads that are not finished take some.
     """
     most = services.quota.stored_bytes
     if most is None:
         return None
     stored = services.records.stored(caller)[1] - services.originals.bytes_of(caller)
+    stored += services.pieces.bytes_of(caller)
     return most - stored + (0 if again is None else again.kept_bytes)
 
 

@@ -155,7 +155,7 @@ def plain_name(filename: str) -> str:
 async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
     """A new upload into the blob store, within the settings' limits."""
     upload = Upload(services.blobs, services.settings.max_upload_bytes, services.upload_limiter, claim)
-    async with _closed(upload):
+    async with closing(upload):
         yield upload
 
 
@@ -163,7 +163,7 @@ async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]
 async def open_settings(services: Services, claim: Claim) -> AsyncIterator[SettingsUpload]:
     """The settings that may come with an upload, which counts as one with them."""
     upload = SettingsUpload(services.blobs, settings_limit(services), services.upload_limiter, claim)
-    async with _closed(upload):
+    async with closing(upload):
         yield upload
 
 
@@ -173,7 +173,8 @@ def settings_limit(services: Services) -> int:
 
 
 @asynccontextmanager
-async def _closed(upload: Upload) -> AsyncIterator[None]:
+async def closing(upload: Upload) -> AsyncIterator[None]:
+    """What got no name within the context goes at its end."""
     try:
         yield
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+import json
 from typing import Any, Literal
 
 import yaml
@@ -11,7 +11,10 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import TypeAdapter
 
 from regnf_core import __version__
+from regnf_service.http.open_paths import OPEN_PATHS
+from regnf_service.http.problems import MEDIA_TYPE
 from regnf_service.http.schemas.references import REFERENCED
+from regnf_state.reasons import REASONS
 
 _DESCRIPTION = """\
 Register neural signed distance fields: given the field of a scene, a detection box in it and the field of a library
@@ -20,14 +23,25 @@ object, find the similarity transform that carries the scene's copy of the objec
 Upload both fields, post a detection to `/register`, follow the job, fetch its result. Every error is a problem object
 (RFC 9457) with a stable `reason`; switch on it, never on text. Answers may gain members.
 
-Where tokens are configured every call but `/healthz`, `/static` and a job's page needs `Authorization: Bearer`, and is
-refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's fields and jobs are 404.
+Where tokens are configured every call but `/healthz`, `/static`, `/docs` and a job's page needs
+`Authorization: Bearer`, and is refused with 401 `UNAUTHENTICATED` otherwise. A token names a caller; another caller's
+fields and jobs are 404.
 A service that limits calls answers 429 `RATE_LIMITED` with `Retry-After` at any address that needs a token,
 429 `TOO_MANY_WRITES` to a caller that posts, changes or deletes faster than it allows,
 and any service 429 `TOO_MANY_REQUESTS_AT_ONCE` to a caller that has too many requests in progress.
 
 Query parameters that an address of fields, registrations or jobs does not know are refused with 400 `INVALID_QUERY`.
 """
+_TAGS = {
+    "fields": "Upload fields and see what was found in them.",
+    "library": "Objects by name, with tags, to be found by search.",
+    "registrations": "Find where an object stands in a scene.",
+    "batches": "Thousands of registrations at once.",
+    "renderings": "Pictures, meshes and fields of edited scenes.",
+    "jobs": "Follow, cancel and forget jobs.",
+    "results": "What a job has found, its files and its page.",
+    "service": "What the service says about itself.",
+}
 _UNUSED = ("HTTPValidationError", "ValidationError")
 
 
@@ -51,9 +65,12 @@ def build_contract(app: FastAPI) -> dict[str, Any]:
         components["schemas"].pop(name, None)
     components["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
     contract["security"] = [{}, {"token": []}]
-    for operations in contract["paths"].values():
+    contract["tags"] = [{"name": name, "description": told} for name, told in _TAGS.items()]
+    contract["x-reasons"] = {name: {"status": one.status, "meaning": one.meaning} for name, one in REASONS.items()}
+    for path, operations in contract["paths"].items():
         for method, operation in operations.items():
             _mend(operation)
+            _say_who_may_call(path, operation)
             if method == "head":
                 _drop_content(operation)
     return contract
@@ -72,6 +89,16 @@ def _mend(operation: dict[str, Any]) -> None:
     operation["responses"] = dict(sorted(responses.items()))
 
 
+def _say_who_may_call(path: str, operation: dict[str, Any]) -> None:
+    """401 wherever a token is asked for where some are configured; the other addresses need none."""
+    if OPEN_PATHS.fullmatch(path.replace("{id}", "id")):
+        operation["security"] = [{}]
+        return
+    problem = {"$ref": "#/components/schemas/ProblemDocument"}
+    refusal = {"description": "`UNAUTHENTICATED`", "content": {MEDIA_TYPE: {"schema": problem}}}
+    operation["responses"] = dict(sorted((operation["responses"] | {"401": refusal}).items()))
+
+
 def _drop_null(schema: dict[str, Any]) -> None:
     """Nobody can send null in a query or a header: what is not required is left out."""
     match [kind for kind in schema.get("anyOf", []) if kind != {"type": "null"}]:
@@ -83,16 +110,6 @@ def _drop_null(schema: dict[str, Any]) -> None:
 def _drop_content(operation: dict[str, Any]) -> None:
     for response in operation["responses"].values():
         response.pop("content", None)
-
-
-def allowed_methods(contract: dict[str, Any], path: str) -> list[str]:
-    """The methods that a path answers to, below whatever prefix; none for one the contract does not know."""
-    found = set()
-    for template, operations in contract["paths"].items():
-        pattern = re.sub(r"\\{[^}]+\\}", "[^/]+", re.escape(template))
-        if re.fullmatch(f"(/v1)?{pattern}", path):
-            found |= {method.upper() for method in operations}
-    return sorted(found)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -112,3 +129,8 @@ def contract_yaml(app: FastAPI) -> str:
     """The contract as the file holds it."""
     text: str = yaml.dump(app.openapi(), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
     return text
+
+
+def contract_json(app: FastAPI) -> str:
+    """The same as JSON."""
+    return json.dumps(app.openapi(), ensure_ascii=False)

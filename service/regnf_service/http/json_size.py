@@ -5,6 +5,8 @@ from __future__ import annotations
 _SEPARATORS = (b",", b":", b"[", b"{")
 MOST_VALUES = 4096
 """Twice what a search among the most candidates takes, each written at its longest."""
+MOST_VALUES_WITH_CAMERAS = 16384
+"""Of a request that may hold a file of cameras: some 600 of them."""
 MOST_MEMBERS = 256
 """Of one object. No object of the contract has half as many."""
 

@@ -11,6 +11,8 @@ import uuid
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from regnf_service.http.open_paths import OPEN_PATHS
+from regnf_service.http.page_requests import is_home_page
 from regnf_service.http.problems import problem_response
 from regnf_service.http.security_headers import secure
 from regnf_service.http.wrong_tokens import WrongTokens
@@ -19,7 +21,6 @@ from regnf_state.logs import ACCESS_LOGGER, log_context
 from regnf_state.ownership import ANONYMOUS
 
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,128}")
-_OPEN_PATHS = re.compile(r"(/v1)?/healthz|/static/.*|(/v1)?/jobs/[A-Za-z0-9_-]+/view")
 _JOB_ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _PROBES = frozenset({"/healthz", "/readyz", "/static"})
 access_log = logging.getLogger(ACCESS_LOGGER)
@@ -83,8 +84,9 @@ def route_of(scope: Scope) -> str:
 
 
 def is_open(scope: Scope) -> bool:
-    """What needs no token: the liveness probe, and the page, which asks for the token itself."""
-    return scope["method"] in ("GET", "HEAD") and _OPEN_PATHS.fullmatch(scope["path"]) is not None
+    """What needs no token: the liveness probe, and the pages, which ask for the token themselves."""
+    open_path = OPEN_PATHS.fullmatch(scope["path"]) is not None
+    return scope["method"] in ("GET", "HEAD") and (open_path or is_home_page(scope))
 
 
 def _came_from_outside(scope: Scope) -> bool:

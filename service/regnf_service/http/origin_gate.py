@@ -15,16 +15,17 @@ from regnf_service.http.problems import problem_response
 from regnf_service.problem import CLOSE, Problem
 
 _OWN_SITES = frozenset({"same-origin", "none"})
-_PAGES = re.compile(r"(/v1)?(/docs|/jobs/[A-Za-z0-9_-]+/view)")
+_PAGES = re.compile(r"(/v1)?(/docs|/jobs/[A-Za-z0-9_-]+/view|/|/jobs|/fields)")
 """What people follow a link to, from wherever they found it."""
 
 
 class OriginGate:
     """Answers requests for a name that ``hosts`` knows, sent by a program or by a page of this service."""
 
-    def __init__(self, app: ASGIApp, hosts: AllowedHosts) -> None:
+    def __init__(self, app: ASGIApp, hosts: AllowedHosts, origins: frozenset[str] = frozenset()) -> None:
         self._app = app
         self._hosts = hosts
+        self._origins = origins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
@@ -45,9 +46,14 @@ class OriginGate:
         arrived_on = (scope.get("server") or ("",))[0] or ""
         if host is None or not self._hosts.knows(host, arrived_on):
             return Problem("HOST_NOT_ALLOWED", headers=CLOSE)
-        if _is_visit(scope, headers) or not _is_foreign(headers, host):
+        if self._is_named(headers) or _is_visit(scope, headers) or not _is_foreign(headers, host):
             return None
         return Problem("ORIGIN_NOT_ALLOWED", headers=CLOSE)
+
+    def _is_named(self, headers: Headers) -> bool:
+        """Whether the page behind the request is of a site that the operator has named (``origins``)."""
+        given = headers.getlist("origin")
+        return len(given) == 1 and given[0] in self._origins
 
 
 def _is_foreign(headers: Headers, host: Authority) -> bool:

@@ -18,10 +18,11 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.errors import RegnfError
-from regnf_service.http.contract import allowed_methods
+from regnf_service.http.allowed_methods import allowed_methods
 from regnf_service.http.security_headers import SECURITY_HEADERS
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_state.blobs.base import StorageFullError
+from regnf_state.library import NameTakenError
 from regnf_state.reasons import REASONS
 from regnf_state.records import QueueFullError, QuotaError, RecordError, RecordsFullError, UnreadableRecordError
 
@@ -44,6 +45,8 @@ def problem_of(error: Exception) -> Problem:
             return Problem("QUEUE_FULL", headers=RETRY_LATER)
         case QuotaError():
             return Problem(error.reason, headers=RETRY_LATER if REASONS[error.reason].status == 429 else None)
+        case NameTakenError():
+            return Problem(error.reason)
         case RecordsFullError():
             return Problem(error.reason, headers=RETRY_LATER)
         case UnreadableRecordError():

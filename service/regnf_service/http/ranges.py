@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Depends, Header
 
 from regnf_service.problem import Problem
 
@@ -39,3 +42,27 @@ def parse_range(header: str | None, size: int) -> ByteRange | None:
     if not satisfiable:
         raise Problem("RANGE_NOT_SATISFIABLE", headers={"Content-Range": f"bytes */{size}"})
     return ByteRange(start, end - start)
+
+
+@dataclass(frozen=True)
+class RangeHeaders:
+    """What a request says of the part that it wants. value: the header Range · if_range: the ETag that it belongs
+    to."""
+
+    value: str | None
+    if_range: str | None
+
+    def part(self, size: int, etag: str) -> ByteRange | None:
+        """The part of ``size`` bytes; None: all of them. Raises Problem."""
+        return parse_range(self.value, size) if self.if_range in (None, etag) else None
+
+
+async def range_headers(
+    range_: Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")] = None,
+    if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
+) -> RangeHeaders:
+    """For a route's signature, by ``RangeDep``."""
+    return RangeHeaders(range_, if_range)
+
+
+RangeDep = Annotated[RangeHeaders, Depends(range_headers)]

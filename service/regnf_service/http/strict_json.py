@@ -14,15 +14,15 @@ _MAX_DEPTH = 32
 _LARGEST_EXACT = 2**53
 
 
-def parse_json(body: bytes) -> Any:
+def parse_json(body: bytes, most_values: int = MOST_VALUES) -> Any:
     """The value in ``body``; a number without a fraction is an int, as JSON Schema has it, however it is spelled.
 
     NaN and Infinity are accepted here; the schema refuses them with their place.
 
     Raises Problem MALFORMED_JSON, REQUEST_TOO_LARGE for more values than any request needs.
     """
-    if count_values(body) > MOST_VALUES:
-        raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {MOST_VALUES} members and values is taken.")
+    if count_values(body) > most_values:
+        raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {most_values} members and values is taken.")
     try:
         value = json.loads(body.decode("utf-8"), object_pairs_hook=_object, parse_float=_number)
     except UnicodeDecodeError as error:

@@ -1,4 +1,4 @@
-"""From a checked request to a job: fields looked up, the box compared with the scene, the job recorded and queued."""
+"""From a checked request to a job: fields looked up, boxes compared with the scene, the job recorded and queued."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from regnf_core.detections import Bounds, require_in_scene
+from regnf_core.detections import Bounds, Detection, require_in_scene
 from regnf_core.errors import InvalidDetectionError
 from regnf_service.budget import check_budget
 from regnf_service.jobs.cost_limits import check_cost
 from regnf_service.jobs.identity import digest, functions_of, job_id_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
+from regnf_state.job_request import JobRequest, kind_of
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
 from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
-from regnf_state.registration_request import RegistrationRequest
+from regnf_state.rendering_request import RenderingRequest
 
 _KEY_LIFETIME_S = 24 * 3600
 _MAX_KEY_LENGTH = 255
@@ -27,11 +28,12 @@ def check_idempotency_key(key: str | None) -> None:
         raise Problem("INVALID_IDEMPOTENCY_KEY")
 
 
-def check_fields(services: Services, caller: str, request: RegistrationRequest, named: Mapping[str, str]) -> None:
+def check_fields(services: Services, caller: str, request: JobRequest, named: Mapping[str, str]) -> None:
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
     ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
-    Raises Problem OPTIONS_TOO_COSTLY, FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE, WEBHOOK_NOT_ALLOWED.
+    Raises Problem OPTIONS_TOO_COSTLY, RENDER_TOO_LARGE, FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE,
+    WEBHOOK_NOT_ALLOWED.
     """
     check_cost(services.settings, request)
     services.webhooks.check(caller, request.webhook)
@@ -42,11 +44,22 @@ def check_fields(services: Services, caller: str, request: RegistrationRequest, 
     bounds = _bounds(scene)
     if bounds is None:
         return
-    try:
-        require_in_scene(request.detection, bounds, _bounds(records.get("/object")))
-    except InvalidDetectionError as error:
-        fault = {"pointer": "/detection", "detail": str(error)}
-        raise Problem(error.reason, str(error), errors=[fault], hint=error.hint) from error
+    for pointer, box in _boxes(request).items():
+        try:
+            require_in_scene(box, bounds, _bounds(records.get("/object")))
+        except InvalidDetectionError as error:
+            fault = {"pointer": pointer, "detail": str(error)}
+            raise Problem(error.reason, str(error), errors=[fault], hint=error.hint) from error
+
+
+def _boxes(request: JobRequest) -> dict[str, Detection]:
+    """The boxes in the scene that a request names, by where it does."""
+    if not isinstance(request, RenderingRequest):
+        return {"/detection": request.detection}
+    named = {f"/edits/{n}/detection": getattr(one, "detection", None) for n, one in enumerate(request.rendering.edits)}
+    if request.rendering.orbit is not None:
+        named["/orbit/detection"] = request.rendering.orbit.detection
+    return {pointer: box for pointer, box in named.items() if box is not None}
 
 
 def _require_usable(found: Mapping[str, FieldRecord | None]) -> None:
@@ -72,14 +85,14 @@ def _bounds(found: FieldRecord | None) -> Bounds | None:
     return None
 
 
-def future_job_id(services: Services, caller: str, asked: RegistrationRequest) -> str:
+def future_job_id(services: Services, caller: str, asked: JobRequest) -> str:
     """The id of the job for a caller's request, by what its fields are now."""
     request = asked.owned_by(caller)
     found = services.records.get_fields([request.scene, *request.objects])
     return job_id_of(request, functions_of(found))
 
 
-def submit(services: Services, caller: str, asked: RegistrationRequest, idempotency_key: str | None) -> JobRecord:
+def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: str | None) -> JobRecord:
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
     A job that exists tells the request's webhook of its end too; one that has finished, at once.
@@ -98,7 +111,7 @@ def submit(services: Services, caller: str, asked: RegistrationRequest, idempote
     record, _ = services.records.create_job(
         JobRecord(
             id=job_id,
-            kind="registration",
+            kind=kind_of(request),
             status="accepted",
             request=request.to_record(),
             inputs=_inputs(asked),
@@ -123,7 +136,7 @@ def _require_budget(services: Services, caller: str, job_id: str) -> None:
     check_budget(services, caller)
 
 
-def _earlier_answer(services: Services, key: str, job_id: str, request: RegistrationRequest) -> JobRecord | None:
+def _earlier_answer(services: Services, key: str, job_id: str, request: JobRequest) -> JobRecord | None:
     """The job that an earlier call with this key made: its answer was lost on its way, and nothing is started twice."""
     asked = digest(request.values())  # of all of it: another webhook is another request
     mine = f"{asked} {services.records.now()!r}"
@@ -142,9 +155,20 @@ def _earlier_answer(services: Services, key: str, job_id: str, request: Registra
     return known if request.webhook is None or request.webhook in known.webhooks else None
 
 
-def _inputs(request: RegistrationRequest) -> dict[str, Any]:
+def _inputs(request: JobRequest) -> dict[str, Any]:
     """What the job's document shows of the request."""
     values = request.values()
+    if isinstance(request, RenderingRequest):
+        return {
+            "scene": request.scene,
+            "edits": [one.kind for one in request.rendering.edits],
+            "frames": request.rendering.frames,
+            "size": list(request.rendering.image_size),
+            "mode": request.rendering.options.mode,
+            "outputs": list(request.rendering.outputs),
+            "seed": request.rendering.seed,
+            "options_sha256": digest(values["options"]),
+        }
     return {
         "scene": request.scene,
         "object": request.object,
@@ -152,5 +176,6 @@ def _inputs(request: RegistrationRequest) -> dict[str, Any]:
         "detection": values["detection"],
         "seed": request.seed,
         "initial_transform": request.initial_transform,
+        "pictures": request.pictures,
         "options_sha256": digest(values["options"]),
     }

@@ -15,10 +15,13 @@ from typing import Any
 from redis import Redis
 
 from regnf_service.upkeep.lease import Term
+from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pages import all_of
+from regnf_state.pieces import Pieces
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord, UnreadableRecordError
+from regnf_state.redis.batch_index import BatchIndex
 from regnf_state.redis.keys import PREFIX
 from regnf_state.room import Room
 from regnf_state.settings import Settings
@@ -62,6 +65,8 @@ class Housekeeper:
         self._keep_rejected_s = settings.retention_s
         self._cap = settings.storage_cap_bytes
         self._room = Room(records, blobs, redis, settings)
+        self._pieces = Pieces(blobs, settings)
+        self._batches = Batches(blobs, BatchIndex(redis), settings.retention_s)
 
     def run_if_due(self, term: Term) -> Removed:
         """A round, if the last one is an hour ago."""
@@ -77,12 +82,12 @@ class Housekeeper:
         """One round. Raises LeaseLostError, RedisError, OSError."""
         if not self._records.generation.is_current():
             return Removed()  # records that Redis has lost must not look unused
-        temporary = self._blobs.sweep(_ORPHANED_AFTER_S)
+        now = self._records.now()
+        temporary = self._blobs.sweep(_ORPHANED_AFTER_S) + self._pieces.expire(now) + self._batches.sweep(now)
         folders = self._folders()
         self._forget_expired(term)
         orphans = tuple(self._drop_orphans(term, folders))
         fields = self._unused_fields()
-        now = self._records.now()
         dropped = [
             field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
         ]
@@ -137,9 +142,10 @@ class Housekeeper:
                 yield folder
 
     def _unused_fields(self) -> list[tuple[float, FieldRecord]]:
-        """Fields that no active job needs, least recently used first, each with the time of its last use."""
+        """Fields that no active job needs and no library names, least recently used first, with the time of the use."""
         needed = {name for job in self._records.active_jobs() for name in fields_of(job)}
         idle = [field for field in self._fields() if field.state != "validating" and field.sha256 not in needed]
+        idle = [field for field in idle if field.library is None or field.state == "rejected"]
         uses = self._records.last_uses([field.sha256 for field in idle])
         return sorted(zip(uses, idle, strict=True), key=lambda one: (one[0], one[1].sha256))
 

@@ -60,6 +60,7 @@ def links(parameter: str, source: str, *operations: str, **fixed: str) -> dict[s
 
 FIELD_LINKS = links("sha256", "/sha256", "get_field", "patch_field", "delete_field")
 JOB_LINKS = links("id", "/id", "get_job", "job_events", "cancel_job", "get_result", "delete_job", "view")
+BATCH_LINKS = links("id", "/id", "get_batch", "batch_results", "cancel_batch", "delete_batch")
 FILE: dict[str, Any] = {"type": "string", "format": "binary", "minLength": 1}
 NOT_MODIFIED: dict[str, Any] = {"description": "Nothing has changed since one of the ETags given."}
 BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
@@ -80,4 +81,5 @@ UPLOAD_REFUSALS = (
     "QUOTA_WORKER_SECONDS",
     "STORAGE_FULL",
 )
+PIECE_REFUSALS = ("UPLOAD_OFFSET_MISMATCH", "UPLOAD_NOT_FINISHED", "TOO_MANY_PIECES")
 MULTIPART_REFUSALS = ("MALFORMED_MULTIPART", "MISSING_PART", "UNKNOWN_PART", "DUPLICATE_PART", "REQUEST_TOO_LARGE")

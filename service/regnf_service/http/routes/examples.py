@@ -93,3 +93,59 @@ REGISTER_EXAMPLES: dict[str, Any] = {
         },
     },
 }
+
+_WHERE = [[2.0, 0.0, 0.0, 0.3], [0.0, 2.0, 0.0, 0.1], [0.0, 0.0, 2.0, -0.4], [0.0, 0.0, 0.0, 1.0]]
+RENDER_EXAMPLES: dict[str, Any] = {
+    "substitution": {
+        "summary": "The library object where the registered one stands, seen from all sides; instead of object and "
+        "transform an edit may name the `job` that found them",
+        "value": {
+            "scene": SCENE,
+            "edits": [{"kind": "substitution", "object": OBJECT, "T_object_scene": _WHERE}],
+            "orbit": {"edit": 0, "frames": 36, "elevation_deg": 20.0},
+            "size": [320, 240],
+            "outputs": ["color", "strip", "animation"],
+        },
+    },
+    "several edits": {
+        "summary": "One thing replaced, another one removed, from two places; the edited scene becomes a field",
+        "value": {
+            "scene": SCENE,
+            "edits": [
+                {"kind": "replacement", "object": OBJECT, "T_object_scene": _WHERE, "replacement": OTHER},
+                {"kind": "removal", "detection": {"min": [0.4, 0.4, -0.2], "max": [0.8, 0.8, 0.4]}},
+            ],
+            "look_at": [
+                {"position": [2.0, 0.0, 1.0], "target": [0.0, 0.0, 0.0]},
+                {"position": [0.0, 2.0, 1.0], "target": [0.0, 0.0, 0.0]},
+            ],
+            "options": {"mode": "volume"},
+            "outputs": ["color", "depth", "mesh", "field"],
+        },
+    },
+    "the scene alone": {
+        "summary": "As the cameras of a transforms.json saw it",
+        "value": {
+            "scene": SCENE,
+            "transforms": {
+                "document": {
+                    "camera_angle_x": 0.8,
+                    "w": 640,
+                    "h": 480,
+                    "frames": [
+                        {
+                            "file_path": "0.png",
+                            "transform_matrix": [
+                                [1.0, 0.0, 0.0, 0.0],
+                                [0.0, 1.0, 0.0, 0.0],
+                                [0.0, 0.0, 1.0, 2.0],
+                                [0.0, 0.0, 0.0, 1.0],
+                            ],
+                        }
+                    ],
+                }
+            },
+            "outputs": ["color", "depth"],
+        },
+    },
+}

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from regnf_core.field_candidates import MOST_CANDIDATES
-from regnf_core.importing.gate.picture import PICTURE_NAME
+from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import redescribe
+from regnf_service.fields.views import stored_view
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.description_change import described_anew
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep
+from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.parsing import read_body
 from regnf_service.http.routes.documentation import (
@@ -28,12 +30,14 @@ from regnf_service.http.routes.documentation import (
     header,
     refusals,
 )
+from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.routes.uploads import field_etag
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.waiting import wait_for
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
+from regnf_state.originals import candidate_key
 from regnf_state.ownership import reference_of
 from regnf_state.records import FieldRecord
 
@@ -41,6 +45,7 @@ router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
+_PRIVATE_HOUR = "private, max-age=3600"
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
@@ -99,10 +104,47 @@ async def get_field(
 )
 @blocking
 def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
-    """The surface from two sides, and its section with lines of equal distance: orange is inside."""
+    """The surface from two sides, and its section with lines of equal distance: orange is inside.
+
+    Made once the field is ready, as the mesh is.
+    """
     record = _require(services, caller, sha256)
-    name = PICTURE_NAME if record.state == "ready" else None
-    return held.apply(_picture(services, record, name, "private, max-age=3600"))
+    found = stored_view(services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND")
+    return held.apply(_seen(record, found, "image/png", _PRIVATE_HOUR))
+
+
+@get_and_head(
+    router,
+    "/fields/{sha256}/mesh.glb",
+    summary="A field's surface as a mesh to look at",
+    response_class=Response,
+    responses={
+        200: {"description": "Triangles in the field's frame and unit.", "content": {"model/gltf-binary": BINARY}},
+        304: NOT_MODIFIED,
+        **refusals("INVALID_QUERY", "FIELD_NOT_FOUND", "FIELD_MESH_NOT_FOUND"),
+    },
+)
+@blocking
+def get_field_mesh(
+    sha256: str,
+    services: ServicesDep,
+    caller: CallerDep,
+    held: IfNoneMatchDep,
+    detail: Annotated[
+        Literal["fine", "coarse"], Query(description="At most 200,000 triangles, or at most 30,000.")
+    ] = "fine",
+) -> Response:
+    """Made for people: flat where the field is a mesh, with vertex colors where the field has colors.
+
+    A worker makes it once the field is ready and no work waits: until then `views` of the field is `pending`, and the
+    404 has `Retry-After`. A small surface has one mesh for both. A `.glb` of `POST /render` is made with the resolution
+    that you ask for.
+    """
+    record = _require(services, caller, sha256)
+    fine, coarse = MESH_NAMES
+    names = (coarse, fine) if detail == "coarse" else (fine,)
+    found = stored_view(services, record, names, "FIELD_MESH_NOT_FOUND")
+    return held.apply(_seen(record, found, "model/gltf-binary", _PRIVATE_HOUR))
 
 
 @get_and_head(
@@ -122,42 +164,45 @@ def get_candidate_picture(
 ) -> Response:
     """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
     record = _require(services, caller, sha256)
-    shown = number in _NUMBERS and record.has_candidate_picture(int(number))
-    name = f"candidates/{number}.png" if shown else None
-    return held.apply(_picture(services, record, name, "private, no-cache"))
-
-
-def _picture(services: Services, record: FieldRecord, name: str | None, caching: str) -> Response:
-    """What is stored of the field under ``name``. Raises Problem FIELD_PREVIEW_NOT_FOUND, also without a name."""
-    if name is None:
+    if number not in _NUMBERS or not record.has_candidate_picture(int(number)):
         raise Problem("FIELD_PREVIEW_NOT_FOUND")
     try:
-        with services.blobs.open(f"fields/{record.sha256}/{name}") as file:
-            data = file.read()
+        with services.blobs.open(candidate_key(record.sha256, int(number))) as file:
+            found = file.read()
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
-    headers = {"ETag": field_etag(record), "Cache-Control": caching}
-    return Response(data, media_type="image/png", headers=headers)
+    return held.apply(_seen(record, found, "image/png", "private, no-cache"))
+
+
+def _seen(record: FieldRecord, data: bytes, media_type: str, caching: str) -> Response:
+    return Response(data, media_type=media_type, headers={"ETag": field_etag(record), "Cache-Control": caching})
 
 
 @router.get(
     "/fields",
     summary="Fields, newest first",
     response_model=FieldPage,
-    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
 )
 async def list_fields(
+    request: Request,
     services: ServicesDep,
     caller: CallerDep,
     prefix: PrefixDep,
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     label: Annotated[str | None, Query(max_length=200, description="Only fields with this label.")] = None,
-) -> JSONResponse:
-    """A page may be short or empty and not be the last: go on while there is a `next_page_token`."""
-    page = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
-    documents = [field_document(record, prefix) for record in page.records]
-    return JSONResponse({"fields": documents, "next_page_token": encode_token(page.rest)})
+) -> Response:
+    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+
+    A browser gets a page, which needs no token.
+    """
+    if wants_page(request.scope):
+        return page("lists.html")
+    found = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
+    documents = [field_document(record, prefix) for record in found.records]
+    document = {"fields": documents, "next_page_token": encode_token(found.rest)}
+    return JSONResponse(document, headers={"Vary": "Accept"})
 
 
 @router.patch(
@@ -186,7 +231,7 @@ async def list_fields(
             "QUOTA_WORKER_SECONDS",
         ),
     },
-    openapi_extra={"requestBody": {"required": True, "content": dict.fromkeys(_PATCHES, _CHANGE)}},
+    openapi_extra={"requestBody": {"required": True, "content": {JSON: _CHANGE}}},
 )
 async def patch_field(
     sha256: str, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
@@ -194,6 +239,7 @@ async def patch_field(
     """Answers a question of the import without a second upload, as long as the bytes are kept (`kept_until`).
 
     Another description is another function of the same bytes. It is refused while an active job uses the field.
+    The body may also be sent as `application/merge-patch+json`.
     """
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
@@ -216,13 +262,22 @@ def _changed(services: Services, caller: str, sha256: str, change: FieldChange) 
     summary="Forget a field and its bytes",
     status_code=204,
     response_class=Response,
-    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE"),
+    responses=refusals("FIELD_NOT_FOUND", "FIELD_IN_USE", "FIELD_IN_LIBRARY"),
 )
 @blocking
 def delete_field(sha256: str, services: ServicesDep, caller: CallerDep) -> Response:
-    """Refused while an active job needs the field. Results of finished jobs stay."""
+    """Refused while an active job needs the field, or the library has it. Results of finished jobs stay.
+
+    Pieces of an upload go too.
+    """
+    if is_sha256(sha256) and services.pieces.find(caller, sha256).pieces:
+        services.pieces.drop(caller, sha256)
+        if services.records.get_field(reference_of(caller, sha256)) is None:
+            return Response(status_code=204)
     field = _require(services, caller, sha256)
     reference = field.sha256
+    if field.library is not None:
+        raise Problem("FIELD_IN_LIBRARY")
     if next(iter(services.records.jobs_using_field(reference)), None) is not None:
         raise Problem("FIELD_IN_USE")
     services.records.delete_field(reference)

@@ -6,14 +6,17 @@ from dataclasses import asdict
 from typing import Annotated, Any, NamedTuple
 
 from fastapi import APIRouter, Header, Query
+from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import sse
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.etags import IfNoneMatchDep
+from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.routes.documentation import NOT_MODIFIED, header, refusals
+from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document
 from regnf_service.http.waiting import wait_for
 from regnf_service.jobs.identity import digest
@@ -77,24 +80,28 @@ def _etag(seen: _Seen) -> str:
     "/jobs",
     summary="Jobs, newest first",
     response_model=JobPage,
-    responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
 )
 @blocking
 def list_jobs(
+    request: Request,
     services: ServicesDep,
     caller: CallerDep,
     prefix: PrefixDep,
     limit: LimitQuery = 50,
     page_token: PageTokenQuery = None,
     status: Annotated[Status | None, Query(description="Only jobs in this state.")] = None,
-) -> JSONResponse:
+) -> Response:
     """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
 
-    `queue_position` is left out here: ask for the job itself.
+    `queue_position` is left out here: ask for the job itself. A browser gets a page, which needs no token.
     """
-    page = services.records.list_jobs(status, limit, decode_token(page_token), caller)
-    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in page.records]
-    return JSONResponse({"jobs": documents, "next_page_token": encode_token(page.rest)})
+    if wants_page(request.scope):
+        return page("lists.html")
+    found = services.records.list_jobs(status, limit, decode_token(page_token), caller)
+    documents = [job_document(record, None, services.settings.retention_s, prefix) for record in found.records]
+    document = {"jobs": documents, "next_page_token": encode_token(found.rest)}
+    return JSONResponse(document, headers={"Vary": "Accept"})
 
 
 @router.get(

@@ -11,15 +11,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from redis.exceptions import RedisError
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import FileResponse, JSONResponse, Response
 
 from regnf_core import __version__
 from regnf_service.concurrency import blocking, in_thread
-from regnf_service.http.contract import contract_yaml
+from regnf_service.http.contract import contract_json, contract_yaml
 from regnf_service.http.dependencies import PrefixDep, ServicesDep
-from regnf_service.http.docs_page import STYLE_POLICY, render_docs
+from regnf_service.http.page_requests import wants_page
 from regnf_service.http.problems import problem_of
 from regnf_service.http.routes.documentation import get_and_head, refusals
+from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.meta import HealthDocument, IndexDocument, ReadyDocument, VersionDocument
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
@@ -96,16 +97,19 @@ async def version() -> dict[str, str]:
     return {"name": "regnf", "version": __version__, "python": platform.python_version()}
 
 
-@get_and_head(router, "/", summary="Every address", response_model=IndexDocument)
-async def index(request: Request, prefix: PrefixDep) -> dict[str, object]:
-    """Start here."""
+@get_and_head(router, "/", summary="Every address", response_model=IndexDocument, responses={200: {"content": HTML}})
+async def index(request: Request, prefix: PrefixDep) -> Response:
+    """Start here. A browser gets the home page, which needs no token."""
+    if wants_page(request.scope):
+        return page("home.html")
     paths = request.app.openapi()["paths"]
     addresses = {
         f"{method.upper()} {prefix}{path}": operation["summary"]
         for path, operations in paths.items()
         for method, operation in operations.items()
     }
-    return {"name": "regnf", "version": __version__, "addresses": addresses}
+    document = {"name": "regnf", "version": __version__, "addresses": addresses}
+    return JSONResponse(document, headers={"Vary": "Accept"})
 
 
 @get_and_head(
@@ -119,11 +123,31 @@ async def openapi_yaml(request: Request) -> Response:
     return Response(await _made_once(request, contract_yaml, request.app), media_type="application/yaml")
 
 
-@get_and_head(router, "/docs", summary="This contract, for people", response_class=HTMLResponse)
-async def docs(request: Request) -> HTMLResponse:
-    """One page without scripts; loads nothing from elsewhere."""
-    page = await _made_once(request, render_docs, request.app.openapi())
-    return HTMLResponse(page, headers={"Content-Security-Policy": STYLE_POLICY})
+@get_and_head(
+    router,
+    "/openapi.json",
+    summary="This contract as JSON",
+    response_class=Response,
+    responses={200: {"content": {"application/json": {"schema": {"type": "object"}}}}},
+)
+async def openapi_json(request: Request) -> Response:
+    return Response(await _made_once(request, contract_json, request.app), media_type="application/json")
+
+
+@get_and_head(
+    router,
+    "/docs",
+    summary="This contract, for people",
+    response_class=FileResponse,
+    responses={200: {"description": "The page.", "content": HTML}},
+)
+@blocking
+def docs() -> FileResponse:
+    """Every address with a form to try it, every reason and schema.
+
+    The page reads the contract, and asks for a token if one is needed. It loads nothing from elsewhere.
+    """
+    return page("docs.html")
 
 
 async def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> str:

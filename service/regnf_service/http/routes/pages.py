@@ -1,4 +1,4 @@
-"""The page of a job. It reads the job through the API, so it holds no data itself and needs no token."""
+"""The pages. They read everything through the API, so they hold no data themselves and need no token."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from regnf_state.ownership import ANONYMOUS
 
 router = APIRouter(tags=["results"])
 WEB = Path(__file__).resolve().parents[2] / "web"
+HTML = {"text/html": {"schema": {"type": "string"}}}
+"""Of an address that a browser gets a page from."""
 PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
 
 
@@ -24,7 +26,7 @@ PAGE_POLICY = "default-src 'self'; object-src 'none'; base-uri 'none'; form-acti
     summary="A job's page, with the registration in 3D",
     response_class=FileResponse,
     responses={
-        200: {"description": "The page.", "content": {"text/html": {"schema": {"type": "string"}}}},
+        200: {"description": "The page.", "content": HTML},
         **refusals("JOB_NOT_FOUND", "JOB_EXPIRED"),
     },
 )
@@ -34,5 +36,10 @@ def view(id: str, services: ServicesDep) -> FileResponse:  # noqa: A002
     if not services.settings.needs_token:
         # with tokens the page comes before the token, so it must not tell which jobs there are
         find_job(services, id, ANONYMOUS)
-    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-cache"}
-    return FileResponse(WEB / "view.html", media_type="text/html", headers=headers)
+    return page("view.html")
+
+
+def page(name: str) -> FileResponse:
+    """One of the pages. At an address that has JSON too, the two must not be taken for each other."""
+    headers = {"Content-Security-Policy": PAGE_POLICY, "Cache-Control": "no-cache", "Vary": "Accept"}
+    return FileResponse(WEB / name, media_type="text/html", headers=headers)

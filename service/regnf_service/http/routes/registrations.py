@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import AsyncExitStack
-from typing import Annotated
 
-from fastapi import APIRouter, Header, Query
+from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 
@@ -16,36 +14,39 @@ from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
 from regnf_service.fields.uploads import open_settings, open_upload, settings_limit
 from regnf_service.http import body
+from regnf_service.http.by_reference import asked_by_reference
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
 from regnf_service.http.parsing import read_body
 from regnf_service.http.routes.documentation import (
     FILE,
-    JOB_LINKS,
     JSON,
     MULTIPART_REFUSALS,
     UPLOAD_REFUSALS,
-    header,
     refusals,
 )
 from regnf_service.http.routes.examples import REGISTER_EXAMPLES
-from regnf_service.http.routes.jobs import job_answer
+from regnf_service.http.routes.submitting import (
+    JOB_REFUSALS,
+    JOB_RESPONSES,
+    Asking,
+    DryRunQuery,
+    IdempotencyKeyHeader,
+    PreferHeader,
+    answer,
+)
 from regnf_service.http.routes.uploads import DESCRIPTION_BYTES, read_description
 from regnf_service.http.schemas.jobs import JobDocument
 from regnf_service.http.schemas.references import reference
-from regnf_service.http.schemas.registrations import DryRunDocument, RegisterRequest, RegistrationSpec
+from regnf_service.http.schemas.registrations import RegisterRequest, RegistrationSpec
 from regnf_service.http.turns import fair_key
-from regnf_service.http.waiting import wait_for
-from regnf_service.jobs.submit import check_fields, check_idempotency_key, future_job_id, submit
+from regnf_service.jobs.submit import check_fields, check_idempotency_key
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.records import ACTIVE, FINISHED
 from regnf_state.registration_request import RegistrationRequest
 
 router = APIRouter(tags=["registrations"])
-_PREFERENCE = re.compile(r"\s*wait\s*=\s*\"?(\d{1,6})\"?\s*", re.IGNORECASE)
-_MAX_WAIT_S = 30
 _ROLES: tuple[Role, Role] = ("scene", "object")
 _ONE_SHOT = {
     "schema": {
@@ -63,37 +64,18 @@ _ONE_SHOT = {
 }
 
 
-def preferred_wait(prefer: str | None) -> int | None:
-    """The seconds of `Prefer: wait=N` (RFC 7240), at most thirty; what is malformed is ignored, as the RFC has it."""
-    for preference in (prefer or "").split(","):
-        match = _PREFERENCE.fullmatch(preference)
-        if match:
-            return min(int(match.group(1)), _MAX_WAIT_S)
-    return None
-
-
 @router.post(
     "/register",
     summary="Find the transform that lays the scene's copy of the object onto the library's",
     response_model=JobDocument,
     status_code=202,
     responses={
-        200: {
-            "description": "The job has finished (`Prefer: wait`, or an identical one had), or the dry run passed.",
-            "content": {JSON: {"schema": {"anyOf": [reference(JobDocument), reference(DryRunDocument)]}}},
-            "links": JOB_LINKS,
-        },
-        202: {
-            "description": "Accepted.",
-            "headers": {"Location": header("The job."), "Retry-After": header("Seconds until a look is worth it.")},
-            "links": JOB_LINKS,
-        },
+        **JOB_RESPONSES,
         **refusals(
             *UPLOAD_REFUSALS,
             *MULTIPART_REFUSALS,
+            *JOB_REFUSALS,
             "MALFORMED_JSON",
-            "INVALID_QUERY",
-            "INVALID_IDEMPOTENCY_KEY",
             "FIELD_NOT_FOUND",
             "INVALID_REQUEST",
             "INVALID_DETECTION",
@@ -102,16 +84,13 @@ def preferred_wait(prefer: str | None) -> int | None:
             "INVALID_TRANSFORM",
             "INITIAL_TRANSFORM_UNSUPPORTED",
             "LIBRARY_SEARCH_UNSUPPORTED",
+            "LIBRARY_ENTRY_NOT_FOUND",
+            "LIBRARY_EMPTY",
+            "LIBRARY_TOO_LARGE",
             "FIELD_REJECTED",
             "FIELD_DESCRIPTION_DIFFERS",
             "INVALID_DESCRIPTION",
-            "INVALID_WEBHOOK",
-            "WEBHOOK_NOT_ALLOWED",
             "DETECTION_OUTSIDE_SCENE",
-            "IDEMPOTENCY_KEY_REUSED",
-            "QUEUE_FULL",
-            "QUOTA_ACTIVE_JOBS",
-            "QUOTA_WEBHOOKS",
         ),
     },
     openapi_extra={
@@ -129,15 +108,9 @@ async def register(
     services: ServicesDep,
     caller: CallerDep,
     prefix: PrefixDep,
-    dry_run: Annotated[bool, Query(description="Check everything, start nothing.")] = False,
-    prefer: Annotated[str | None, Header(description="`wait=N`: hold the answer until the job has finished.")] = None,
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            description="Up to 255 printable ASCII characters, kept for 24 hours: refused with another request.",
-            json_schema_extra={"pattern": "^[!-~]([ -~]{0,253}[!-~])?$"},
-        ),
-    ] = None,
+    dry_run: DryRunQuery = False,
+    prefer: PreferHeader = None,
+    idempotency_key: IdempotencyKeyHeader = None,
 ) -> JSONResponse:
     """The same request twice is one job: its id follows from what is asked. A job that failed is started anew.
 
@@ -145,24 +118,7 @@ async def register(
     """
     check_idempotency_key(idempotency_key)
     asked = await _read(request, services, caller, keep=not dry_run)
-    if dry_run:
-        job_id = await in_thread(future_job_id, services, caller, asked)
-        return JSONResponse({"valid": True, "id": job_id, "request": asked.values()})
-    record = await in_thread(submit, services, caller, asked, idempotency_key)
-    wait = preferred_wait(prefer)
-    if wait and record.status in ACTIVE:
-        record = await wait_for(
-            lambda: services.records.get_job(record.id) or record,
-            lambda found: found.status in FINISHED,
-            wait,
-            services,
-            caller,
-        )
-    response = await job_answer(services, record, prefix, 200 if record.status in FINISHED else 202)
-    response.headers["Location"] = f"{prefix}/jobs/{record.id}"
-    if wait is not None:
-        response.headers["Preference-Applied"] = f"wait={wait}"
-    return response
+    return await answer(services, caller, prefix, asked, Asking(dry_run, prefer, idempotency_key))
 
 
 async def _read(request: Request, services: Services, caller: str, keep: bool) -> RegistrationRequest:
@@ -179,11 +135,7 @@ async def _by_reference(request: Request, services: Services, caller: str) -> Re
     settings = services.settings
     text = await body.read_small(request, settings)
     spec = await read_body(services, RegisterRequest, text)
-    asked = spec.to_request(spec.scene, spec.object, spec.candidates)
-    named = {"/scene": spec.scene}
-    if spec.object is not None:
-        named["/object"] = spec.object
-    named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(spec.candidates or ())}
+    asked, named = await in_thread(asked_by_reference, services, caller, spec)
     await in_thread(check_fields, services, caller, asked, named)
     return asked
 

@@ -5,56 +5,42 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, BinaryIO
 
-from fastapi import APIRouter, Header
+from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.etags import IfNoneMatchDep
-from regnf_service.http.ranges import ByteRange, parse_range
+from regnf_service.http.ranges import ByteRange, RangeDep
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
-from regnf_service.http.schemas.common import whole_problem
+from regnf_service.http.schemas.renderings import RenderResultDocument
 from regnf_service.http.schemas.results import ResultDocument
-from regnf_service.jobs.lookup import find_job
+from regnf_service.http.waiting import wait_for
+from regnf_service.jobs.lookup import find_job, manifest_of, result_of
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.manifest import ARTIFACTS, Manifest, read_manifest, read_result
-from regnf_state.records import ACTIVE, JobRecord
+from regnf_state.manifest import MEDIA_TYPES, Manifest
 
 router = APIRouter(tags=["results"])
 _BLOCK_BYTES = 256 * 1024
 _CACHE = "private, max-age=0, must-revalidate"
-_FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(set(ARTIFACTS.values()))}
-
-
-def _require_successful(record: JobRecord) -> None:
-    """Raises Problem JOB_NOT_READY, JOB_DISMISSED, JOB_FAILED with what ended the job.
-
-    A failed job is 409 whatever ended it: this request met no error of the server, and polling it must raise no alarm.
-    """
-    if record.status in ACTIVE:
-        raise Problem("JOB_NOT_READY", headers={"Retry-After": "1"})
-    if record.status == "dismissed":
-        raise Problem("JOB_DISMISSED")
-    if record.status == "failed":
-        error = whole_problem(record.error or {})
-        raise Problem("JOB_FAILED", f"{error['reason']}: {error['detail']}", extra={"error": error})
+_ARTIFACT_WAIT_S = 20
+ArtifactWaitQuery = Annotated[
+    int, Query(ge=0, le=30, description="Seconds to hold the answer back for a file that is still to come.")
+]
+_FILES = {kind: {} if kind == JSON else BINARY for kind in sorted(MEDIA_TYPES)}
 
 
 def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
-    """The manifest of a successful job. Raises as ``find_job`` and ``_require_successful``, and Problem JOB_EXPIRED."""
-    _require_successful(find_job(services, job_id, caller))
-    manifest = read_manifest(services.blobs, job_id)
-    if manifest is None:
-        raise Problem("JOB_EXPIRED")
-    return manifest
+    """The manifest of the caller's job. Raises as ``find_job`` and ``manifest_of``."""
+    return manifest_of(services, find_job(services, job_id, caller))
 
 
 @router.get(
     "/jobs/{id}/result",
-    summary="What the registration found",
-    response_model=ResultDocument,
+    summary="What the registration found, or what the rendering has made",
+    response_model=ResultDocument | RenderResultDocument,
     responses={
         200: {"links": links("name", "/artifacts/0/name", "get_artifact", "head_artifact", id="id")},
         **refusals(
@@ -68,17 +54,25 @@ def _manifest(services: Services, job_id: str, caller: str) -> Manifest:
 )
 @blocking
 def get_result(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> Any:  # noqa: A002
-    """A failed job has no result: the member `error` of the 409 is the job's own problem."""
+    """A failed job has no result: the member `error` of the 409 is the job's own problem.
+
+    The result is there before its pictures and clouds, which are listed as `pending` until they are made.
+    """
     manifest = _manifest(services, id, caller)
-    try:
-        document = read_result(services.blobs, manifest)
-    except FileNotFoundError as error:
-        raise Problem("JOB_EXPIRED") from error
+    document = result_of(services, manifest)
+    known = {one["name"]: one for one in document.get("artifacts", ())}  # a rendering says what its files show
     listed = [
-        {"name": name, "bytes": entry.bytes, "sha256": entry.sha256, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
+        known.get(name, {})
+        | {"name": name, "bytes": entry.bytes, "sha256": entry.sha256, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
         for name, entry in manifest.served().items()
     ]
-    return JSONResponse(document | {"artifacts": listed}, headers={"Cache-Control": _CACHE})
+    listed = [one | {"state": "ready"} for one in listed]
+    listed += [
+        {"name": name, "state": "pending", "bytes": None, "sha256": None, "url": f"{prefix}/jobs/{id}/artifacts/{name}"}
+        for name in manifest.pending
+    ]
+    added = {"artifacts": listed} | ({"missing_artifacts": list(manifest.missing)} if manifest.missing else {})
+    return JSONResponse(document | added, headers={"Cache-Control": _CACHE})
 
 
 _RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -92,11 +86,13 @@ _RESPONSES: dict[int | str, dict[str, Any]] = {
     **refusals(
         "JOB_NOT_FOUND",
         "ARTIFACT_NOT_FOUND",
+        "ARTIFACT_NOT_READY",
         "JOB_NOT_READY",
         "JOB_DISMISSED",
         "JOB_FAILED",
         "JOB_EXPIRED",
         "RANGE_NOT_SATISFIABLE",
+        "INVALID_QUERY",
     ),
 }
 
@@ -118,11 +114,15 @@ async def get_artifact(
     services: ServicesDep,
     caller: CallerDep,
     held: IfNoneMatchDep,
-    range_: Annotated[str | None, Header(alias="Range", description="One range, `bytes=first-last`.")] = None,
-    if_range: Annotated[str | None, Header(description="The ETag that the range belongs to.")] = None,
+    range_: RangeDep,
+    wait: ArtifactWaitQuery = _ARTIFACT_WAIT_S,
 ) -> Response:
-    """The names are those of the result's `artifacts` list."""
-    manifest = await in_thread(_manifest, services, id, caller)
+    """The names are those of the result's `artifacts` list. The answer is held back while the file is still to come."""
+    manifest = await wait_for(
+        lambda: _manifest(services, id, caller), lambda now: name not in now.pending, wait, services, caller
+    )
+    if name in manifest.pending:
+        raise Problem("ARTIFACT_NOT_READY", headers={"Retry-After": "1"})
     artifact = manifest.served().get(name)
     if artifact is None:
         raise Problem("ARTIFACT_NOT_FOUND")
@@ -130,7 +130,7 @@ async def get_artifact(
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": _CACHE}
     if held.matches(etag):
         return Response(status_code=304, headers=headers)
-    part = parse_range(range_, size) if if_range in (None, etag) else None
+    part = range_.part(size, etag)
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"
     chosen = part or ByteRange(0, size)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header, Path
 from starlette.requests import Request
@@ -14,21 +14,25 @@ from starlette.responses import JSONResponse
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, room_for_bytes, store_upload
+from regnf_service.fields.piecewise import finish_pieces
 from regnf_service.fields.uploads import Received, SettingsUpload, Upload, open_settings, open_upload, settings_limit
 from regnf_service.http import body
+from regnf_service.http.content_range import PATTERN, content_range
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
+from regnf_service.http.piece_upload import Piece, receive_piece
 from regnf_service.http.routes.documentation import (
     FIELD_LINKS,
     FILE,
     MULTIPART_REFUSALS,
+    PIECE_REFUSALS,
     UPLOAD_REFUSALS,
     header,
     refusals,
 )
-from regnf_service.http.schemas.fields import FieldDocument, field_document
+from regnf_service.http.schemas.fields import FieldDocument, UploadProgress, field_document
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.turns import fair_key
@@ -39,6 +43,7 @@ from regnf_state.records import FieldRecord
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
 _BESIDE = ("settings", "cameras")
+_SHA256_DIGITS = 64
 _HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
 _DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
 _ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -53,9 +58,14 @@ _ANSWERS: dict[int | str, dict[str, Any]] = {
 _MULTIPART = {
     "schema": {
         "type": "object",
-        "required": ["file"],
         "additionalProperties": False,
-        "properties": {"file": FILE, "description": reference(UploadDescription), "settings": FILE, "cameras": FILE},
+        "properties": {
+            "file": FILE,
+            "upload": {"type": "string", "pattern": "^[0-9a-f]{64}$", "description": "In place of `file`: its pieces."},
+            "description": reference(UploadDescription),
+            "settings": FILE,
+            "cameras": FILE,
+        },
     }
 }
 
@@ -67,7 +77,12 @@ _MULTIPART = {
     status_code=201,
     responses={
         **_ANSWERS,
-        **refusals(*UPLOAD_REFUSALS),
+        202: {
+            "description": "The piece is kept; the rest is awaited.",
+            "model": UploadProgress,
+            "headers": {"Upload-Offset": header("How many bytes have arrived.")},
+        },
+        **refusals(*UPLOAD_REFUSALS, *PIECE_REFUSALS),
     },
     openapi_extra={"requestBody": {"required": True, "content": {"application/octet-stream": {"schema": FILE}}}},
 )
@@ -80,15 +95,34 @@ async def put_field(
     content_digest: Annotated[
         str | None, Header(description="RFC 9530: `sha-256=:<base64>:`.", json_schema_extra=_DIGEST)
     ] = None,
+    content_range_: Annotated[
+        str | None,
+        Header(
+            alias="Content-Range", description="RFC 9110: which piece comes.", json_schema_extra={"pattern": PATTERN}
+        ),
+    ] = None,
+    upload_complete: Annotated[
+        Literal["?0", "?1"], Header(description="?0: the pieces wait for `POST /fields`, with what goes with them.")
+    ] = "?1",
 ) -> JSONResponse:
-    """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held."""
+    """The bytes of a checkpoint, map, grid or mesh (docs/import-gate.md), as they are. Repeat freely: 200 when held.
+
+    With `Content-Range: bytes first-last/total` one piece of them, in order: what has arrived whole stays when the next
+    one breaks off. `bytes */total` without a body asks how much has arrived, and finishes what has arrived whole.
+    """
     if not is_sha256(sha256):
         raise Problem("INVALID_DIGEST", headers=CLOSE)
     if body.media_type(request).startswith("multipart/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "PUT takes the bytes alone.", headers=CLOSE)
     digest = announced_digest(content_digest)
-    declared = body.declared_length(request)
+    span = content_range(content_range_, services.settings.max_upload_bytes)
     pace = Pace(services.settings)
+    if span is not None:
+        piece = Piece(caller, sha256, span, digest, upload_complete == "?1")
+        async with services.uploads.held(fair_key(request.scope, caller), pace):
+            found = await receive_piece(request, services, piece, pace)
+        return _progress(piece, found) if isinstance(found, int) else _answer(found, prefix)
+    declared = body.declared_length(request)
     async with services.uploads.held(fair_key(request.scope, caller), pace):
         room = await in_thread(check_room, services, caller, sha256)
         with services.under_way.claim(caller, room, declared) as claim:
@@ -108,7 +142,12 @@ async def put_field(
     responses={
         **_ANSWERS,
         **refusals(
-            *UPLOAD_REFUSALS, *MULTIPART_REFUSALS, "MALFORMED_JSON", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"
+            *UPLOAD_REFUSALS,
+            *MULTIPART_REFUSALS,
+            *PIECE_REFUSALS[1:],
+            "MALFORMED_JSON",
+            "FIELD_DESCRIPTION_DIFFERS",
+            "INVALID_DESCRIPTION",
         ),
     },
     openapi_extra={
@@ -131,7 +170,7 @@ async def post_field(
 
     `settings` is the file of settings that the trainer left, or a zip or tar file of several; `cameras` says where the
     cameras stood whose images the field was made from (docs/import-gate.md); `description` is JSON: what no file says.
-    An archive of a whole training run needs none of them.
+    An archive of a whole training run needs none of them. `upload` names a file whose pieces came by PUT.
     """
     if body.media_type(request).startswith("text/"):
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/octet-stream or multipart/form-data.", headers=CLOSE)
@@ -146,6 +185,8 @@ async def post_field(
         if in_parts:
             files = {part: await stack.enter_async_context(open_settings(services, claim)) for part in _BESIDE}
             received, beside = await _receive_parts(request, services, upload, files, pace, digest)
+            if isinstance(received, str):
+                return _answer(await finish_pieces(services, caller, received, beside), prefix)
         else:
             received, beside = await _receive_raw(request, services, upload, pace), Beside()
             if digest not in (None, received.sha256):
@@ -168,20 +209,26 @@ async def _receive_parts(
     beside: Mapping[str, SettingsUpload],
     pace: Pace,
     digest: str | None,
-) -> tuple[Received, Beside]:
+) -> tuple[Received | str, Beside]:
+    """What came. In place of the file it may be the SHA-256 of one whose pieces came before."""
     body.refuse_encoding(request)
     limit = services.settings.max_upload_bytes + len(beside) * settings_limit(services) + 2 * DESCRIPTION_BYTES
     data = body.chunks(request, limit, pace)
     if digest is not None:
         data = _compared(data, digest)
-    texts = {"description": DESCRIPTION_BYTES}
+    texts = {"description": DESCRIPTION_BYTES, "upload": _SHA256_DIGITS}
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
-    if "file" not in parts:
-        raise Problem("MISSING_PART", "The part `file` is missing.")
+    if ("file" in parts) == ("upload" in parts):
+        raise Problem("MISSING_PART", "Send the part `file`, or `upload` in its place.")
     description = read_description(parts.get("description"))
     settings, cameras = [await beside[part].received() for part in _BESIDE]
-    return await upload.finish(), Beside(description, settings, cameras)
+    if "file" in parts:
+        return await upload.finish(), Beside(description, settings, cameras)
+    named = parts["upload"].decode("latin-1")
+    if not is_sha256(named):
+        raise Problem("INVALID_DIGEST")
+    return named, Beside(description, settings, cameras)
 
 
 def read_description(text: bytes | None) -> UploadDescription | None:
@@ -197,6 +244,11 @@ async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[by
         yield piece
     if found.hexdigest() != digest:
         raise Problem("DIGEST_MISMATCH")
+
+
+def _progress(piece: Piece, offset: int) -> JSONResponse:
+    document = UploadProgress(sha256=piece.sha256, offset=offset, bytes=piece.range.total)
+    return JSONResponse(document.model_dump(), status_code=202, headers={"Upload-Offset": str(offset)})
 
 
 def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:

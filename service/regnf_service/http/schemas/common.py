@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, WithJsonSchema
 
 from regnf_core.labels import LABEL_PATTERN
-from regnf_state.problems import problem_document
+from regnf_state.problems import whole_problem
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-Links = dict[str, str]
+Moment = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
+"""A time as ``rfc3339`` writes it."""
+Address = Annotated[str, WithJsonSchema({"type": "string", "format": "uri-reference"})]
+"""An address on this service, without its host."""
+Links = dict[str, Address]
 Label = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=LABEL_PATTERN)]
 
 
@@ -35,37 +39,33 @@ class ProblemEntry(Outgoing):
     detail: str
 
 
-class CandidateDocument(Outgoing):
+class ReadingDocument(Outgoing):
     """One of several functions that an upload may be."""
 
     name: str
     description: dict[str, Any] = Field(description="The entries that choose it: send them with PATCH.")
-    picture: str | None = Field(None, description="Its picture, for as long as the upload is kept.")
+    picture: Address | None = Field(None, description="Its picture, for as long as the upload is kept.")
 
 
 class ProblemDocument(Outgoing):
     """RFC 9457 problem details. Programs switch on `reason`, never on text."""
 
-    type: str
+    type: Address
     title: str
-    status: int
+    status: Annotated[int, Field(ge=400, le=599)]
     reason: str
     detail: str
     hint: str | None = Field(None, description="What to do next, for people.")
     instance: str | None = None
     request_id: str | None = None
     errors: list[ProblemEntry] = []
-    candidates: list[CandidateDocument] = Field(
+    candidates: list[ReadingDocument] = Field(
         [], description="With a field's `LAYOUT_AMBIGUOUS`: what it may be, the likeliest first."
     )
     error: ProblemDocument | None = Field(None, description="With `JOB_FAILED`: the job's own problem.")
+    offset: int | None = Field(None, description="Of an upload in pieces: how many bytes have arrived.")
 
 
 def outgoing_problem(error: dict[str, Any] | None) -> dict[str, Any] | None:
     """A record's problem as it travels."""
     return None if error is None else whole_problem(error)
-
-
-def whole_problem(error: dict[str, Any]) -> dict[str, Any]:
-    """A stored problem with every member that a problem has."""
-    return problem_document(str(error.get("reason", "INTERNAL"))) | error

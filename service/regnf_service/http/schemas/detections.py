@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, PlainValidator
+from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import PydanticCustomError
 
@@ -146,4 +146,5 @@ def _read(value: Any) -> ParsedDetection:
 Detection = Annotated[
     ParsedDetection,
     PlainValidator(_read, json_schema_input_type=CornerBox | CenteredBox | NuScenesBox | _Corners),
+    PlainSerializer(ParsedDetection.canonical, return_type=dict[str, Any]),
 ]

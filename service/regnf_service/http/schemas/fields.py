@@ -14,6 +14,7 @@ from regnf_service.http.schemas.common import (
     Incoming,
     Label,
     Links,
+    Moment,
     Outgoing,
     ProblemDocument,
     Sha256,
@@ -22,7 +23,7 @@ from regnf_service.http.schemas.common import (
 from regnf_service.http.schemas.results import SymmetryDocument
 from regnf_service.times import rfc3339
 from regnf_state.ownership import sha256_of
-from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord
+from regnf_state.records import CANDIDATES, DRAWINGS, ORIGINAL_UNTIL, VIEWS, FieldRecord
 
 
 class SettingsDocument(Outgoing):
@@ -31,6 +32,13 @@ class SettingsDocument(Outgoing):
     name: str
     sha256: Sha256
     bytes: int
+
+
+class EntryNamed(Outgoing):
+    """Under which name a library has the field."""
+
+    name: str
+    tags: list[str] = Field([])
 
 
 class FieldDocument(Outgoing):
@@ -47,13 +55,27 @@ class FieldDocument(Outgoing):
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's own, found by the first job that registers the field as an object."
     )
+    library: EntryNamed | None = Field(None, description="Its entry in the library: `GET /library/{name}`.")
+    views: Literal["pending", "ready", "none"] | None = Field(
+        None,
+        description="Of a ready field: whether its mesh and picture, which follow when workers have time, are still to "
+        "be made, are there, or cannot be made. Null also of a field from before they followed.",
+    )
     error: ProblemDocument | None = Field(None, description="Why the field was rejected.")
-    kept_until: str | None = Field(
+    kept_until: Moment | None = Field(
         None, description="Until when the upload can be imported anew with another description: PATCH. Null: it cannot."
     )
-    created_at: str
-    updated_at: str
+    created_at: Moment
+    updated_at: Moment
     links: Links
+
+
+class UploadProgress(Outgoing):
+    """An upload in pieces that is not finished."""
+
+    sha256: Sha256
+    offset: int = Field(description="How many bytes have arrived: where the next piece begins.")
+    bytes: int = Field(description="How many the file has.")
 
 
 class _DocumentedAsDescription:
@@ -99,8 +121,10 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "description": record.said,
         "settings": None if record.settings is None else record.settings._asdict(),
         "cameras": None if record.cameras is None else record.cameras._asdict(),
-        "report": _without_time(record.report),
+        "report": _plain(record.report),
         "symmetry": record.symmetry,
+        "library": None if record.library is None else {name: record.library[name] for name in ("name", "tags")},
+        "views": record.views,
         "error": None if record.error is None else outgoing_problem(_error(record, address)),
         "kept_until": rfc3339(record.original_until),
         "created_at": rfc3339(record.created),
@@ -109,13 +133,14 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
     }
 
 
-def _without_time(said: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in said.items() if name != ORIGINAL_UNTIL}
+def _plain(said: dict[str, Any]) -> dict[str, Any]:
+    """A report or an error without what the document shows elsewhere."""
+    return {name: value for name, value in said.items() if name not in (ORIGINAL_UNTIL, VIEWS, DRAWINGS)}
 
 
 def _error(record: FieldRecord, address: str) -> dict[str, Any]:
     """Why the field was rejected; pictures of candidates by their addresses."""
-    error = _without_time(record.error or {})
+    error = _plain(record.error or {})
     if CANDIDATES not in error:
         return error
     pictures = [
@@ -128,4 +153,5 @@ def _error(record: FieldRecord, address: str) -> dict[str, Any]:
 
 
 def _links(record: FieldRecord, address: str) -> Links:
-    return {"self": address} | ({"preview": f"{address}/preview.png"} if record.state == "ready" else {})
+    shown = {"preview": f"{address}/preview.png", "mesh": f"{address}/mesh.glb"}
+    return {"self": address} | (shown if record.state == "ready" else {})

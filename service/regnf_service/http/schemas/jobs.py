@@ -5,17 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import zip_longest
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field
+from pydantic import Field, WithJsonSchema
 
 from regnf_service.http.paging import NEXT_PAGE
-from regnf_service.http.schemas.common import Links, Outgoing, ProblemDocument, outgoing_problem
+from regnf_service.http.schemas.common import Links, Moment, Outgoing, ProblemDocument, outgoing_problem
+from regnf_service.http.schemas.results import Verdict
 from regnf_service.times import rfc3339
 from regnf_state.records import ACTIVE, WARNINGS, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 
 Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+_PHASES = ["loading", "sampling", "initializing", "optimizing", "verifying", "exporting", "composing", "rendering"]
+# said in the contract alone: a record that an older version wrote is shown as it is
+_Phase = Annotated[str, WithJsonSchema({"type": "string", "enum": _PHASES})]
+_Verdict = Annotated[str, WithJsonSchema({"type": "string", "enum": list(get_args(Verdict))})]
 
 
 class WebhookDocument(Outgoing):
@@ -28,31 +33,33 @@ class WebhookDocument(Outgoing):
     sends: int = 0
     last_status: int | None = Field(None, description="What the receiver answered last.")
     last_error: str | None = Field(None, description="A word for why there was no answer.")
-    next_at: str | None = None
-    delivered_at: str | None = None
+    next_at: Moment | None = None
+    delivered_at: Moment | None = None
 
 
 class JobDocument(Outgoing):
-    """One job. `successful` means that it has a result, whose verdict may still be `rejected`."""
+    """One job. `successful` means that it has a result; the verdict of a registration may still be `rejected`."""
 
     id: str
-    kind: Literal["registration"]
+    kind: Literal["registration", "render"]
     status: Status
-    phase: str | None = Field(
-        None, description="loading, sampling, initializing, optimizing, verifying or exporting: where it is, or ended."
+    phase: _Phase | None = Field(
+        None,
+        description="loading, sampling, initializing, optimizing, verifying or exporting: where it is, or ended. Of a "
+        "rendering: loading, composing, rendering or exporting.",
     )
     progress: float = Field(0.0, ge=0, le=1)
     queue_position: int | None = Field(None, description="1 is next; null for a job that does not wait.")
     attempts: int = Field(1, ge=1, description="How often the job was handed to a worker.")
     cancel_requested: bool = False
-    created_at: str
-    updated_at: str
-    started_at: str | None = None
-    finished_at: str | None = None
-    expires_at: str | None = Field(None, description="When a finished job and its artifacts will be gone.")
+    created_at: Moment
+    updated_at: Moment
+    started_at: Moment | None = None
+    finished_at: Moment | None = None
+    expires_at: Moment | None = Field(None, description="When a finished job and its artifacts will be gone.")
     inputs: dict[str, Any] = Field(
-        description="scene, object or the number of candidates, detection, seed, initial_transform, and the SHA-256 of "
-        "the full options."
+        description="scene, object or the number of candidates, detection, seed, initial_transform, pictures, and the "
+        "SHA-256 of the full options. Of a rendering: scene, the kinds of its edits, frames, size, mode, outputs, seed."
     )
     engine: dict[str, Any] = Field(
         {}, description="Version, revision and device. The revision grows with changed results."
@@ -61,7 +68,7 @@ class JobDocument(Outgoing):
         {},
         description="What the imports of `scene` and `object` were not sure of: words; the result has sentences.",
     )
-    verdict: str | None = Field(None, description="Of a successful job: its result's verdict.")
+    verdict: _Verdict | None = Field(None, description="Of a successful job: its result's verdict.")
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     webhooks: list[WebhookDocument] = Field([], description="Told of the job's end, in the order of asking.")
     links: Links

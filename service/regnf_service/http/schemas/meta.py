@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from regnf_service.http.schemas.common import Outgoing
 
@@ -34,3 +34,19 @@ class IndexDocument(Outgoing):
     name: Literal["regnf"]
     version: str
     addresses: dict[str, str]
+
+
+class DemoFile(Outgoing):
+    """A field file to fetch and to upload."""
+
+    name: str
+    bytes: int
+    address: str
+
+
+class DemoDocument(Outgoing):
+    """A scene and an object to try, and a detection as `POST /register` takes it."""
+
+    scene: DemoFile
+    object: DemoFile
+    detection: dict[str, Any]

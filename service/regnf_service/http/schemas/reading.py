@@ -11,7 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from regnf_core.hints import suggestion
 from regnf_core.options import UNKNOWN_OPTION, did_you_mean
+from regnf_service.http.json_size import MOST_VALUES
 from regnf_service.http.schemas.detections import DETECTION_FAULT
+from regnf_service.http.schemas.edits import KINDS as EDIT_KINDS
+from regnf_service.http.schemas.library import BY_DIGEST, BY_LIBRARY
 from regnf_service.http.schemas.members import members_at
 from regnf_service.http.schemas.registrations import SEARCH_UNSUPPORTED, START_UNSUPPORTED
 from regnf_service.http.schemas.transforms import SPELLINGS as TRANSFORM_SPELLINGS
@@ -24,12 +27,23 @@ _REASONS = {
     "initial_transform": "INVALID_TRANSFORM",
     "ground_truth": "INVALID_TRANSFORM",
     "webhook": "INVALID_WEBHOOK",
+    "edits": "EDIT_INVALID",
+    **dict.fromkeys(("orbit", "look_at", "poses", "transforms", "size"), "CAMERA_INVALID"),
 }
+_REASONS_WITHIN = {
+    "T_object_scene": "INVALID_TRANSFORM",
+    "T_replacement_object": "INVALID_TRANSFORM",
+    "T_scene_file": "INVALID_TRANSFORM",
+    "detection": "INVALID_DETECTION",
+}
+"""Of members that lie deeper: they go before those of the whole."""
 _REASONS_OF_FAULTS = {
     START_UNSUPPORTED: "INITIAL_TRANSFORM_UNSUPPORTED",
     SEARCH_UNSUPPORTED: "LIBRARY_SEARCH_UNSUPPORTED",
 }
-_FIELDS = frozenset({"scene", "object", "candidates"})
+_FIELDS = frozenset({"scene", "object", "candidates", "replacement"})
+_TAGS = TRANSFORM_SPELLINGS | EDIT_KINDS | {BY_DIGEST, BY_LIBRARY}
+"""Parts of places that no body has: which model of several was taken."""
 _HASH_DIGITS = 64
 _HASH_HINT = "A field is named by the SHA-256 of its file: `sha256sum FILE` prints it, and so does POST /fields."
 _Model = TypeVar("_Model")
@@ -44,12 +58,14 @@ class _Fault(NamedTuple):
     hint: str | None
 
 
-def read_model(model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUEST") -> _Model:
+def read_model(
+    model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUEST", most_values: int = MOST_VALUES
+) -> _Model:
     """The body as ``model``, a pydantic model or dataclass, strictly.
 
     Raises Problem: MALFORMED_JSON, the faulty member's reason, or ``otherwise``.
     """
-    text = json.dumps(parse_json(body))
+    text = json.dumps(parse_json(body, most_values))
     try:
         validated: _Model = _adapter(cast(Any, model)).validate_json(text, strict=True)
     except ValidationError as error:
@@ -68,8 +84,7 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     if any(fault["type"] == "json_invalid" for fault in raw):
         return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
     faults = [_fault(entry, model) for entry in raw[:MAX_ERRORS]]
-    reasons = [_REASONS_OF_FAULTS.get(one.kind) or _REASONS.get(str((*one.place, "")[0])) for one in faults]
-    reason = next(filter(None, reasons), otherwise)
+    reason = next(filter(None, map(_reason, faults)), otherwise)
     of_box = next((one.detail for one in faults if one.kind == DETECTION_FAULT), None)
     return Problem(
         reason,
@@ -79,9 +94,17 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     )
 
 
+def _reason(fault: _Fault) -> str | None:
+    """The reason of a fault: the one that its kind has, or the place."""
+    if fault.kind in _REASONS_OF_FAULTS or not fault.place:
+        return _REASONS_OF_FAULTS.get(fault.kind)
+    within = next((_REASONS_WITHIN[str(part)] for part in fault.place[1:] if part in _REASONS_WITHIN), None)
+    return within or _REASONS.get(str(fault.place[0]))
+
+
 def _fault(entry: Any, model: Any) -> _Fault:
     kind = str(entry["type"])
-    place = tuple(part for part in entry["loc"] if part not in TRANSFORM_SPELLINGS)
+    place = tuple(part for part in entry["loc"] if part not in _TAGS)
     detail = str(entry["msg"]).removeprefix("Value error, ")
     if kind == DETECTION_FAULT:
         context = entry["ctx"]
@@ -91,7 +114,7 @@ def _fault(entry: Any, model: Any) -> _Fault:
         return _Fault(kind, place, "No such option" + meant, meant.replace("; did", "Did", 1) or _meant(place, model))
     if kind in ("extra_forbidden", UNKNOWN_OPTION):
         return _Fault(kind, place, "This member is not known.", _meant(place, model))
-    if kind == "string_pattern_mismatch" and place[:1] and place[0] in _FIELDS:
+    if kind == "string_pattern_mismatch" and not _FIELDS.isdisjoint(place):
         return _Fault(kind, place, _hash_fault(str(entry["input"])), _HASH_HINT)
     return _Fault(kind, place, detail, None)
 

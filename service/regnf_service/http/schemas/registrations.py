@@ -10,7 +10,9 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    StrictBool,
     StringConstraints,
+    Tag,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -20,12 +22,20 @@ from pydantic_core import PydanticCustomError
 from regnf_core.options import RegistrationOptions
 from regnf_service.http.schemas.common import Incoming, Outgoing, Sha256
 from regnf_service.http.schemas.detections import Detection
+from regnf_service.http.schemas.library import (
+    BY_DIGEST,
+    MAX_SELECTED,
+    Choice,
+    LibraryReference,
+    LibrarySelection,
+    Named,
+    Selected,
+)
 from regnf_service.http.schemas.transforms import Similarity, rows_of
 from regnf_state.registration_request import RegistrationRequest, recorded_detection
 
 START_UNSUPPORTED = "initial_transform_unsupported"
 SEARCH_UNSUPPORTED = "library_search_unsupported"
-_MAX_CANDIDATES = 512
 
 
 class FieldReference(Incoming):
@@ -54,8 +64,12 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 Candidates = Annotated[
-    list[Reference], Field(min_length=1, max_length=_MAX_CANDIDATES, json_schema_extra={"uniqueItems": True})
+    list[Reference],
+    Field(min_length=1, max_length=MAX_SELECTED, json_schema_extra={"uniqueItems": True}),
+    AfterValidator(_distinct),
 ]
+OneObject = Annotated[Annotated[Reference, Tag(BY_DIGEST)] | Named, Choice]
+SeveralObjects = Annotated[Annotated[Candidates, Tag(BY_DIGEST)] | Selected, Choice]
 
 
 class GroundTruth(Incoming):
@@ -86,6 +100,12 @@ class RegistrationSpec(Incoming):
         None, description="Told of the job's end, at once if it has finished. Only hosts that the service allows."
     )
 
+    pictures: StrictBool = Field(
+        True,
+        description="Whether the result gets clouds of points, residuals and a picture, which take a worker a third "
+        "of a small registration's time. Without them it has the numbers.",
+    )
+
     @field_validator("initial_transform")
     @classmethod
     def _is_of_use(cls, start: Any, info: ValidationInfo) -> Any:
@@ -112,6 +132,7 @@ class RegistrationSpec(Incoming):
             initial_transform=None if start is None else rows_of(start),
             ground_truth=None if truth is None else rows_of(truth.T_object_scene),
             webhook=None if webhook is None else webhook.url,
+            pictures=self.pictures,
         )
 
 
@@ -127,20 +148,20 @@ class RegisterRequest(RegistrationSpec):
     model_config = ConfigDict(json_schema_extra=_one_of_both)
 
     scene: Reference = Field(description="The scene's field.")
-    object: Annotated[Reference | None, BeforeValidator(_given, json_schema_input_type=Sha256 | FieldReference)] = (
-        Field(None, description="The library object's field.")
-    )
+    object: Annotated[
+        OneObject | None, BeforeValidator(_given, json_schema_input_type=Sha256 | FieldReference | LibraryReference)
+    ] = Field(None, description="The object's field, or its entry in the library.")
     candidates: Annotated[
-        Candidates | None, AfterValidator(_distinct), BeforeValidator(_given, json_schema_input_type=Candidates)
+        SeveralObjects | None, BeforeValidator(_given, json_schema_input_type=Candidates | LibrarySelection)
     ] = Field(
         None,
-        description="Instead of `object`: the fields of a library. The likeliest is found and registered by the preset "
-        "`robust`, and the result ranks them.",
+        description="Instead of `object`: fields, or entries of the library. The likeliest is found and registered by "
+        "the preset `robust`, and the result ranks them.",
     )
 
     @field_validator("candidates")
     @classmethod
-    def _can_be_searched(cls, names: list[str] | None, info: ValidationInfo) -> list[str] | None:
+    def _can_be_searched(cls, names: Any, info: ValidationInfo) -> Any:
         if names is None:
             return None
         options = info.data.get("options")

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from regnf_service.http.schemas.common import Outgoing
+from regnf_service.http.schemas.common import Address, Outgoing, Sha256
 
 Verdict = Literal["registered", "ambiguous", "rejected"]
 _Three = Annotated[list[float | None], Field(min_length=3, max_length=3)]
@@ -28,6 +28,15 @@ class AlternativeDocument(Outgoing):
     T_object_scene: TransformDocument
     score: float = Field(description="0..1, smaller is better; the result's own is the metric `score`.")
     relation: str = Field(description="How it differs from the result, such as `180 degrees about z`: object axes.")
+
+
+class ConsideredDocument(Outgoing):
+    """A pose that was refined and judged by itself. `considered.npz` has what each sample says of it."""
+
+    T_object_scene: TransformDocument
+    reason: str = Field(description="As of a verdict: SURFACES_AGREE, or what speaks against it.")
+    detail: str = Field("", description="The same in words.")
+    metrics: dict[str, float | None] = Field({})
 
 
 class UncertaintyDocument(Outgoing):
@@ -79,12 +88,15 @@ class FieldNotesDocument(Outgoing):
 
 
 class ArtifactEntry(Outgoing):
-    """One file that the job wrote."""
+    """One file that the job wrote, or is about to write."""
 
     name: str
-    bytes: int
-    sha256: str
-    url: str
+    state: Literal["ready", "pending"] = Field(
+        "ready", description="`pending`: it is still being made; a request for it is held until it is there."
+    )
+    bytes: int | None = Field(description="Null while it is pending, as the digest.")
+    sha256: Sha256 | None
+    url: Address
 
 
 class ResultDocument(Outgoing):
@@ -99,6 +111,9 @@ class ResultDocument(Outgoing):
     T_object_scene_initial: TransformDocument | None = Field(None, description="Where the refinement began.")
     alternatives: list[AlternativeDocument] = Field(
         [], description="Every other pose that explains the data as well; empty unless `ambiguous`."
+    )
+    considered: list[ConsideredDocument] | None = Field(
+        None, description="Up to six poses that were judged, the likeliest first; null from the preset `paper`."
     )
     covariance: Annotated[list[_Seven], Field(min_length=7, max_length=7)] | None = Field(
         None,
@@ -120,3 +135,6 @@ class ResultDocument(Outgoing):
     options: dict[str, Any] = Field({}, description="Every option that was used, defaults included.")
     engine: dict[str, Any] = Field({}, description="Name, version, device.")
     artifacts: list[ArtifactEntry] = Field([])
+    missing_artifacts: list[str] = Field(
+        [], description="Names of pictures and clouds that could not be made once the result was out."
+    )

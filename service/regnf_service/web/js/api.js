@@ -1,6 +1,8 @@
 // The job's own part of the HTTP API. Every address is below the job's, taken from the page's own address.
 
-const TOKEN_KEY = 'regnf.token';
+import { patientFetch } from './patience.js';
+
+export const TOKEN_KEY = 'regnf.token';
 
 /** What the service answers instead of a result: RFC 9457 problem details. */
 export class ApiProblem extends Error {
@@ -58,6 +60,11 @@ export class JobApi {
     return (await this.request(`${this.fieldUrl(sha256)}/preview.png`)).blob();
   }
 
+  /** The field's surface as GLB; detail is fine or coarse. */
+  async fieldMesh(sha256, detail) {
+    return (await this.request(`${this.fieldUrl(sha256)}/mesh.glb?detail=${detail}`)).arrayBuffer();
+  }
+
   /** The field's document. */
   async field(sha256) {
     return (await this.request(this.fieldUrl(sha256))).json();
@@ -69,7 +76,23 @@ export class JobApi {
   }
 
   fieldUrl(sha256) {
-    return `${this.base.replace(/\/jobs\/[^/]*$/, '')}/fields/${sha256}`;
+    return `${this.root}/fields/${sha256}`;
+  }
+
+  /** What every address of the service begins with. */
+  get root() {
+    return this.base.replace(/\/jobs\/[^/]*$/, '');
+  }
+
+  /** The same for another job. */
+  ofJob(id) {
+    return new JobApi(`${this.root}/jobs/${encodeURIComponent(id)}`);
+  }
+
+  /** Asks for a rendering; its job's document. */
+  async startRendering(request) {
+    const headers = { 'Content-Type': 'application/json' };
+    return (await this.request(`${this.root}/render`, { method: 'POST', headers, body: JSON.stringify(request) })).json();
   }
 
   async cancel() {
@@ -81,15 +104,15 @@ export class JobApi {
     return this.request(this.base + path, options);
   }
 
-  async request(address, { method = 'GET', headers = {}, signal } = {}) {
+  async request(address, { method = 'GET', headers = {}, body, signal } = {}) {
     const authorized = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
-    const response = await fetch(address, { method, headers: authorized, signal, cache: 'no-cache' });
+    const response = await patientFetch(address, { method, headers: authorized, body, signal, cache: 'no-cache' });
     if (response.ok) return response;
     throw new ApiProblem(response.status, await problemOf(response));
   }
 }
 
-async function problemOf(response) {
+export async function problemOf(response) {
   try {
     return await response.json();
   } catch {

@@ -3,37 +3,43 @@
 import { JobApi, jobBase } from './api.js';
 import { showCandidates } from './candidates.js';
 import { showCertainty } from './certainty.js';
+import { offerConsidered, unchooseConsidered } from './considered.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
 import { announce, byId, copyText, show } from './dom.js';
 import { followJob } from './events.js';
 import { showFields } from './fields.js';
+import { offerInScene, showStrip } from './in-scene.js';
+import { showAgreement } from './metric-list.js';
 import { prefersStillness } from './motion.js';
+import { Names } from './names.js';
 import { showOptions } from './options.js';
 import {
-  checkPose, showAgreement, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
+  checkPose, showFiles, showJob, showPoses, showTimes, showTransform, showVerdict,
 } from './panel.js';
 import { Playback } from './playback.js';
-import { LossPlot } from './plot.js';
+import { DistancePlot } from './plot.js';
 import { showRanking } from './ranking.js';
 import { inverse, readSim3 } from './sim3.js';
 import { Stage } from './stage.js';
 import {
-  hideCard, showActive, showBadge, showDismissed, showError, showFailed, showFilesOnly, showLoading, showNoView, showTrouble,
+  hideCard, showActive, showBadge, showDismissed, showError, showFailed, showFilesOnly, showLoading, showNoView, showNumbersOnly,
+  showTrouble,
 } from './status.js';
 
 const api = new JobApi(jobBase(location.pathname));
+const fieldNames = new Names(api);
 
 async function main() {
   showLoading('Reading the job');
   try {
     let job = await api.job();
-    showJob(job);
-    showFields(api, job);
+    showJob(fieldNames, job);
+    showFields(api, fieldNames, job);
     if (isActive(job)) {
       showActive(job);
       job = await followJob(api, job, showActive, showTrouble);
     }
-    showJob(job);
+    showJob(fieldNames, job);
     await showFinished(job);
   } catch (error) {
     showError(error, main);
@@ -55,23 +61,28 @@ async function showResult(job, result) {
   const trace = names.includes('trace.json') ? await readTrace() : [];
   const frames = framesOf(result, trace);
   showBadge(result.verdict ?? job.status, job.id);
-  if (result.verdict) showVerdict(result);
-  showRanking(result.candidates);
+  if (result.verdict) showVerdict(job, result);
+  offerInScene(api, job, result);
+  if (job.kind === 'render') await showStrip(api, names);
+  showRanking(fieldNames, result.candidates);
   showCertainty(result);
   showOptions(result.options);
   if (frames.length) showTransform(frames.at(-1).pose);
-  showAgreement(result.metrics);
-  showTimes(result.metrics);
+  await showAgreement(result.metrics);
+  showTimes(job, result.metrics);
   showFiles(api, artifacts);
-  showJob(job, result);
-  showFields(api, job, result);
-  if (frames.length) await showStage(job, result, frames, names);
-  else showFilesOnly();
+  await showJob(fieldNames, job, result);
+  showFields(api, fieldNames, job, result);
+  if (!frames.length) showFilesOnly();
+  else if (job.inputs?.pictures === false) {
+    showNumbersOnly();
+    offerPoses(result, frames, () => {});
+  } else await showStage(job, result, frames, names);
 }
 
 async function showStage(job, result, frames, names) {
-  const stage = new Stage(api, names);
-  showLoading('Fetching the point clouds');
+  const stage = new Stage(api, names, fieldNames);
+  showLoading('Fetching the surfaces');
   try {
     await stage.open(job, result, frames);
     hideCard();
@@ -81,14 +92,17 @@ async function showStage(job, result, frames, names) {
     offerPoses(result, frames, () => {});
     return;
   }
-  const loss = new LossPlot(byId('loss'), frames, (index) => playback.seek(index));
+  const unit = result.metrics?.object_diameter > 0 ? 'of the diameter' : 'object units';
+  const curve = new DistancePlot(byId('distance'), frames, unit, (index) => playback.seek(index));
   const playback = new Playback(frames, (position) => {
     stage.moveTo(position);
-    loss.moveTo(position);
+    curve.moveTo(position);
+    stage.showMarks(null);
+    unchooseConsidered();
     if (checkPose(0)) showTransform(frames.at(-1).pose); // the path leads to the result, not to an alternative
   });
-  show(byId('convergence'), loss.useful);
-  byId('loss-note').textContent = loss.note;
+  show(byId('convergence'), curve.useful);
+  byId('distance-note').textContent = curve.note;
   byId('canvas').addEventListener('keydown', (event) => {
     if (event.key !== ' ') return;
     event.preventDefault();
@@ -100,7 +114,14 @@ async function showStage(job, result, frames, names) {
     stage.placeAlternative(inverse(alternative));
     playback.nameInstead('Alternative');
   });
-  announce('The point clouds are shown.');
+  offerConsidered(api, result, names, ({ pose, marks }) => {
+    playback.pause();
+    stage.placeAlternative(inverse(pose));
+    stage.showMarks(marks);
+    playback.nameInstead('A pose that was judged');
+    showTransform(pose, 'A pose that was judged');
+  });
+  announce('The surfaces are shown.');
   if (!prefersStillness() && frames.length > 1) playback.play();
 }
 

@@ -19,9 +19,9 @@ export function frameSphere(camera, controls, sphere, direction) {
 }
 
 /** The direction to look from: the side on which the fewest points stand between the camera and the sphere. */
-export function clearestDirection(sphere, positions, toWorld) {
+export function clearestDirection(sphere, positions, toWorld, elevation = ELEVATION) {
   const blocked = new Array(CANDIDATES).fill(0);
-  const sides = blocked.map((_, i) => horizonDirection(Math.PI / 5 + (i * 2 * Math.PI) / CANDIDATES));
+  const sides = blocked.map((_, i) => horizonDirection(Math.PI / 5 + (i * 2 * Math.PI) / CANDIDATES, elevation));
   const point = new Vector3();
   const stride = Math.max(Math.floor(positions.count / 4000), 1);
   for (let i = 0; i < positions.count; i += stride) {
@@ -71,8 +71,8 @@ function zoom(camera, controls, factor) {
   camera.position.sub(controls.target).multiplyScalar(factor).add(controls.target);
 }
 
-function horizonDirection(azimuth) {
+function horizonDirection(azimuth, elevation) {
   return new Vector3(
-    Math.cos(ELEVATION) * Math.cos(azimuth), Math.sin(ELEVATION), Math.cos(ELEVATION) * Math.sin(azimuth),
+    Math.cos(elevation) * Math.cos(azimuth), Math.sin(elevation), Math.cos(elevation) * Math.sin(azimuth),
   );
 }

@@ -4,15 +4,16 @@ import { byId, el, fillFacts, show } from './dom.js';
 import { number } from './format.js';
 
 const AXES = ['x', 'y', 'z'];
+const [FULL_DEGREES, FULL_SHARE, FULL_PERCENT] = [1, 0.01, 1]; // the share is of the object's diameter
 
-/** Bars within each group of deviations: their units differ, so lengths are comparable within a group alone. */
+/** Bars of fixed scales, alike for all results: a full one is much for a pose that somebody wants to use. */
 export function showCertainty(result) {
   const { uncertainty, covariance, covariance_ordering: ordering, symmetry } = result;
   if (uncertainty) {
     byId('sigmas').replaceChildren(
-      ...group('Rotation about the object’s axes', 'degrees', AXES, uncertainty.rotation_deg),
-      ...group('Translation', 'object units', AXES, uncertainty.translation),
-      ...group('Scale', '%', [''], [uncertainty.scale_percent]),
+      ...group('Rotation about the object’s axes', 'degrees', AXES, uncertainty.rotation_deg, FULL_DEGREES),
+      ...group('Translation', 'object units', AXES, uncertainty.translation, FULL_SHARE * (result.metrics?.object_diameter ?? NaN)),
+      ...group('Scale', '%', [''], [uncertainty.scale_percent], FULL_PERCENT),
     );
   }
   if (covariance && ordering) byId('covariance').replaceChildren(...matrixRows(covariance, ordering));
@@ -28,16 +29,17 @@ export function symmetryInWords({ order, axis, continuous }) {
   return order === 1 ? 'none found' : `${order} rotations${about} look the same`;
 }
 
-function group(name, unit, labels, values = []) {
-  const largest = Math.max(...values.filter(Number.isFinite), 0);
+function group(name, unit, labels, values, whole) {
+  const largest = Number.isFinite(whole) ? whole : Math.max(...values.filter(Number.isFinite), 0);
   const rows = labels.map((label, i) => {
     const fill = el('span', {});
-    fill.style.width = `${Number.isFinite(values[i]) && largest > 0 ? (100 * values[i]) / largest : 0}%`;
+    fill.style.width = `${Number.isFinite(values[i]) && largest > 0 ? Math.min(100, (100 * values[i]) / largest) : 0}%`;
     return el('div', { className: 'sigma' }, el('span', { className: 'mono' }, label),
       el('span', { className: 'track', 'aria-hidden': 'true' }, fill),
       el('span', { className: 'mono' }, `± ${number(values[i], 2)}`));
   });
-  return [el('h3', {}, name, ' ', el('small', {}, unit)), ...rows];
+  const said = Number.isFinite(whole) ? `${unit}; full bar ${number(whole, 2)}` : unit;
+  return [el('h3', {}, name, ' ', el('small', {}, said)), ...rows];
 }
 
 function matrixRows(covariance, ordering) {

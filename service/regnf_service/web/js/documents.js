@@ -1,11 +1,15 @@
 // Reading the API's documents: what the page needs from them, or null where a document does not say.
 
-import { readSim3 } from './sim3.js';
+import { partsOf, readSim3 } from './sim3.js';
 
+const RENDERING_PHASES = ['loading', 'composing', 'rendering', 'exporting'];
 export const PHASES = ['loading', 'sampling', 'initializing', 'optimizing', 'verifying', 'exporting'];
 
 // What a registration may leave behind, for services whose result does not list it.
 const KNOWN_ARTIFACTS = ['scene_points.ply', 'object_points.ply', 'trace.json', 'residuals.npz', 'preview.png'];
+
+/** Those that a job goes through. */
+export const phasesOf = (job) => (job.kind === 'render' ? RENDERING_PHASES : PHASES);
 
 export const isActive = (job) => job.status === 'accepted' || job.status === 'running';
 
@@ -42,20 +46,31 @@ export function artifactsOf(result) {
 }
 
 /**
- * The replay: [{ label, iteration, loss, pose }] from the initial transform over the trace to the result.
+ * The mean distance between the surfaces' samples in an iteration, over both sides alike: a share of the object's diameter
+ * where that is known, else in object units. No kernel weighs it. pose is T_object_scene. null where the trace has none.
+ */
+function distanceOf(row, pose, diameter) {
+  const { residual_scene: scene, residual_object: object } = row ?? {};
+  if (!Number.isFinite(scene) || !Number.isFinite(object) || !pose) return null;
+  const mean = (scene + object * partsOf(pose).scale) / 2; // the object's samples measure in the scene's units
+  return diameter > 0 ? mean / diameter : mean;
+}
+
+/**
+ * The replay: [{ label, iteration, distance, pose }] from the initial transform over the trace to the result.
  * pose is T_object_scene. Iterations without a readable transform are left out.
  */
 export function framesOf(result, trace) {
   const frames = [];
-  const add = (label, iteration, loss, value) => {
+  const add = (label, iteration, row, value) => {
     const pose = readSim3(value);
-    if (pose) frames.push({ label, iteration, loss: Number.isFinite(loss) ? loss : null, pose });
+    if (pose) frames.push({ label, iteration, distance: distanceOf(row, pose, result.metrics?.object_diameter), pose });
   };
   add('Start', null, null, result.T_object_scene_initial);
   const rows = Array.isArray(trace) ? trace : (trace?.iterations ?? trace?.trace ?? []);
   rows.forEach((row, i) => {
     const iteration = row?.iteration ?? i + 1;
-    add(`Iteration ${iteration}`, iteration, row?.loss, row?.T_object_scene);
+    add(`Iteration ${iteration}`, iteration, row, row?.T_object_scene);
   });
   add('Result', null, null, result.T_object_scene);
   return frames;

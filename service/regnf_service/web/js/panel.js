@@ -1,4 +1,4 @@
-// The results beside the view: verdict, transform, agreement, times, downloads, the job itself.
+// The results beside the view: verdict, transform, times, downloads, the job itself.
 
 import { secondsByPhase } from './documents.js';
 import { byId, copyText, el, fillFacts, show } from './dom.js';
@@ -9,9 +9,8 @@ const DIRECTIONS = {
   T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
   T_scene_object: 'T_scene_object: carries object coordinates to scene coordinates',
 };
-const NAMES = { residual_rms: 'Residual RMS', inlier_share_scene: 'Scene inliers', inlier_share_object: 'Object inliers' };
 
-export function showVerdict(result) {
+export function showVerdict(job, result) {
   const { verdict, verdict_reason: reason, metrics = {} } = result;
   byId('verdict').dataset.verdict = verdict;
   byId('verdict-word').textContent = words(verdict);
@@ -22,7 +21,7 @@ export function showVerdict(result) {
   showWarnings(result.fields);
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;
-  const total = totalSeconds(metrics);
+  const { waited, worked } = timesOf(job, metrics);
   const { probability } = metrics;
   fillFacts(byId('figures'), [
     ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), 'that the pose is right')]] : []),
@@ -30,7 +29,7 @@ export function showVerdict(result) {
     ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
       Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],
     ['Inliers', figure(percent(Math.min(metrics.inlier_share_scene, metrics.inlier_share_object)), 'weaker side')],
-    ['Time', figure(seconds(total), metrics.iterations ? `${number(metrics.iterations)} iterations` : '')],
+    ['Time', figure(seconds(waited ?? worked), waited === null ? '' : `from request to result, ${seconds(worked)} of it computing`)],
   ]);
   show(byId('verdict'));
 }
@@ -69,20 +68,11 @@ export function showTransform(matrix, note = '') {
   show(byId('transform'));
 }
 
-export function showAgreement(metrics = {}) {
-  const shares = Object.entries(metrics).filter(([name, value]) => /share|overlap/.test(name) && value >= 0 && value <= 1);
-  byId('shares').replaceChildren(...shares.map(([name, value]) => shareBar(NAMES[name] ?? words(name), value)));
-  const others = Object.entries(metrics).filter(
-    ([name, value]) => Number.isFinite(value) && !name.startsWith('seconds') && !shares.some(([share]) => share === name),
-  );
-  fillFacts(byId('metrics'), others.map(([name, value]) => [NAMES[name] ?? words(name), mono(number(value))]));
-  show(byId('agreement'), shares.length + others.length > 0);
-}
-
-export function showTimes(metrics = {}) {
+export function showTimes(job, metrics = {}) {
   const rows = secondsByPhase(metrics);
   const sum = rows.reduce((total, row) => total + row.seconds, 0);
-  byId('time-total').textContent = `${seconds(sum)} in all`;
+  const { waited } = timesOf(job, metrics);
+  byId('time-total').textContent = `${seconds(sum)}${waited === null ? ' in all' : ` of ${seconds(waited)} from request to result`}`;
   byId('time-stack').replaceChildren(...rows.map((row, i) => {
     const part = el('span', { 'data-slot': String(i % 6), title: `${words(row.phase)} ${seconds(row.seconds)}` });
     part.style.flexGrow = String(Math.max(row.seconds / (sum || 1), 0.004));
@@ -122,10 +112,15 @@ export function showFiles(api, artifacts) {
   show(byId('downloads'), artifacts.length > 0);
 }
 
-export function showJob(job, result) {
+/** The job itself; names.js says what its fields are called. Their digests are the names' titles. */
+export async function showJob(names, job, result) {
   const engine = result?.engine ?? job.engine ?? {};
   const named = result?.candidates && result.object ? { 'object found': result.object } : {};
-  const inputs = Object.entries({ ...job.inputs, ...named }).filter(([, value]) => typeof value === 'string' && value !== '');
+  const texts = Object.entries({ ...job.inputs, ...named }).filter(([, value]) => typeof value === 'string' && value !== '');
+  const inputs = await Promise.all(texts.map(async ([name, value]) => [words(name), await valueOf(names, value)]));
+  const title = await names.ofJob(job, result);
+  document.title = `${title} – regnf`;
+  byId('job-title').textContent = title;
   fillFacts(byId('job-facts'), [
     ['Id', mono(job.id ?? '')],
     ['Kind', job.kind],
@@ -136,10 +131,14 @@ export function showJob(job, result) {
     ['Start', job.inputs?.initial_transform ? 'given with the request' : null],
     ['Seed', mono(String(result?.seed ?? job.inputs?.seed ?? ''))],
     ['Engine', typeof engine === 'string' ? engine : Object.values(engine).filter((value) => typeof value !== 'object').join(' · ')],
-    ...inputs.map(([name, value]) => [words(name), mono(value)]),
+    ...inputs,
   ].map(([term, value]) => [term, value instanceof Node && !value.textContent ? null : value]));
   show(byId('about'));
 }
+
+const valueOf = async (names, value) => (/^[0-9a-f]{64}$/.test(value)
+  ? el('span', { title: value }, await names.of(value))
+  : mono(value));
 
 // A plain link cannot carry the token, so the bytes come through fetch and are saved from memory.
 async function saveWithToken(event, api, name) {
@@ -149,17 +148,13 @@ async function saveWithToken(event, api, name) {
   setTimeout(() => URL.revokeObjectURL(url), 60_000);
 }
 
-function totalSeconds(metrics) {
-  if (Number.isFinite(metrics.seconds_total)) return metrics.seconds_total;
+/** Seconds from the request to the result, null where the job does not say, and those of the phases. */
+function timesOf(job, metrics) {
+  const waited = (Date.parse(job.finished_at) - Date.parse(job.created_at)) / 1000;
   const rows = secondsByPhase(metrics);
-  return rows.length ? rows.reduce((sum, row) => sum + row.seconds, 0) : NaN;
-}
-
-function shareBar(name, share) {
-  const fill = el('span', {});
-  fill.style.width = `${share * 100}%`;
-  return el('div', { className: 'share' }, el('span', {}, name), el('span', { className: 'mono' }, percent(share)),
-    el('span', { className: 'track', 'aria-hidden': 'true' }, fill));
+  const sum = rows.length ? rows.reduce((total, row) => total + row.seconds, 0) : NaN;
+  const worked = Number.isFinite(metrics.seconds_total) ? metrics.seconds_total : sum;
+  return { waited: Number.isFinite(waited) ? waited : null, worked };
 }
 
 const rowsAsText = (rows) => `[${rows.map((row) => `[${row.join(', ')}]`).join(',\n ')}]`;

@@ -56,10 +56,10 @@ export class Playback {
   moveTo(position) {
     this.position = position;
     const frame = this.frames[Math.round(position)];
-    const loss = frame.loss === null ? '' : ` · loss ${number(frame.loss, 3)}`;
+    const distance = frame.distance === null ? '' : ` · distance ${number(frame.distance, 3)}`;
     this.slider.value = String(Math.round(position));
-    this.slider.setAttribute('aria-valuetext', frame.label + loss);
-    byId('iteration-text').textContent = frame.label + loss;
+    this.slider.setAttribute('aria-valuetext', frame.label + distance);
+    byId('iteration-text').textContent = frame.label + distance;
     this.onMove(position);
   }
 

@@ -1,4 +1,4 @@
-// The page's two small plots, as SVG: the loss over the iterations and the histogram of the residuals.
+// The page's two small plots, as SVG: the distance over the iterations and the histogram of the residuals.
 
 import { cssColor, rampColor } from './colors.js';
 import { svg } from './dom.js';
@@ -7,16 +7,16 @@ import { number } from './format.js';
 const MARGIN = { left: 46, right: 10, top: 10, bottom: 22 };
 const HEIGHT = 150;
 
-/** The loss curve. Clicking or dragging on it seeks: onSeek(index of the frame). */
-export class LossPlot {
-  constructor(host, frames, onSeek) {
-    this.host = host;
-    this.marks = frames.map((frame, index) => ({ index, loss: frame.loss, iteration: frame.iteration })).filter(({ loss }) => loss !== null);
+/** The mean distance between the surfaces. unit: what it is measured in. Clicking or dragging on it seeks: onSeek(index of the frame). */
+export class DistancePlot {
+  constructor(host, frames, unit, onSeek) {
+    Object.assign(this, { host, unit });
+    this.marks = frames.map((frame, index) => ({ index, distance: frame.distance, iteration: frame.iteration })).filter(({ distance }) => distance !== null);
     this.last = frames.length - 1;
     this.position = this.last;
     this.onSeek = onSeek;
-    const losses = this.marks.map(({ loss }) => loss);
-    [this.low, this.high] = [Math.min(...losses), Math.max(...losses)];
+    const distances = this.marks.map(({ distance }) => distance);
+    [this.low, this.high] = [Math.min(...distances), Math.max(...distances)];
     this.logarithmic = this.low > 0 && this.high / this.low > 20;
     new ResizeObserver(() => this.draw()).observe(host);
     this.draw();
@@ -29,11 +29,11 @@ export class LossPlot {
   /** What the plot shows, in words. */
   get summary() {
     const [first, last] = [this.marks[0], this.marks.at(-1)];
-    return `Loss over ${this.marks.length} iterations, from ${number(first.loss, 3)} to ${number(last.loss, 3)}`;
+    return `Mean distance over ${this.marks.length} iterations, from ${number(first.distance, 3)} to ${number(last.distance, 3)} ${this.unit}`;
   }
 
   get note() {
-    return this.logarithmic ? 'logarithmic' : '';
+    return this.logarithmic ? `${this.unit}, logarithmic` : this.unit;
   }
 
   /** Puts the cursor at a frame, fractions included. */
@@ -46,7 +46,7 @@ export class LossPlot {
     const width = this.host.clientWidth;
     if (!this.useful || !width) return;
     this.width = width;
-    const points = this.marks.map(({ index, loss }) => `${this.x(index).toFixed(1)},${this.y(loss).toFixed(1)}`);
+    const points = this.marks.map(({ index, distance }) => `${this.x(index).toFixed(1)},${this.y(distance).toFixed(1)}`);
     const ground = HEIGHT - MARGIN.bottom;
     const area = `M${this.x(this.marks[0].index)},${ground}L${points.join('L')}L${this.x(this.marks.at(-1).index)},${ground}Z`;
     this.cursor = svg('g', { class: 'cursor' }, svg('line', { y1: MARGIN.top, y2: ground }), svg('circle', { r: 4 }));
@@ -84,7 +84,7 @@ export class LossPlot {
     const after = this.marks.find(({ index }) => index >= at);
     const share = after.index === before.index ? 0 : (at - before.index) / (after.index - before.index);
     const x = this.x(at);
-    const y = (1 - share) * this.y(before.loss) + share * this.y(after.loss);
+    const y = (1 - share) * this.y(before.distance) + share * this.y(after.distance);
     const [line, dot] = this.cursor.children;
     line.setAttribute('x1', x);
     line.setAttribute('x2', x);
@@ -104,10 +104,10 @@ export class LossPlot {
     return MARGIN.left + ((index - first) / Math.max(last - first, 1)) * (this.width - MARGIN.left - MARGIN.right);
   }
 
-  y(loss) {
+  y(distance) {
     const scale = this.logarithmic ? Math.log : (value) => value;
     const span = scale(this.high) - scale(this.low) || 1;
-    return HEIGHT - MARGIN.bottom - ((scale(loss) - scale(this.low)) / span) * (HEIGHT - MARGIN.top - MARGIN.bottom);
+    return HEIGHT - MARGIN.bottom - ((scale(distance) - scale(this.low)) / span) * (HEIGHT - MARGIN.top - MARGIN.bottom);
   }
 }
 

@@ -9,8 +9,10 @@ const STAGES = {
 };
 
 /** candidates as the result has them, the likeliest first; the rest folds away. */
-export function showRanking(candidates) {
+export function showRanking(names, candidates) {
   const rows = (candidates ?? []).map((one, i) => row(one, i));
+  nameRows(names, rows.slice(0, SHOWN));
+  byId('ranking-more').ontoggle = () => nameRows(names, rows.slice(SHOWN));
   byId('ranking-note').textContent = rows.length ? `${rows.length} candidates` : '';
   byId('ranking-list').replaceChildren(...rows.slice(0, SHOWN));
   byId('ranking-rest').replaceChildren(...rows.slice(SHOWN));
@@ -18,8 +20,15 @@ export function showRanking(candidates) {
   show(byId('ranking'), rows.length > 0);
 }
 
+/** Puts the objects' names in place of their digests; the folded ones are asked for once they are seen. */
+async function nameRows(names, rows) {
+  for (const node of rows.map((one) => one.querySelector('[data-object]'))) {
+    node.textContent = await names.of(node.dataset.object);
+  }
+}
+
 function row({ object, stage, score, verdict, verdict_reason: reason }, i) {
-  const name = el('code', { title: object }, object.slice(0, 12));
+  const name = el('span', { title: object, 'data-object': object }, object.slice(0, 12));
   const end = verdict ? words(verdict) : STAGES[stage] ?? stage;
   return el('li', { 'data-verdict': verdict ?? '', className: i === 0 ? 'first' : '' }, name,
     el('span', { title: reason ?? '' }, end),

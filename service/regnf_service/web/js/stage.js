@@ -1,26 +1,31 @@
-// The 3D view of one result: loads its clouds, wires the view's own controls, moves the object.
+// The 3D view of one result: loads its surfaces, wires the view's own controls, moves the object.
 
-import { Cloud, geometryFromPly, isColorful } from './cloud.js';
+import { Cloud, geometryFromArrays, geometryFromPly, isColorful } from './cloud.js';
 import { wireBox } from './box.js';
 import { detectionOf, upAxisOf } from './documents.js';
 import { byId, el, show } from './dom.js';
+import { ellipsoidOf } from './ellipsoid.js';
 import { residualHistogram } from './plot.js';
 import { readResiduals } from './residuals.js';
+import { meshesOf } from './result-meshes.js';
 import { between, inverse } from './sim3.js';
 import { Viewer } from './viewer.js';
 
 const FOCUS = ['after', 'box'];
+const LAYERS = ['scene', 'context', 'before', 'after'];
 
 export class Stage {
-  constructor(api, names) {
-    this.api = api;
-    this.names = names;
+  /** names: of the artifacts; fieldNames: the documents of the fields, as names.js has them. */
+  constructor(api, names, fieldNames) {
+    Object.assign(this, { api, names, fieldNames });
     this.pose = null; // T_scene_object of the moving object
     this.residuals = null;
-    this.plain = {};
+    this.plain = {}; // name -> Cloud
+    this.meshes = null; // name -> Surface
+    this.marked = []; // names of layers
   }
 
-  /** Fetches the clouds and shows them; frames as documents.js reads them. */
+  /** Fetches the surfaces and shows them; frames as documents.js reads them. */
   async open(job, result, frames) {
     const [scene, object] = await Promise.all(['scene_points.ply', 'object_points.ply'].map((name) => this.api.artifact(name)));
     this.plain.scene = new Cloud(geometryFromPly(scene), { seeThrough: true });
@@ -31,15 +36,39 @@ export class Stage {
     this.viewer.setUp(byId('up').value);
     show(byId('gizmo'));
     this.poses = frames.map((frame) => inverse(frame.pose));
-    this.addCloud('scene', this.plain.scene, 'cloud-scene');
-    this.addCloud('after', this.plain.after, 'cloud-after');
-    await this.addContext();
-    this.addBefore(frames.length > 1);
-    this.addBox(detectionOf(job, result));
+    const box = detectionOf(job, result);
+    const fields = { scene: job.inputs?.scene, object: result.object ?? job.inputs?.object };
+    await this.readContext();
+    const meshes = (detail) => meshesOf(this.api, this.fieldNames, fields, box, this.plain.scene.geometry, detail);
+    const areDrawn = !(await this.areToCome(fields));
+    if (areDrawn) this.meshes = await meshes('coarse'); // they come at once; the fine ones follow
+    if (frames.length > 1) this.plain.before = new Cloud(this.plain.after.geometry, { opacity: 0.35, discs: 0.5 });
+    else if (this.meshes) this.meshes.before = null;
+    show(byId('before-chip'), frames.length > 1);
+    show(byId('surfaces-dial'), this.meshes !== null);
+    this.addBox(box);
+    this.addUncertainty(result);
+    this.draw();
     this.moveTo(frames.length - 1);
     this.wire();
     this.viewer.look(FOCUS);
     show(byId('tools'));
+    if (this.meshes || !areDrawn) meshes('fine').then((made) => this.takeMeshes(made));
+  }
+
+  /** Whether a worker has yet to draw the scene or the object. */
+  async areToCome({ scene, object }) {
+    const found = await Promise.all([scene, object].map((sha256) => this.fieldNames.document(sha256)));
+    return found.some((field) => field?.views === 'pending');
+  }
+
+  /** Shows meshes that are finer, or that were drawn after the page was opened; null: there are none. */
+  takeMeshes(meshes) {
+    if (!meshes) return;
+    this.meshes = meshes;
+    if (this.poses.length < 2) this.meshes.before = null;
+    show(byId('surfaces-dial'));
+    this.redraw();
   }
 
   /** Shows the object at a position along the frames, fractions included. */
@@ -56,6 +85,23 @@ export class Stage {
     this.place(pose);
   }
 
+  /** Marks what speaks against a pose, as considered.js has it; null: nothing. */
+  showMarks(marks) {
+    for (const name of this.marked) this.viewer.removeLayer(name);
+    this.marked = [];
+    const cloudOf = (points) => new Cloud(geometryFromArrays(points, new Float32Array(points.length / 3)), { nearer: 1.5, discs: 0.6 });
+    for (const { name, positions, all, tint, pose } of marks ?? []) {
+      if (positions.length === 0) continue;
+      const cloud = cloudOf(positions);
+      cloud.spacing = cloudOf(all).spacing; // discs as large as if all were drawn
+      cloud.colorBy('layer');
+      if (pose) cloud.place(pose);
+      this.viewer.setLayer(`marks-${name}`, { object: cloud.points, cloud, tint });
+      this.marked.push(`marks-${name}`);
+    }
+    this.viewer.invalidate();
+  }
+
   /** T_scene_object: where the object stands in the scene. */
   place(pose) {
     this.pose = pose;
@@ -63,21 +109,30 @@ export class Stage {
     this.viewer?.invalidate();
   }
 
-  addBefore(known) {
-    show(byId('before-chip'), known);
-    if (!known) return;
-    const before = new Cloud(this.plain.after.geometry, { opacity: 0.35, discs: 0.5 });
-    before.place(this.poses[0]);
-    this.addCloud('before', before, 'cloud-before');
+  /** The scene round the detection; older results have none, and the view does without it. */
+  async readContext() {
+    if (!this.names.includes('context_points.ply')) return;
+    const geometry = geometryFromPly(await this.api.artifact('context_points.ply'));
+    this.plain.context = new Cloud(geometry, { seeThrough: true, discs: 0.35 });
   }
 
-  /** The scene round the detection; older results have none, and the view does without it. */
-  async addContext() {
-    const known = this.names.includes('context_points.ply');
-    show(byId('context-chip'), known);
-    if (!known) return;
-    const geometry = geometryFromPly(await this.api.artifact('context_points.ply'));
-    this.addCloud('context', new Cloud(geometry, { seeThrough: true, discs: 0.35 }), 'cloud-context');
+  /** Shows the surfaces as they are chosen: meshes or samples, in their colors; residuals, if given, are of samples. */
+  draw(residuals = null) {
+    const asMeshes = this.meshes !== null && byId('surfaces').value === 'meshes';
+    const chosen = { ...(asMeshes ? this.meshes : this.plain) };
+    for (const cloud of Object.values(chosen)) cloud?.colorBy(byId('color').value === 'file' ? 'file' : 'layer');
+    if (residuals?.scene) chosen.scene = residuals.scene;
+    if (residuals?.object) chosen.after = residuals.object;
+    chosen.before?.place(this.poses[0]);
+    for (const name of LAYERS) this.setLayer(name, chosen[name]);
+    show(byId('context-chip'), Boolean(chosen.context));
+    show(byId('size-dial'), !asMeshes || residuals !== null);
+  }
+
+  setLayer(name, cloud) {
+    if (!cloud) return this.viewer.removeLayer(name);
+    this.viewer.setLayer(name, { object: cloud.points, cloud, tint: `cloud-${name}` });
+    return this.viewer.setVisible(name, byId('layers').querySelector(`input[data-layer="${name}"]`).checked);
   }
 
   addBox(box) {
@@ -85,8 +140,20 @@ export class Stage {
     if (box) this.viewer.setLayer('box', { object: wireBox(box), tint: 'cloud-box' });
   }
 
-  addCloud(name, cloud, tint) {
-    this.viewer.setLayer(name, { object: cloud.points, cloud, tint });
+  /** At the pose of the result, wherever the object is shown; hidden until it is asked for. */
+  addUncertainty({ covariance }) {
+    const { geometry } = this.plain.after;
+    geometry.computeBoundingBox();
+    const { min, max } = geometry.boundingBox;
+    const center = min.clone().lerp(max, 0.5).toArray();
+    const found = ellipsoidOf(covariance, center, min.distanceTo(max));
+    show(byId('uncertainty-chip'), Boolean(found));
+    if (!found) return;
+    const { object, factor } = found;
+    object.matrix.copy(this.poses.at(-1));
+    byId('uncertainty-name').textContent = factor > 1 ? `Uncertainty × ${factor}` : 'Uncertainty';
+    this.viewer.setLayer('uncertainty', { object, tint: 'cloud-uncertainty' });
+    this.viewer.setVisible('uncertainty', false);
   }
 
   wire() {
@@ -100,9 +167,11 @@ export class Stage {
     byId('size').oninput = (event) => this.viewer.setPointFactor(Number(event.target.value));
     byId('frame-object').onclick = () => this.viewer.look(FOCUS);
     byId('frame-all').onclick = () => this.viewer.look([...FOCUS, 'before', 'scene', 'context']);
-    byId('color').onchange = (event) => this.colorBy(event.target.value);
+    byId('color').onchange = () => this.redraw();
+    byId('surfaces').onchange = () => this.redraw();
     this.offer('residual', this.names.includes('residuals.npz'));
-    this.offer('file', Object.values(this.plain).some((cloud) => isColorful(cloud.geometry)));
+    const drawn = [this.plain.scene, this.plain.after, this.meshes?.scene, this.meshes?.after].filter(Boolean);
+    this.offer('file', drawn.some((cloud) => isColorful(cloud.geometry)));
   }
 
   offer(value, available) {
@@ -111,15 +180,9 @@ export class Stage {
     option.disabled = !available;
   }
 
-  async colorBy(mode) {
-    const residuals = mode === 'residual' ? await this.loadResiduals() : null;
-    if (mode === 'residual' && !residuals) return;
-    const clouds = residuals ? { scene: residuals.scene, after: residuals.object } : this.plain;
-    for (const [name, cloud] of Object.entries(clouds)) {
-      if (!cloud) continue;
-      if (!residuals) cloud.colorBy(mode);
-      this.addCloud(name, cloud, `cloud-${name}`);
-    }
+  async redraw() {
+    const residuals = byId('color').value === 'residual' ? await this.loadResiduals() : null;
+    this.draw(residuals);
     this.place(this.pose);
     show(byId('legend'), Boolean(residuals));
   }

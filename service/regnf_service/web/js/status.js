@@ -1,7 +1,7 @@
 // The badge in the bar and the card in the view's place: loading, running, failed, dismissed, not found.
 
 import { ApiProblem } from './api.js';
-import { PHASES, isActive } from './documents.js';
+import { isActive, phasesOf } from './documents.js';
 import { byId, el, fillFacts, show } from './dom.js';
 import { words } from './format.js';
 
@@ -36,7 +36,7 @@ export function showActive(job) {
   show(byId('message-progress'), !queued);
   show(byId('cancel'), isActive(job) && !job.cancel_requested);
   byId('progress').value = job.progress ?? 0;
-  showPhases(job.phase);
+  showPhases(phasesOf(job), job.phase);
 }
 
 export function showTrouble(error) {
@@ -84,6 +84,11 @@ export function showFilesOnly() {
   card({ eyebrow: 'Finished', title: 'The job wrote files', text: 'This kind of job has no pose to show.', tone: 'good' });
 }
 
+export function showNumbersOnly() {
+  const text = 'This registration was asked for without pictures. Its pose and its metrics are beside this text.';
+  card({ eyebrow: 'Finished', title: 'There are no pictures', text, tone: 'good' });
+}
+
 export function hideCard() {
   show(byId('message'), false);
 }
@@ -106,9 +111,9 @@ function showProblem(problem) {
   fillFacts(byId('message-facts'), [['Reason', code], ['Request', problem.request_id ?? null]]);
 }
 
-function showPhases(current) {
-  const at = PHASES.indexOf(current);
-  byId('phases').replaceChildren(...PHASES.map((phase, i) => {
+function showPhases(phases, current) {
+  const at = phases.indexOf(current);
+  byId('phases').replaceChildren(...phases.map((phase, i) => {
     const state = i < at ? 'done' : i === at ? 'now' : 'next';
     const item = el('li', { 'data-state': state }, words(phase));
     if (state === 'now') item.setAttribute('aria-current', 'step');

@@ -14,8 +14,8 @@ const FIELD_OF_VIEW = 36;
 
 export class Viewer {
   /** Throws when the browser offers no WebGL 2. */
-  constructor(canvas, gizmoRoot) {
-    this.renderer = rendererFor(canvas);
+  constructor(canvas, gizmoRoot, { antialias = true } = {}) {
+    this.renderer = rendererFor(canvas, antialias);
     this.camera = new PerspectiveCamera(FIELD_OF_VIEW, 1, 0.01, 1000);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.enableDamping = !prefersStillness();
@@ -29,6 +29,8 @@ export class Viewer {
     this.layers = new Map(); // name -> { object, cloud, tintName }
     this.pointFactor = 1;
     this.pending = 0;
+    this.pixelShare = 1; // of the screen's pixels along each side
+    this.onDraw = () => {};
     this.setUp('z');
     this.controls.addEventListener('change', () => this.invalidate());
     canvas.addEventListener('keydown', (event) => this.key(event));
@@ -46,6 +48,13 @@ export class Viewer {
     this.frame.add(object);
     this.retint();
     this.resizePoints();
+  }
+
+  removeLayer(name) {
+    const layer = this.layers.get(name);
+    if (layer) this.frame.remove(layer.object);
+    this.layers.delete(name);
+    this.invalidate();
   }
 
   layer(name) {
@@ -71,15 +80,15 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Looks at the named layers from the side that is most open. */
-  look(names) {
+  /** Looks at the named layers from the side that is most open; elevation: radians above the horizon. */
+  look(names, elevation = undefined) {
     const box = this.boundsOf(names);
     if (box.isEmpty()) return;
     this.looking = names;
     const sphere = box.getBoundingSphere(new Sphere());
     const scene = this.layers.get('scene');
-    const positions = scene?.cloud?.geometry.getAttribute('position') ?? { count: 0 };
-    frameSphere(this.camera, this.controls, sphere, clearestDirection(sphere, positions, this.frame.matrixWorld));
+    const positions = (scene?.cloud?.samples ?? scene?.cloud?.geometry)?.getAttribute('position') ?? { count: 0 };
+    frameSphere(this.camera, this.controls, sphere, clearestDirection(sphere, positions, this.frame.matrixWorld, elevation));
     this.settleFloor();
     this.invalidate();
   }
@@ -129,11 +138,17 @@ export class Viewer {
   resize() {
     const { clientWidth, clientHeight } = this.renderer.domElement;
     if (!clientWidth || !clientHeight) return;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2) * this.pixelShare);
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
     this.resizePoints();
+  }
+
+  setPixelShare(share) {
+    if (share === this.pixelShare) return;
+    this.pixelShare = share;
+    this.resize();
   }
 
   resizePoints() {
@@ -144,6 +159,15 @@ export class Viewer {
     this.invalidate();
   }
 
+  /** Milliseconds that one frame takes to be drawn to its end. */
+  timeFrame() {
+    const began = performance.now();
+    this.renderer.render(this.root, this.camera);
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // waits for the drawing, which `finish` need not
+    return performance.now() - began;
+  }
+
   /** Draws once, with the next frame of the display. */
   invalidate() {
     if (this.pending) return;
@@ -152,13 +176,14 @@ export class Viewer {
       this.controls.update(); // asks for another frame through 'change' while the motion settles
       this.settleClipping();
       this.renderer.render(this.root, this.camera);
+      this.onDraw();
       this.gizmo.turn(this.camera, this.frame.getWorldQuaternion(new Quaternion()));
     });
   }
 }
 
-function rendererFor(canvas) {
-  const context = canvas.getContext('webgl2', { antialias: true, alpha: true });
+function rendererFor(canvas, antialias) {
+  const context = canvas.getContext('webgl2', { antialias, alpha: true });
   if (!context) throw new Error('This browser offers no WebGL 2. The numbers and the downloads do without it.');
-  return new WebGLRenderer({ canvas, context, antialias: true, alpha: true });
+  return new WebGLRenderer({ canvas, context, antialias, alpha: true });
 }

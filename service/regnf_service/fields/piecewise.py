@@ -1,0 +1,106 @@
+"""An upload in pieces: each is stored on its own, and the last one makes the field, as if all had come at once."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from regnf_core.importing.containers.sniff import HEAD_BYTES
+from regnf_service.bytes_under_way import Claim
+from regnf_service.concurrency import in_thread
+from regnf_service.fields.ingest import Beside, StoredUpload, held_field, store_upload
+from regnf_service.fields.uploads import Received, Upload, closing, open_upload
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
+from regnf_state.pieces import MOST_PIECES
+
+
+@dataclass(frozen=True)
+class PieceRange:
+    """Bytes ``first`` to ``end`` - 1 of a file of ``total`` bytes. Both None: no bytes, `bytes */total`."""
+
+    first: int | None
+    end: int | None
+    total: int
+
+    @property
+    def length(self) -> int:
+        """How many bytes the body must have."""
+        return 0 if self.first is None or self.end is None else self.end - self.first
+
+
+class PieceUpload(Upload):
+    """One piece. Only the file's beginning shows whether it can be a field."""
+
+    def __init__(self, services: Services, claim: Claim, piece: PieceRange) -> None:
+        super().__init__(services.blobs, piece.length, services.upload_limiter, claim)
+        self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
+
+
+async def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange) -> None:
+    """Refuse a piece before it comes. Raises Problem UPLOAD_OFFSET_MISMATCH, TOO_MANY_PIECES."""
+    found = await in_thread(services.pieces.find, caller, sha256)
+    if piece.first is None:
+        return
+    if piece.first != found.offset:
+        raise _at("UPLOAD_OFFSET_MISMATCH", found.offset)
+    if found.pieces >= MOST_PIECES:
+        raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.", headers=CLOSE)
+
+
+@asynccontextmanager
+async def open_piece(services: Services, claim: Claim, piece: PieceRange) -> AsyncIterator[PieceUpload]:
+    """Takes one piece's bytes into the blob store."""
+    upload = PieceUpload(services, claim, piece)
+    async with closing(upload):
+        yield upload
+
+
+async def keep_piece(
+    services: Services, caller: str, sha256: str, piece: PieceRange, upload: Upload, received: Received
+) -> None:
+    """Store a piece that has arrived whole. Raises Problem UPLOAD_INCOMPLETE."""
+    if received.bytes != piece.length or piece.first is None:
+        raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.", headers=CLOSE)
+    await in_thread(services.pieces.make_room, caller, sha256, piece.first + received.bytes)
+    await upload.commit(services.pieces.key(caller, sha256, piece.first))
+
+
+async def finish_pieces(services: Services, caller: str, sha256: str, beside: Beside | None = None) -> StoredUpload:
+    """Make the field of the pieces, which then go.
+
+    Raises Problem DIGEST_MISMATCH, UPLOAD_NOT_FINISHED where no piece is held, and what ``store_upload`` raises.
+    """
+    with services.under_way.claim(caller, None, None) as claim:
+        async with open_upload(services, claim) as upload:
+            blocks = services.pieces.blocks(caller, sha256)
+            while (block := await in_thread(next, blocks, b"")) != b"":
+                await upload.feed(block)
+            if not claim.arrived:
+                raise _at("UPLOAD_NOT_FINISHED", 0)
+            received = await upload.finish()
+            if received.sha256 != sha256:
+                if beside is None:  # with what goes beside it, the last piece may not be here yet
+                    await in_thread(services.pieces.drop, caller, sha256)
+                raise Problem("DIGEST_MISMATCH")
+            taken = await store_upload(services, caller, upload, received, beside)
+    await in_thread(services.pieces.drop, caller, sha256)
+    return taken
+
+
+async def arrived(services: Services, caller: str, sha256: str) -> int:
+    """How many bytes of an upload have arrived."""
+    return (await in_thread(services.pieces.find, caller, sha256)).offset
+
+
+async def held(services: Services, caller: str, sha256: str) -> StoredUpload | None:
+    """The field, if the caller has it already: then no piece is needed."""
+    known = await in_thread(held_field, services, caller, sha256)
+    return None if known is None else StoredUpload(known, created=False)
+
+
+def _at(reason: str, offset: int) -> Problem:
+    extra: dict[str, Any] = {"offset": offset}
+    return Problem(reason, extra=extra, headers={"Upload-Offset": str(offset), **CLOSE})

@@ -1,0 +1,198 @@
+"""/library: objects by name, with tags, unit, note and symmetry."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, BinaryIO
+
+from fastapi import APIRouter, Path, Query
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+
+from regnf_core.library_entries import MAX_NAME, MAX_TAG, EntryNotes
+from regnf_service.concurrency import blocking, in_thread
+from regnf_service.http import body
+from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep
+from regnf_service.http.page_requests import wants_page
+from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.parsing import read_body
+from regnf_service.http.routes.documentation import BINARY, JSON, header, refusals
+from regnf_service.http.routes.pages import HTML, page
+from regnf_service.http.schemas.library import (
+    EntryChange,
+    EntryDocument,
+    EntryPage,
+    NewEntry,
+    SaidSymmetry,
+    entry_document,
+)
+from regnf_service.http.schemas.references import reference
+from regnf_service.library import add_entry, change_entry, find_entry, remove_entry
+from regnf_service.problem import CLOSE, Problem
+from regnf_service.services import Services
+from regnf_state.library import LibraryEntry
+from regnf_state.ownership import sha256_of
+
+router = APIRouter(tags=["library"])
+_BLOCK_BYTES = 256 * 1024
+_PATCHES = (JSON, "application/merge-patch+json")
+_BODY_REFUSALS = (
+    "INVALID_HEADER",
+    "MALFORMED_JSON",
+    "UPLOAD_INCOMPLETE",
+    "UPLOAD_STALLED",
+    "REQUEST_TOO_LARGE",
+    "UNSUPPORTED_MEDIA_TYPE",
+    "INVALID_REQUEST",
+    "CONFLICT",
+    "LIBRARY_NAME_TAKEN",
+)
+NamePath = Annotated[str, Path(description="Of the entry.", max_length=4 * MAX_NAME)]
+
+
+@router.get(
+    "/library",
+    summary="The library's entries, the one added last first",
+    response_model=EntryPage,
+    responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
+)
+@blocking
+def list_library(
+    request: Request,
+    services: ServicesDep,
+    caller: CallerDep,
+    prefix: PrefixDep,
+    limit: LimitQuery = 50,
+    page_token: PageTokenQuery = None,
+    tag: Annotated[str | None, Query(max_length=MAX_TAG, description="Only entries with this tag.")] = None,
+    name: Annotated[str | None, Query(max_length=MAX_NAME, description="Only those with this in their names.")] = None,
+) -> Response:
+    """A page may be short or empty and not be the last: go on while there is a `next_page_token`.
+
+    A browser gets a page, which needs no token.
+    """
+    if wants_page(request.scope):
+        return page("library.html")
+    found = services.records.list_entries(caller, tag, name, limit, decode_token(page_token))
+    entries = [entry for field in found.records if (entry := LibraryEntry.of(field)) is not None]
+    documents = [entry_document(entry, prefix) for entry in entries]
+    return JSONResponse({"entries": documents, "next_page_token": encode_token(found.rest)}, headers={"Vary": "Accept"})
+
+
+@router.post(
+    "/library",
+    summary="Make a field an entry of the library",
+    response_model=EntryDocument,
+    status_code=201,
+    responses={
+        200: {"description": "It was one, and says the same.", "model": EntryDocument},
+        201: {"headers": {"Location": header("The entry.")}},
+        **refusals(*_BODY_REFUSALS, "FIELD_NOT_FOUND", "FIELD_REJECTED", "FIELD_IN_LIBRARY", "QUOTA_WORKER_SECONDS"),
+    },
+    openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(NewEntry)}}}},
+)
+async def post_library(request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
+    """A field has one entry at most, under a name of the caller's choice. The field may still be `validating`.
+
+    A worker then makes the object's model, with the signature that searches compare, and looks for its symmetry.
+    """
+    if body.media_type(request) != JSON:
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
+    asked = await read_body(services, NewEntry, await body.read_small(request, services.settings))
+    notes = EntryNotes.checked(asked.name, asked.tags, asked.unit, asked.note, _plain(asked.symmetry))
+    entry, created = await in_thread(add_entry, services, caller, asked.field, notes)
+    document = entry_document(entry, prefix)
+    headers = {"Location": document["links"]["self"]}
+    return JSONResponse(document, status_code=201 if created else 200, headers=headers)
+
+
+@router.get(
+    "/library/{name}",
+    summary="An entry of the library",
+    response_model=EntryDocument,
+    responses=refusals("LIBRARY_ENTRY_NOT_FOUND"),
+)
+@blocking
+def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
+    """Its picture and its mesh are those of its field."""
+    return JSONResponse(entry_document(find_entry(services, caller, name), prefix))
+
+
+@router.patch(
+    "/library/{name}",
+    summary="Change an entry",
+    response_model=EntryDocument,
+    responses=refusals(*_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND"),
+    openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(EntryChange)}}}},
+)
+async def patch_library_entry(
+    name: NamePath, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
+) -> JSONResponse:
+    """What is left out stays; null takes a unit, a note or a symmetry back, and all tags with `[]` (RFC 7396)."""
+    if body.media_type(request) not in _PATCHES:
+        raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
+    change = await read_body(services, EntryChange, await body.read_small(request, services.settings))
+    entry = await in_thread(_changed, services, caller, name, change)
+    return JSONResponse(entry_document(entry, prefix))
+
+
+def _changed(services: Services, caller: str, name: str, change: EntryChange) -> LibraryEntry:
+    said = change.model_dump(exclude_unset=True)
+    if said.get("name", name) is None:
+        del said["name"]
+    notes = EntryNotes.checked(**(find_entry(services, caller, name).notes.to_dict() | said))
+    return change_entry(services, caller, name, notes)
+
+
+@router.delete(
+    "/library/{name}",
+    summary="Take an entry out of the library",
+    status_code=204,
+    response_class=Response,
+    responses=refusals("LIBRARY_ENTRY_NOT_FOUND", "CONFLICT"),
+)
+@blocking
+def delete_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
+    """Its field stays: `DELETE /fields/{sha256}` forgets that."""
+    remove_entry(services, caller, name)
+    return Response(status_code=204)
+
+
+@router.get(
+    "/library/{name}/file",
+    summary="An entry's field as a safe field file",
+    response_class=StreamingResponse,
+    responses={
+        200: {"description": "It can be uploaded anywhere.", "content": {"application/octet-stream": BINARY}},
+        **refusals("LIBRARY_ENTRY_NOT_FOUND", "FIELD_VALIDATING"),
+    },
+)
+async def get_library_file(name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
+    """What the import made of the upload (docs/safe-format.md): libraries are carried elsewhere with it."""
+    file, size, digest = await in_thread(_open, services, caller, name)
+    headers = {"Content-Length": str(size), "Content-Disposition": f'attachment; filename="{digest}.safetensors"'}
+    return StreamingResponse(_blocks(file), media_type="application/octet-stream", headers=headers)
+
+
+def _open(services: Services, caller: str, name: str) -> tuple[BinaryIO, int, str]:
+    field = find_entry(services, caller, name).field
+    key = f"fields/{field.sha256}/field.safetensors"
+    if field.state != "ready":
+        raise Problem("FIELD_VALIDATING")
+    try:
+        return services.blobs.open(key), services.blobs.size(key), sha256_of(field.sha256)
+    except FileNotFoundError as error:
+        raise Problem("LIBRARY_ENTRY_NOT_FOUND") from error
+
+
+async def _blocks(file: BinaryIO) -> AsyncIterator[bytes]:
+    """The file's bytes, a block at a time, each read in a thread."""
+    try:
+        while block := await in_thread(file.read, _BLOCK_BYTES):
+            yield block
+    finally:
+        file.close()
+
+
+def _plain(said: SaidSymmetry | None) -> dict[str, Any] | None:
+    return None if said is None else said.model_dump()

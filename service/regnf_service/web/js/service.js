@@ -1,0 +1,103 @@
+// The service as the home page and the lists use it. Every address is below the root of the page's own address.
+
+import { ApiProblem, JobApi, TOKEN_KEY, problemOf } from './api.js';
+import { bytes } from './format.js';
+import { patientFetch } from './patience.js';
+
+const FOLLOW_S = 20;
+
+export class Service {
+  /** onToken() is asked for a token, as a promise, whenever the service wants one. */
+  constructor(onToken) {
+    this.root = /^\/v1(\/|$)/.test(location.pathname) ? '/v1' : '';
+    this.onToken = onToken;
+  }
+
+  get token() {
+    return sessionStorage.getItem(TOKEN_KEY);
+  }
+
+  job(id) {
+    return new JobApi(`${this.root}/jobs/${encodeURIComponent(id)}`);
+  }
+
+  /** A successful response; everything else becomes an ApiProblem. A 401 asks for the token and tries again. */
+  async request(path, options = {}) {
+    for (;;) {
+      const { headers = {}, ...rest } = options;
+      const authorized = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
+      const response = await patientFetch(this.root + path, { cache: 'no-cache', ...rest, headers: { Accept: '*/*', ...authorized } });
+      if (response.ok) return response;
+      if (response.status !== 401) throw new ApiProblem(response.status, await problemOf(response));
+      sessionStorage.setItem(TOKEN_KEY, await this.onToken());
+    }
+  }
+
+  async json(path, options) {
+    return (await this.request(path, options)).json();
+  }
+
+  async post(path, body) {
+    const options = { method: 'POST', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body) };
+    return this.json(path, options);
+  }
+
+  /** The field's document, or null where there is none. */
+  async field(sha256, wait = 0) {
+    try {
+      return await this.json(`/fields/${sha256}${wait ? `?wait=${wait}` : ''}`);
+    } catch (error) {
+      if (error.status === 404) return null;
+      throw error;
+    }
+  }
+
+  /** The field's document once its import has ended. */
+  async imported(sha256) {
+    for (;;) {
+      const field = await this.field(sha256, FOLLOW_S);
+      if (!field || field.state !== 'validating') return field;
+    }
+  }
+
+  /** All of a list, at most `most`: name is fields, jobs or library. */
+  async all(name, most = 400) {
+    const found = [];
+    let page = '';
+    do {
+      const document = await this.json(`/${name}?limit=200${page}`);
+      found.push(...(document[name] ?? document.entries));
+      page = document.next_page_token && `&page_token=${encodeURIComponent(document.next_page_token)}`;
+    } while (page && found.length < most);
+    return found;
+  }
+
+  /** The field's surface as GLB; detail is fine or coarse. */
+  async mesh(sha256, detail) {
+    return (await this.request(`/fields/${sha256}/mesh.glb?detail=${detail}`, { cache: 'default' })).arrayBuffer();
+  }
+
+  async picture(sha256) {
+    return (await this.request(`/fields/${sha256}/preview.png`, { cache: 'default' })).blob();
+  }
+
+  /** Sends a file with its description; onProgress hears the share and words for it. The field's document. */
+  upload(file, description, onProgress) {
+    const form = new FormData();
+    form.append('description', JSON.stringify(description));
+    form.append('file', file, file.name);
+    return new Promise((resolve, reject) => {
+      const request = new XMLHttpRequest(); // fetch tells nothing of what it has sent
+      request.open('POST', `${this.root}/fields`);
+      if (this.token) request.setRequestHeader('Authorization', `Bearer ${this.token}`);
+      request.responseType = 'json';
+      request.upload.onprogress = ({ loaded, total }) => onProgress(loaded / total, `${bytes(loaded)} of ${bytes(total)}`);
+      request.onload = () => {
+        if (request.status < 300) resolve(request.response);
+        else reject(new ApiProblem(request.status, request.response ?? {}));
+      };
+      request.onerror = () => reject(new ApiProblem(0, { detail: 'The connection broke. Send the file again.' }));
+      request.send(form);
+    });
+  }
+}
