@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
@@ -14,16 +16,22 @@ EXIT_INTERRUPTED = 130
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
+_PAGE = re.compile(r"\bdocs/([a-z0-9/-]+)\.md\b")
 
 
 def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None = None) -> int:
     """Say on stderr what went wrong, and what to do next; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
-    err.print(message, markup=False, soft_wrap=True)
+    err.print(_with_commands(message), markup=False, soft_wrap=True)
     if hint:
         err.print("[bold]hint:[/] ", end="")
-        err.print(hint, markup=False, soft_wrap=True)
+        err.print(_with_commands(hint), markup=False, soft_wrap=True)
     return code
+
+
+def _with_commands(text: str) -> str:
+    """Pages of the manual by the command that prints them: an installed regnf has no folder docs."""
+    return _PAGE.sub(r"`regnf manual \1`", text)
 
 
 def phase_progress() -> Progress:

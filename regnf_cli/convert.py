@@ -22,7 +22,8 @@ from regnf_core.field_source import FieldSource
 
 _SUFFIXES = (".safetensors", ".glb", ".ply", ".npz")
 _GRID_MOST = 1024
-
+_IMPORTING = "importing"
+_FOLLOWING = "importing, and following the rays of the cameras: a minute for some hundred images"
 
 Resolution = Annotated[
     int, typer.Option(min=2, max=_GRID_MOST, help="Cells along the longest edge, for meshes and grids.")
@@ -76,7 +77,12 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
-        with err.status("importing"), source.naming(), source.packed_settings() as settings, _packed(cameras) as stood:
+        with (
+            err.status(_IMPORTING if cameras is None else _FOLLOWING),
+            source.naming(),
+            source.packed_settings() as settings,
+            _packed(cameras) as stood,
+        ):
             said = source.description or None
             report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings, cameras=stood)
         if images is not None:

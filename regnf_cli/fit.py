@@ -29,7 +29,7 @@ from regnf_cli.fit_options import (
     TableLog2,
 )
 from regnf_cli.options import Seed
-from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.errors import InvalidOptionsError
 
 _LONGEST_LABEL = 200  # of the safe format
 _OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto)
@@ -81,26 +81,14 @@ def fit(
 def _fit_mesh(
     mesh: Path, output: Path, settings: dict[str, Any], table_log2: int, extent: float | None, rest: dict[str, Any]
 ) -> None:
-    import numpy as np
-
-    from regnf_core.fields.mesh import MeshField
+    from regnf_fit.mesh.file import mesh_target
     from regnf_fit.mesh.fit import fit_field
     from regnf_fit.mesh.options import FitOptions
 
     options = FitOptions(**settings)
     options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
-    target = MeshField.load(mesh)
-    source: dict[str, Any] = {"mesh": mesh.name}
-    if extent is not None:
-        low, high = target.bounds.numpy()
-        if not (high > low).any():
-            raise InvalidInputError("the mesh is a single point", reason="NO_SURFACE_IN_TARGET")
-        T_field_mesh = np.eye(4)
-        T_field_mesh[:3, :3] *= extent / (high - low).max()
-        T_field_mesh[:3, 3] = -T_field_mesh[0, 0] * (low + high) / 2
-        target = target.transformed(T_field_mesh)
-        source["T_field_mesh"] = T_field_mesh.tolist()
-    _fit_with_bar(fit_field, target, output, options, rest | {"source": source})
+    target = mesh_target(mesh, extent)
+    _fit_with_bar(fit_field, target.field, output, options, rest | {"source": target.source})
 
 
 def _check(output: Path, extent: float | None, label: str | None) -> None:

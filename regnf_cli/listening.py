@@ -8,6 +8,7 @@ import logging
 import socket
 
 from regnf_cli.start_errors import StartError
+from regnf_service.http.cross_origin import cors_origins
 from regnf_service.http.hosts import HostsError, allowed_hosts
 from regnf_service.tokens import TokensError, read_callers
 from regnf_service.webhooks.signing import read_secrets
@@ -17,7 +18,10 @@ from regnf_state.settings import Settings
 _BACKLOG = 2048
 _TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
 
-_HOSTS_HINT = 'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"].'
+_HOSTS_HINT = (
+    'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"], and'
+    ' REGNF_CORS_ORIGINS likewise: ["https://app.example.org"].'
+)
 logger = logging.getLogger(__name__)
 
 
@@ -41,6 +45,7 @@ def check_access(settings: Settings) -> None:
         raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
     try:
         allowed_hosts(settings)
+        cors_origins(settings)
     except HostsError as error:
         raise StartError(str(error), reason=error.reason, hint=_HOSTS_HINT) from error
     if not settings.is_private and not settings.allowed_hosts:

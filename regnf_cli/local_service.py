@@ -18,18 +18,20 @@ _LISTENING = "0A"  # in /proc/net/tcp
 
 
 @contextmanager
-def running_service(state_dir: Path, **settings: object) -> Iterator[str]:
+def running_service(state_dir: Path, checkout: Path | None = None, **settings: object) -> Iterator[str]:
     """Start `regnf serve` with its state under ``state_dir``; yields its address.
 
-    ``settings`` are those of the service by name; REGNF_* of this process' environment are not passed on.
-    Its log is ``state_dir``/serve.log. Raises RuntimeError when it does not listen within half a minute.
+    ``checkout`` may name another checkout, whose `.venv` is used. ``settings`` are those of the service by name; the
+    REGNF_* of this process' environment are not passed on. Its log is ``state_dir``/serve.log.
+    Raises RuntimeError when it does not listen within half a minute.
     """
     state_dir.mkdir(parents=True, exist_ok=True)
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("REGNF_", "PYTHONPATH"))}
     environment |= {f"REGNF_{name.upper()}": str(value) for name, value in settings.items()}
-    command = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir)]
+    python = sys.executable if checkout is None else str(checkout / ".venv" / "bin" / "python")
+    command = [python, "-m", "regnf_cli.main", "serve", "--port", "0", "--state-dir", str(state_dir)]
     with (state_dir / "serve.log").open("w") as log:
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment)
+        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment, cwd=checkout)
     try:
         yield _address(server)
     finally:

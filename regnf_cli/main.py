@@ -1,4 +1,4 @@
-"""The command ``regnf``: gathers the sub-commands and turns errors into exit codes.
+"""The command ``regnf``: runs the sub-command that is asked for and turns errors into exit codes.
 
 Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable · 130 interrupted.
 """
@@ -8,49 +8,17 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from typing import Annotated, cast
+from typing import cast
 
 import typer
 
-from regnf_cli.candidates import show_candidates
+from regnf_cli.commands import COMMANDS, GROUPS, app_of
 from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNAVAILABLE, fail
-from regnf_cli.convert import convert
-from regnf_cli.demo import demo
-from regnf_cli.fit import fit
-from regnf_cli.inspect import inspect
-from regnf_cli.register import register
-from regnf_cli.render_dataset import render_dataset
-from regnf_cli.search import search
-from regnf_cli.serve import serve
 from regnf_cli.usage import usage_fault
-from regnf_cli.worker import worker
-from regnf_core import __version__
 from regnf_core.errors import RegnfError
 
 _UsageError = cast(type[Exception], typer.BadParameter.__mro__[1])
 """What typer raises for arguments that it cannot use; it does not export the name."""
-app = typer.Typer(
-    name="regnf",
-    help="Register neural signed distance fields: find where a known object stands in a scanned room.",
-    epilog="Exit codes: 0 registered or done, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable.",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-)
-
-
-@app.callback(invoke_without_command=True)
-def root(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.", is_eager=True)] = False,
-) -> None:
-    if version:
-        typer.echo(__version__)
-        raise typer.Exit
-
-
-for command in (demo, register, search, serve, worker, inspect, convert, fit):
-    app.command(command.__name__)(command)
-app.command("render-dataset")(render_dataset)
 
 
 def main() -> None:
@@ -62,6 +30,8 @@ def main() -> None:
 
 def _run() -> int:
     """Run the command that the arguments name; the exit code. Errors of users take two lines."""
+    asked = sys.argv[1:2]
+    app = app_of(asked) if set(asked) & {*COMMANDS, *GROUPS} else app_of()
     try:
         code = app(standalone_mode=False)
         return code if isinstance(code, int) else 0
@@ -71,6 +41,8 @@ def _run() -> int:
         return EXIT_INTERRUPTED
     except RegnfError as error:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
+        from regnf_cli.candidates import show_candidates
+
         fail(error.reason, str(error), code, error.hint)
         show_candidates(error)
         return code

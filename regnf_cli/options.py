@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from regnf_cli.field_options import CONFIG, DESCRIPTION
-from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT
+from regnf_cli.paths import FIELD, JSON_FILE, OUTPUT, RECORDING
 
 # a field by itself
 
@@ -48,6 +48,10 @@ SceneDescription = Annotated[
 
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1)]
 Output = Annotated[Path | None, typer.Option(help="Folder for the result, point clouds and pictures.", **OUTPUT)]
+Recording = Annotated[
+    Path | None,
+    typer.Option(help="File (.rrd) for a recording to look at in the viewer of rerun. Needs its extra.", **RECORDING),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the whole result document.")]
 
 # a service elsewhere

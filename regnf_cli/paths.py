@@ -8,6 +8,7 @@ from typing import Any
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_files import require_field_file, require_file
 from regnf_core.field_source import find_source
+from regnf_core.files import RECORDING_SUFFIX, new_file
 
 
 def field_path(text: str) -> Path:
@@ -60,11 +61,22 @@ def output_folder(text: str) -> Path:
             break
         if place.exists():
             message = f"{place}: a file, expected a folder to write into"
-            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder with --output.")
+            raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder.")
     return path
+
+
+def recording_file(text: str) -> Path:
+    """The path of a recording to write, whose folder may not be there yet.
+
+    Raises InvalidOptionsError for a name of something else, InvalidInputError (FILE_IS_FOLDER, FILE_IS_NO_FOLDER).
+    """
+    path = Path(text)
+    output_folder(str(path.parent))
+    return new_file(path, RECORDING_SUFFIX)
 
 
 FIELD: dict[str, Any] = {"parser": field_path, "metavar": "FIELD"}
 JSON_FILE: dict[str, Any] = {"parser": file, "metavar": "FILE"}
 OUTPUT: dict[str, Any] = {"parser": output_folder, "metavar": "FOLDER"}
+RECORDING: dict[str, Any] = {"parser": recording_file, "metavar": "FILE"}
 """How options and arguments of these kinds are declared."""

@@ -17,6 +17,7 @@ from regnf_cli.options import (
     DetectionIndex,
     NoConfigs,
     Output,
+    Recording,
     Scene,
     SceneConfig,
     SceneDescription,
@@ -25,13 +26,13 @@ from regnf_cli.options import (
     Token,
     WorkerTimeout,
 )
-from regnf_cli.output import prepare, write_into
+from regnf_cli.output import Files, tell_files
 from regnf_cli.paths import FIELD, JSON_FILE
 from regnf_cli.report import exit_code, show
 from regnf_cli.request_files import read_detection, read_options, read_transform
 from regnf_cli.scene_file import check_box_by_header, open_scene
 from regnf_core.detections import Detection
-from regnf_core.errors import InvalidInputError
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_source import FieldSource
 from regnf_core.options import Preset, RegistrationOptions
 
@@ -67,6 +68,7 @@ def register(
     truth: Truth = None,
     seed: Seed = 0,
     output: Output = None,
+    recording: Recording = None,
     server: Server = None,
     worker_timeout: WorkerTimeout = 60,
     cancel_on_interrupt: CancelOnInterrupt = False,
@@ -82,14 +84,17 @@ def register(
     box = read_detection(detection, detection_index)
     request = _request(box, read_options(options, preset), seed, initial_transform, truth)
     if server is None:
-        require("engine")
+        require("engine", *(["rerun"] if recording else []))
+    elif recording is not None:
+        hint = "Leave --server out, or look at the page of the job."
+        raise InvalidOptionsError("--recording is for registrations that are done here", hint=hint)
     place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
     thing = source_of(object_, object_description, choice_of(object_config, no_config), "object")
     if place.file.samefile(thing.file):
         err.print(f"warning: scene and object are the same file, {scene}", markup=False, soft_wrap=True)
     check_box_by_header(place.file, box, thing.file)
     if server is None:
-        document = _register_here(place, thing, box, request, output)
+        document = _register_here(place, thing, box, request, Files(output, recording))
     else:
         from regnf_cli.remote import RemoteService
         from regnf_cli.remote_exchange import Delivery, register_remotely
@@ -97,6 +102,7 @@ def register(
         service = RemoteService(server, token, worker_timeout)
         document = register_remotely(service, place, thing, request, Delivery(output, cancel_on_interrupt))
     show(document, as_json)
+    tell_files(output, recording)
     raise typer.Exit(exit_code(document))
 
 
@@ -121,7 +127,7 @@ def _request(
 
 
 def _register_here(
-    scene: FieldSource, object_: FieldSource, detection: Detection, request: dict[str, Any], output: Path | None
+    scene: FieldSource, object_: FieldSource, detection: Detection, request: dict[str, Any], files: Files
 ) -> dict[str, Any]:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
@@ -134,7 +140,7 @@ def _register_here(
     box = OrientedBox.from_detection(detection)
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
-    prepare(output)
+    files.prepare()
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
         opened, obj = open_scene(scene, detection), load_field(object_)
@@ -146,7 +152,7 @@ def _register_here(
             request["seed"],
             lambda phase, share: bar.update(task, description=phase, completed=share),
             WarmStart(T_object_scene=start),
-            clouds=output is not None,
+            clouds=files.wanted,
         )
         bar.update(task, description="exporting", completed=1.0)
     said: dict[str, Any] = {
@@ -154,6 +160,6 @@ def _register_here(
         "object_name": str(object_.named),
         "fields": {"scene": opened.notes, "object": obj.notes},
     }
-    write_into(output, result, **said)
+    files.write(result, box, **said)
     document: dict[str, Any] = result_document(result, **said)
     return document

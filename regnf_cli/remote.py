@@ -12,8 +12,9 @@ from typing import Any
 import httpx
 
 from regnf_cli.patient_client import PatientClient
-from regnf_cli.remote_errors import ServiceError, checked, checked_address, service_error
-from regnf_cli.worker_watch import WorkerWatch
+from regnf_cli.remote_errors import checked, service_error
+from regnf_client.errors import ServiceError, checked_address
+from regnf_client.worker_watch import WorkerWatch, worker_lives
 from regnf_core.field_source import FieldSource
 from regnf_core.importing.upload_description import UploadDescription
 
@@ -37,7 +38,7 @@ class RemoteService:
         checked_address(address)
         self.address = address.rstrip("/")
         self._http = PatientClient(base_url=self.address, headers=headers, timeout=httpx.Timeout(60.0, connect=5.0))
-        self._watch = WorkerWatch(self._worker_lives, worker_timeout_s)
+        self._watch = WorkerWatch(worker_timeout_s)
 
     def __enter__(self) -> RemoteService:
         return self
@@ -45,13 +46,15 @@ class RemoteService:
     def __exit__(self, *_: object) -> None:
         self._http.close()
 
-    def _worker_lives(self) -> bool:
-        """As far as the service says; one that says nothing of it is taken to have one."""
+    def _look_for_worker(self) -> None:
+        """Raises NoWorkerError once the service has had none for too long."""
+        if not self._watch.due:
+            return
         try:
-            checks = self._http.get("/readyz").json()["checks"]
-            return checks["worker"] is not False
-        except (KeyError, TypeError, ValueError):
-            return True
+            readiness = self._http.get("/readyz").json()
+        except ValueError:
+            readiness = None
+        self._watch.saw(worker_lives(readiness))
 
     def upload_field(self, field: FieldSource | Path, report: Report = lambda phase, share: None) -> str:
         """Send a field unless the service holds it; returns its SHA-256 once the service has found it good."""
@@ -96,7 +99,18 @@ class RemoteService:
                 return
             if document["state"] == "rejected":
                 raise service_error(document.get("error") or {})
-            self._watch.look()
+            self._look_for_worker()
+
+    def library(self) -> Iterator[dict[str, Any]]:
+        """The entries of the caller's library."""
+        token: str | None = None
+        while True:
+            params = {"limit": "200"} | ({} if token is None else {"page_token": token})
+            page = checked(self._http.get("/library", params=params))
+            yield from page["entries"]
+            token = page["next_page_token"]
+            if token is None:
+                return
 
     def submit(self, request: dict[str, Any]) -> dict[str, Any]:
         """POST /register; returns the job document."""
@@ -109,7 +123,7 @@ class RemoteService:
             report(job.get("phase") or job["status"], job.get("progress") or 0.0)
             if job["status"] in _FINISHED:
                 return job
-            self._watch.look()
+            self._look_for_worker()
             checked(self._http.get(f"/jobs/{job_id}", params={"wait": 1}))
 
     def cancel(self, job_id: str) -> None:

@@ -13,7 +13,8 @@ from rich.progress import Progress
 
 from regnf_cli.console import err, phase_progress
 from regnf_cli.remote import RemoteService, Report
-from regnf_cli.remote_errors import ServiceError, unreachable
+from regnf_cli.remote_errors import unreachable
+from regnf_client.errors import ServiceError
 from regnf_core.field_candidates import Said
 from regnf_core.field_source import FieldSource
 
@@ -65,6 +66,23 @@ def search_remotely(
     document = _exchange(service, upload, request, delivery)
     for place in (document, *document["candidates"]):
         place["object"] = str(files[place["object"]].named)
+    return document
+
+
+def search_its_library(
+    service: RemoteService, scene: FieldSource, tag: str | None, request: dict[str, Any], delivery: Delivery
+) -> dict[str, Any]:
+    """The same among the entries of the caller's library at the service, which the document names."""
+    names: dict[str, str] = {}
+
+    def upload(report: Report) -> dict[str, Any]:
+        names.update({one["field"]: one["name"] for one in service.library()})
+        wanted = {} if tag is None else {"tags": [tag]}
+        return {"scene": _sent(service, scene, report), "candidates": {"library": wanted}}
+
+    document = _exchange(service, upload, request, delivery)
+    for place in (document, *document["candidates"]):
+        place["object"] = names.get(place["object"], place["object"])
     return document
 
 

@@ -34,6 +34,14 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
     return value
 
 
+def read_list(path: Path, what: str) -> list[Any]:
+    """A JSON list from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
+    value = _read_json(path, what)
+    if not isinstance(value, list):
+        raise InvalidInputError(f"{what} {path}: expected a JSON list", reason="MALFORMED_JSON", hint="Write [...].")
+    return value
+
+
 def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
     """Plain options: those of a file, or none, with the preset that was asked for by name.
 

@@ -12,6 +12,7 @@ import typer
 from regnf_cli.console import phase_progress
 from regnf_cli.extras import require
 from regnf_cli.field_options import CONFIG, DESCRIPTION, choice_of, source_of
+from regnf_cli.library_objects import objects_of
 from regnf_cli.options import (
     AsJson,
     CancelOnInterrupt,
@@ -27,29 +28,29 @@ from regnf_cli.options import (
     Token,
     WorkerTimeout,
 )
-from regnf_cli.output import prepare, write_into
+from regnf_cli.output import prepare, tell_files, write_into
 from regnf_cli.paths import JSON_FILE, library_path
 from regnf_cli.report import exit_code, show
 from regnf_cli.request_files import read_detection, read_options
 from regnf_cli.scene_file import check_box_by_header, open_scene
 from regnf_core.detections import Detection
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.field_files import checkpoint_below
 from regnf_core.field_source import FieldSource
-from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.options import RegistrationOptions, RobustOptions
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
     from regnf_core.library import LibraryObject
 
-_MOST = 512
-
-
 Library = Annotated[
-    list[Path],
-    typer.Argument(help="Folders of fields, or fields: the objects.", parser=library_path, metavar="LIBRARY..."),
+    list[Path] | None,
+    typer.Argument(
+        help="Libraries, folders of fields, or fields: the objects. Without any, your library.",
+        parser=library_path,
+        metavar="[LIBRARY]...",
+    ),
 ]
+Tag = Annotated[str | None, typer.Option(help="Of libraries, only the entries with this tag.")]
 Top = Annotated[int, typer.Option(min=1, help="How many of the likeliest to print.")]
 Options = Annotated[Path | None, typer.Option(help="JSON: options of the preset robust.", **JSON_FILE)]
 ObjectConfig = Annotated[Path | None, typer.Option(help="The same of every object.", **CONFIG)]
@@ -58,8 +59,9 @@ ObjectDescription = Annotated[dict[str, Any] | None, typer.Option(help="The same
 
 def search(
     scene: Scene,
-    library: Library,
     detection: DetectionFile,
+    library: Library = None,
+    tag: Tag = None,
     detection_index: DetectionIndex = None,
     top: Top = 5,
     options: Options = None,
@@ -78,7 +80,8 @@ def search(
 ) -> None:
     """Find which object of a library stands in the box, and where.
 
-    Example: **regnf search room.ckpt chairs/ --detection box.json --top 3**
+    Example: **regnf search room.ckpt chairs/ --detection box.json --top 3**, or of your library
+    **regnf search room.ckpt --tag seat --detection box.json**
 
     Exit codes: 0 registered, 4 ambiguous, 1 rejected (none of them fits), 2 bad input, 3 service unavailable.
     """
@@ -87,17 +90,21 @@ def search(
     place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
     check_box_by_header(place.file, box)
     settings = choice_of(object_config, no_config)
-    objects = [source_of(path, object_description, settings, "object") for path in library_files(library)]
+    objects = [] if server and not library else list(objects_of(library, tag, object_description, settings))
     if server is None:
         require("engine")
         document = _search_here(place, objects, box, request, output)
     else:
         from regnf_cli.remote import RemoteService
-        from regnf_cli.remote_exchange import Delivery, search_remotely
+        from regnf_cli.remote_exchange import Delivery, search_its_library, search_remotely
 
-        service = RemoteService(server, token, worker_timeout)
-        document = search_remotely(service, place, objects, request, Delivery(output, cancel_on_interrupt))
+        service, delivery = RemoteService(server, token, worker_timeout), Delivery(output, cancel_on_interrupt)
+        if library:
+            document = search_remotely(service, place, objects, request, delivery)
+        else:
+            document = search_its_library(service, place, tag, request, delivery)
     show(document, as_json, top)
+    tell_files(output)
     raise typer.Exit(exit_code(document))
 
 
@@ -111,37 +118,6 @@ def _request(box: Detection, options: Path | None, seed: int) -> dict[str, Any]:
     return request
 
 
-def library_files(named: list[Path]) -> list[Path]:
-    """The files named, and those of the folders named that look like fields, each once, in order.
-
-    Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE).
-    """
-    files: dict[Path, Path] = {}
-    for path in named:
-        for file in _fields_in(path) if path.is_dir() else [path]:
-            files.setdefault(file.resolve(), file)
-    if not files:
-        message = f"{', '.join(map(str, named))}: no fields in it, expected safe fields, checkpoints or meshes"
-        hint = "Give the folder that holds the objects' files; folders inside it are not searched."
-        raise InvalidInputError(message, reason="LIBRARY_EMPTY", hint=hint)
-    if len(files) > _MOST:
-        raise InvalidInputError(f"{len(files)} objects; at most {_MOST} are searched", reason="LIBRARY_TOO_LARGE")
-    return list(files.values())
-
-
-def _fields_in(folder: Path) -> list[Path]:
-    """The fields that lie in a folder; the folder itself where it has none and is a training run's."""
-    found = sorted(filter(_looks_like_a_field, folder.iterdir()))
-    return found if found or checkpoint_below(folder) is None else [folder]
-
-
-def _looks_like_a_field(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return sniff_format(file.read(HEAD_BYTES)) is not None
-
-
 def _field_of(source: FieldSource) -> SdfField:
     from regnf_core.loading import load_field
 
@@ -152,8 +128,8 @@ def _modeled(
     objects: list[FieldSource], options: RobustOptions, progress: Callable[[float], None]
 ) -> tuple[list[LibraryObject], dict[str, str]]:
     """The objects with their models, and of those that are none the reasons, by name. Raises NoSurfaceError: all."""
-    from regnf_cli.object_models import object_model
     from regnf_core.library import LibraryObject
+    from regnf_core.object_models import object_model
 
     library, unusable = [], {}
     for taken, one in enumerate(objects):

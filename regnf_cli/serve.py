@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from regnf_cli.demo_data import demo_folder
 from regnf_cli.extras import require
 
 
@@ -32,6 +33,8 @@ def serve(
     settings = read_settings(host=host, port=port, state_dir=state_dir, workers=workers)
     if settings.workers:
         require("engine")  # a worker starts without it, and then fails every job
+    if settings.demo_dir is None:
+        settings = settings.model_copy(update={"demo_dir": demo_folder()})
     configure_logging(settings.log_format)
     Supervisor(settings).run(ready=lambda address: typer.echo(f"regnf serves {address} (Ctrl+C stops it)"))
 

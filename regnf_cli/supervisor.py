@@ -94,6 +94,8 @@ class Supervisor:
             "REGNF_PORT": str(listener.getsockname()[1]),
             "REGNF_WORKERS": str(self._settings.workers),
         }
+        if self._settings.demo_dir is not None:
+            environment["REGNF_DEMO_DIR"] = str(self._settings.demo_dir)
         descriptor = listener.fileno()
         api = [sys.executable, "-m", "regnf_cli.api_process", str(descriptor)]
         self._api = Child("api", api, environment, lifeline, passed=[descriptor])

@@ -25,6 +25,7 @@ def worker(
     import os
 
     from redis.exceptions import ConnectionError as RedisConnectionError
+    from redis.exceptions import TimeoutError as RedisTimeoutError
 
     from regnf_cli.settings import check_redis_url, read_settings
     from regnf_cli.start_errors import StartError
@@ -44,6 +45,6 @@ def worker(
         raise StartError(message, reason=error.reason, hint=hint) from error
     except (PreloadError, StorageMismatchError) as error:
         raise StartError(str(error), reason=error.reason) from error
-    except RedisConnectionError as error:
+    except (RedisConnectionError, RedisTimeoutError) as error:
         hint = "Start Redis, or check the address in --redis-url or REGNF_REDIS_URL."
         raise StartError(f"Redis does not answer: {error}", reason="REDIS_UNAVAILABLE", hint=hint) from error

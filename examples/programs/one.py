@@ -1,0 +1,7 @@
+import regnf
+
+box = regnf.OrientedBox.from_corners([-0.84, -0.59, -0.50], [-0.29, 0.02, 0.02])
+result = regnf.register("examples/data/mix-room.safetensors", "examples/data/armchair.safetensors", box)
+print(result.verdict, result.scale)
+print(result.matrix)
+result.save("out")

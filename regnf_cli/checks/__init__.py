@@ -1,0 +1,1 @@
+"""What `regnf doctor` looks at, one file a subject."""

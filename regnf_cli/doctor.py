@@ -1,0 +1,71 @@
+"""``regnf doctor``: what is wrong with an installation, and how to mend it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from regnf_cli.checks.finding import Finding
+from regnf_cli.checks.gpu import check_gpu
+from regnf_cli.checks.libraries import check_libraries
+from regnf_cli.console import EXIT_UNAVAILABLE, out
+from regnf_cli.extras import require
+from regnf_core.errors import InvalidInputError, MissingExtraError
+
+_COLORS = {"ok": "green", "warning": "yellow", "error": "bold red"}
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Look at libraries, GPU, Redis, storage, disk, memory, open files and the port, and say how to mend what is wrong.
+
+    The service's settings are read from REGNF_* in the environment.
+
+    Example: **regnf doctor**
+
+    Exit codes: 0 nothing is wrong (there may be warnings), 3 something is.
+    """
+    findings = list(check_all())
+    if as_json:
+        out.print_json(json.dumps([asdict(one) for one in findings]))
+    else:
+        _show(findings)
+    raise typer.Exit(EXIT_UNAVAILABLE if any(one.state == "error" for one in findings) else 0)
+
+
+def check_all() -> Iterator[Finding]:
+    """Everything, in the order in which a user needs it."""
+    yield from check_libraries()
+    yield check_gpu()
+    try:
+        require("service")
+    except MissingExtraError as error:
+        yield Finding("service", "warning", str(error), "Needed to serve, not to register here or to use a service.")
+        return
+    from regnf_cli.checks.machine import check_machine
+    from regnf_cli.checks.stores import check_stores
+    from regnf_cli.settings import read_settings
+
+    try:
+        settings = read_settings()
+    except InvalidInputError as error:
+        yield Finding("settings", "error", str(error), error.hint)
+        return
+    yield from check_stores(settings)
+    yield from check_machine(settings)
+
+
+def _show(findings: list[Finding]) -> None:
+    table = Table(box=None, show_header=False)
+    for one in findings:
+        table.add_row(f"[{_COLORS[one.state]}]{one.state}[/]", one.subject, one.found)
+    out.print(table)
+    for one in findings:
+        if one.hint is not None:
+            out.print(f"{one.subject}: {one.hint}", markup=False, soft_wrap=True)

@@ -1,0 +1,247 @@
+"""``regnf library``: objects by name, in a folder of one's own or at a service."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from regnf_cli.console import err, out
+from regnf_cli.field_options import choice_of, source_of
+from regnf_cli.options import Config, Description, Field, NoConfig, Token
+from regnf_cli.paths import file, output_folder
+from regnf_cli.shelves import Shown, files_of, open_shelf
+from regnf_core.errors import InvalidInputError
+from regnf_core.field_source import FieldSource
+from regnf_core.json_faults import json_fault
+from regnf_core.library_archive import open_archive, write_archive
+from regnf_core.library_entries import EntryNotes
+
+app = typer.Typer(
+    help="Keep objects by name, with tags: add, list, show, edit, remove, export, import.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+_NONE = "none"
+_DETECTED = "detected"
+
+Name = Annotated[str, typer.Argument(help="The entry's name.")]
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        "--library",
+        help="The library's folder; without it $REGNF_LIBRARY, or your own.",
+        parser=output_folder,
+        metavar="FOLDER",
+    ),
+]
+Server = Annotated[str | None, typer.Option(help="Address of a regnf service: your library there.")]
+Tags = Annotated[list[str] | None, typer.Option("--tag", help="A tag; give it several times for several.")]
+Unit = Annotated[str | None, typer.Option(help="Of the field: m, cm, mm, in or ft.")]
+Note = Annotated[str | None, typer.Option(help="A line for people.")]
+Symmetry = Annotated[
+    str | None,
+    typer.Option(
+        help='In place of the detected one, JSON: {"order": 4, "axis": [0, 0, 1], "continuous": false}. Or none: it '
+        "has no symmetry. Or detected."
+    ),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Archive = Annotated[Path, typer.Argument(help="The file, .zip.", metavar="ARCHIVE")]
+KnownArchive = Annotated[Path, typer.Argument(help="A file that `export` wrote.", parser=file, metavar="ARCHIVE")]
+
+
+@app.command()
+def add(
+    name: Name,
+    field: Field,
+    tag: Tags = None,
+    unit: Unit = None,
+    note: Note = None,
+    symmetry: Symmetry = None,
+    description: Description = None,
+    config: Config = None,
+    no_config: NoConfig = False,
+    library: Folder = None,
+    server: Server = None,
+    token: Token = None,
+) -> None:
+    """Import a field as an object, find its symmetry, and keep it under a name.
+
+    Example: **regnf library add "office chair" chair.glb --tag seat --unit m**
+    """
+    notes = EntryNotes.checked(name, tag or (), unit, note, _symmetry(symmetry))
+    source = source_of(field, description, choice_of(config, no_config), "object")
+    with open_shelf(library, server, token) as shelf:
+        _show(shelf.add(source, notes))
+
+
+@app.command("list")
+def list_(
+    tag: Annotated[str | None, typer.Option(help="Only entries with this tag.")] = None,
+    name: Annotated[str | None, typer.Option(help="Only those with this in their names.")] = None,
+    library: Folder = None,
+    server: Server = None,
+    token: Token = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the library's objects.
+
+    Example: **regnf library list --tag seat**
+    """
+    with open_shelf(library, server, token) as shelf:
+        entries = shelf.entries(tag, name)
+    if as_json:
+        out.print_json(json.dumps([one.to_dict() for one in entries]))
+        return
+    table = Table("name", "tags", "unit", "symmetry", "field", box=None, header_style="bold")
+    for one in entries:
+        table.add_row(
+            one.notes.name, ", ".join(one.notes.tags), one.notes.unit or "", _words(one.symmetry), one.field[:12]
+        )
+    out.print(table if entries else "no entries")
+
+
+@app.command()
+def show(
+    name: Name, library: Folder = None, server: Server = None, token: Token = None, as_json: AsJson = False
+) -> None:
+    """Show one entry, and where its field lies.
+
+    Example: **regnf library show "office chair"**
+    """
+    with open_shelf(library, server, token) as shelf:
+        entry = shelf.get(name)
+    if as_json:
+        out.print_json(json.dumps(entry.to_dict()))
+    else:
+        _show(entry)
+
+
+@app.command()
+def edit(
+    name: Name,
+    rename: Annotated[str | None, typer.Option(help="Another name.")] = None,
+    tag: Tags = None,
+    unit: Unit = None,
+    note: Note = None,
+    symmetry: Symmetry = None,
+    library: Folder = None,
+    server: Server = None,
+    token: Token = None,
+) -> None:
+    """Change what is said of an entry. What is not named stays; `none` takes unit, note or all tags back,
+    `detected` the symmetry.
+
+    Example: **regnf library edit "office chair" --rename armchair --symmetry detected**
+    """
+    with open_shelf(library, server, token) as shelf:
+        known = shelf.get(name).notes
+        said: dict[str, Any] = {
+            "name": rename,
+            "tags": None if tag is None else [] if tag == [_NONE] else tag,
+            "unit": unit,
+            "note": note,
+        }
+        changes = {member: None if value == _NONE else value for member, value in said.items() if value is not None}
+        if symmetry is not None:
+            changes["symmetry"] = _symmetry(symmetry)
+        _show(shelf.change(name, EntryNotes.checked(**(known.to_dict() | changes))))
+
+
+@app.command()
+def remove(name: Name, library: Folder = None, server: Server = None, token: Token = None) -> None:
+    """Take an entry out of the library: in a folder with its field, at a service without.
+
+    Example: **regnf library remove "office chair"**
+    """
+    with open_shelf(library, server, token) as shelf:
+        shelf.remove(name)
+    err.print(f"removed {name}", markup=False, soft_wrap=True)
+
+
+@app.command("export")
+def export_(
+    archive: Archive,
+    tag: Annotated[str | None, typer.Option(help="Only entries with this tag.")] = None,
+    library: Folder = None,
+    server: Server = None,
+    token: Token = None,
+) -> None:
+    """Write the library into one file: an index, and the fields in the safe format.
+
+    Example: **regnf library export chairs.zip --tag seat**
+    """
+    with open_shelf(library, server, token) as shelf:
+        entries = shelf.entries(tag)
+        if not entries:
+            hint = "`regnf library list` shows what there is."
+            raise InvalidInputError("there is no entry to export", reason="LIBRARY_EMPTY", hint=hint)
+        with files_of(shelf, entries) as files:
+            write_archive(archive, files)
+    counted = "1 entry" if len(entries) == 1 else f"{len(entries)} entries"
+    err.print(f"wrote {archive}: {counted}", markup=False, soft_wrap=True)
+
+
+@app.command("import")
+def import_(
+    archive: KnownArchive,
+    skip_taken: Annotated[bool, typer.Option("--skip-taken", help="Leave out entries whose names are taken.")] = False,
+    library: Folder = None,
+    server: Server = None,
+    token: Token = None,
+) -> None:
+    """Add the entries of a file that `export` wrote. Each field goes through the import gate.
+
+    Example: **regnf library import chairs.zip**
+    """
+    with open_archive(archive) as opened, open_shelf(library, server, token) as shelf, TemporaryDirectory() as folder:
+        taken = {one.notes.name for one in shelf.entries()} & {one.notes.name for one in opened.entries}
+        if taken and not skip_taken:
+            message = f"{archive}: there are entries {', '.join(map(repr, sorted(taken)[:5]))} already"
+            hint = "Rename or remove them, or leave those of the file out with --skip-taken."
+            raise InvalidInputError(message, reason="LIBRARY_NAME_TAKEN", hint=hint)
+        wanted = [one for one in opened.entries if one.notes.name not in taken]
+        for one in wanted:
+            field = Path(folder) / f"{one.field}.safetensors"
+            opened.extract(one, field)
+            shelf.add(FieldSource(field, field), one.notes)
+            field.unlink()
+            err.print(f"added {one.notes.name}", markup=False, soft_wrap=True)
+    err.print(f"{len(wanted)} added, {len(taken)} left out", markup=False, soft_wrap=True)
+
+
+def _symmetry(text: str | None) -> Any:
+    """What is said of it; None leaves the detected one."""
+    if text in (None, _DETECTED):
+        return None
+    try:
+        said = {"order": 1} if text == _NONE else json.loads(text)
+    except json.JSONDecodeError as error:
+        message, hint = json_fault(error)
+        raise InvalidInputError(f"symmetry: {message}", reason="MALFORMED_JSON", hint=hint) from error
+    return {"axis": None, "continuous": False} | said if isinstance(said, dict) else said
+
+
+def _show(entry: Shown) -> None:
+    notes = entry.notes
+    said = {"symmetry": _words(entry.symmetry) + (" (as said)" if notes.symmetry is not None else "")}
+    told = {"name": notes.name, "tags": ", ".join(notes.tags), "unit": notes.unit, "note": notes.note, **said}
+    for word, value in (told | {"field": entry.place}).items():
+        if value:
+            out.print(f"{word:<9} {value}", markup=False, soft_wrap=True)
+
+
+def _words(symmetry: dict[str, Any] | None) -> str:
+    """A symmetry as people read it."""
+    if symmetry is None:
+        return "not known"
+    axis = symmetry.get("axis")
+    about = "" if axis is None else f" about {', '.join(f'{part:.3g}' for part in axis)}"
+    if symmetry["continuous"]:
+        return f"every turn{about}"
+    return f"{symmetry['order']} turns{about}" if symmetry["order"] > 1 else "none"

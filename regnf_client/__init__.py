@@ -1,0 +1,34 @@
+"""A client of a regnf service: httpx, pydantic and NumPy, no torch.
+
+    from regnf_client import Client
+
+    with Client("http://127.0.0.1:8080") as client:
+        result = client.register("room.ckpt", "chair.glb", {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]})
+        print(result.verdict, result.scale, result.T_object_scene)
+
+``AsyncClient`` has the same methods, to be awaited.
+"""
+
+from regnf_client.async_client import AsyncClient
+from regnf_client.batches import Pair, PairResult
+from regnf_client.client import Client
+from regnf_client.errors import NoWorkerError, ServiceError, UnreachableError, WaitTimeoutError
+from regnf_client.models import BatchOutcome, Entry, Event, Field, Job, Rendering, Result
+
+__all__ = [
+    "AsyncClient",
+    "BatchOutcome",
+    "Client",
+    "Entry",
+    "Event",
+    "Field",
+    "Job",
+    "NoWorkerError",
+    "Pair",
+    "PairResult",
+    "Rendering",
+    "Result",
+    "ServiceError",
+    "UnreachableError",
+    "WaitTimeoutError",
+]

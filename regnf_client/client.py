@@ -1,0 +1,252 @@
+"""The client that blocks until an answer is there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+import regnf_client.artifacts as artifacts
+import regnf_client.fields as fields
+import regnf_client.jobs as jobs
+import regnf_client.registrations as registrations
+from regnf_client.answers import refusal
+from regnf_client.batches import BatchReader, PairLike, PairResult, parts_of
+from regnf_client.connection import ADDRESS, WORKER_TIMEOUT_S, Connection
+from regnf_client.errors import unreachable
+from regnf_client.events import EventReader
+from regnf_client.fields import FieldLike, Report
+from regnf_client.jobs import JobLike, id_of
+from regnf_client.lists import delete_field, list_fields, list_jobs
+from regnf_client.models import BatchOutcome, Event, Field, Job, Rendering, Result
+from regnf_client.patience import Patience
+from regnf_client.registrations import Batch, Request
+from regnf_client.sync_driver import SyncDriver
+from regnf_client.sync_library import Library
+from regnf_core.detections.objects import BoxLike
+from regnf_core.field_source import Role, SettingsChoice
+from regnf_core.options import OptionsLike
+
+
+class Client:
+    """A regnf service.
+
+    Scenes and objects are paths (a file, a training run's folder, an archive of one), SHA-256s or ``Field`` objects. A
+    file is sent only if the service lacks it; a large one goes on where an earlier try stopped. What is asked too fast,
+    and what a broken connection stopped, is asked again. ``progress`` is called with a phase and the share of it done.
+
+    Errors: see :mod:`regnf_client.errors`. Each has ``reason`` and ``hint``; ServiceError has ``status`` too.
+    """
+
+    def __init__(
+        self,
+        address: str = ADDRESS,
+        token: str | None = None,
+        *,
+        retries: int = 4,
+        worker_timeout_s: float | None = WORKER_TIMEOUT_S,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        """token: None takes that of the environment variable REGNF_API_TOKEN, if it is set. worker_timeout_s: how long
+        to wait while the service has no worker; None: for ever. transport: of httpx, for proxies and tests."""
+        self._connection = Connection(address, token, retries, worker_timeout_s)
+        self._http = httpx.Client(transport=transport, **self._connection.http_options())
+        self._driver = SyncDriver(self._http)
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._http.close()
+
+    @property
+    def address(self) -> str:
+        """Of the service."""
+        return self._connection.address.rstrip("/")
+
+    @property
+    def library(self) -> Library:
+        """Objects by name, with tags."""
+        return Library(self._connection, self._driver)
+
+    def upload(
+        self,
+        field: str | Path,
+        description: Mapping[str, Any] | None = None,
+        settings: SettingsChoice = None,
+        role: Role | None = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Field:
+        """The field at the service, once its import has ended. ``description`` says what no file says, ``settings``
+        names the trainer's settings (None: those beside the file, False: none), as in ``regnf.open_field``."""
+        source = fields.source_of(field, description, settings, role)
+        return self._driver.run(fields.upload(self._connection.asking(progress, timeout_s), source))
+
+    def field(self, field: FieldLike) -> Field:
+        """A field as it is now. Raises ServiceError (FIELD_NOT_FOUND)."""
+        return self._driver.run(fields.find(self._connection.asking(), field))
+
+    def fields(self, label: str | None = None) -> list[Field]:
+        """All fields, newest first."""
+        return self._driver.run(list_fields(self._connection.asking(), label))
+
+    def delete_field(self, field: FieldLike) -> None:
+        """Forget a field. Raises ServiceError (FIELD_IN_USE)."""
+        self._driver.run(delete_field(self._connection.asking(), field))
+
+    def register(
+        self,
+        scene: FieldLike,
+        obj: FieldLike,
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        start: Any = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Result:
+        """Find where an object stands in a scene. start: a T_object_scene (4, 4) to look at first."""
+        request = Request(detection, options, seed, start)
+        return self._driver.run(
+            registrations.register(self._connection.asking(progress, timeout_s), scene, obj, request)
+        )
+
+    def submit(
+        self,
+        scene: FieldLike,
+        obj: FieldLike,
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        start: Any = None,
+        more: Mapping[str, Any] | None = None,
+        progress: Report | None = None,
+    ) -> Job:
+        """The same without waiting. more: members of the request that have no parameter here, such as ``webhook``."""
+        request = Request(detection, options, seed, start, more or {})
+        return self._driver.run(
+            registrations.submit_registration(self._connection.asking(progress), scene, obj, request)
+        )
+
+    def search(
+        self,
+        scene: FieldLike,
+        objects: Sequence[FieldLike],
+        detection: BoxLike,
+        options: OptionsLike = None,
+        seed: int = 0,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Result:
+        """Which of the objects it is, and where; the result's ``candidates`` rank them all."""
+        request = Request(detection, options, seed)
+        asking = self._connection.asking(progress, timeout_s)
+        return self._driver.run(registrations.search(asking, scene, objects, request))
+
+    def batch(
+        self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
+    ) -> Iterator[PairResult]:
+        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, in no order.
+
+        A pair that fails stops no other. Called again with the same requests after an interruption, it goes on.
+        """
+        asking = self._connection.asking(progress, timeout_s)
+        deadline = asking.deadline()
+        for part in parts_of(requests):
+            reader = BatchReader(asking, part, deadline)
+            found: list[PairResult] | None = self._driver.run(reader.post())
+            while found is not None:
+                yield from found
+                found = self._driver.run(reader.read())
+
+    def register_batch(
+        self,
+        scene: FieldLike,
+        detections: Sequence[BoxLike],
+        objects: Sequence[FieldLike],
+        pairs: Sequence[tuple[int, int]] | None = None,
+        options: OptionsLike = None,
+        seed: int = 0,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> list[BatchOutcome]:
+        """Several registrations in one scene; pairs: numbers of detection and object, None: each with each."""
+        asking = self._connection.asking(progress, timeout_s)
+        wanted = Batch(detections, objects, pairs, options, seed)
+        return self._driver.run(registrations.batch(asking, scene, wanted))
+
+    def render(
+        self,
+        scene: FieldLike,
+        edits: Sequence[Mapping[str, Any]] = (),
+        request: Mapping[str, Any] | None = None,
+        progress: Report | None = None,
+        timeout_s: float | None = None,
+    ) -> Rendering:
+        """Pictures, a mesh and a field of a scene with its edits. request: members of ``POST /render``."""
+        asking = self._connection.asking(progress, timeout_s)
+        return self._driver.run(registrations.render(asking, scene, edits, request or {}))
+
+    def job(self, job: JobLike) -> Job:
+        """A job as it is now. Raises ServiceError (JOB_NOT_FOUND, JOB_EXPIRED)."""
+        return self._driver.run(jobs.find(self._connection.asking(), job))
+
+    def jobs(self, status: str | None = None) -> list[Job]:
+        """All jobs, newest first."""
+        return self._driver.run(list_jobs(self._connection.asking(), status))
+
+    def wait(self, job: JobLike, progress: Report | None = None, timeout_s: float | None = None) -> Job:
+        """The job once it has finished. Raises WaitTimeoutError, NoWorkerError."""
+        return self._driver.run(jobs.wait(self._connection.asking(progress, timeout_s), job))
+
+    def watch(self, job: JobLike) -> Iterator[Event]:
+        """A job's events as they come, until it has finished; a broken stream goes on where it stopped."""
+        reader, tries = EventReader(), Patience(retries=self._connection.retries).tries()
+        while not reader.ended:
+            try:
+                with self._http.stream("GET", f"/jobs/{id_of(job)}/events", headers=reader.headers()) as answer:
+                    if answer.status_code == httpx.codes.NO_CONTENT:
+                        return
+                    if not answer.is_success:
+                        answer.read()
+                        raise refusal(answer)
+                    reader.connected()
+                    for line in answer.iter_lines():
+                        if (event := reader.take(line)) is not None:
+                            yield event
+            except httpx.RequestError as error:
+                wait_s = tries.wait_s(error)
+                if wait_s is None:
+                    raise unreachable(error) from error
+                self._driver.sleep(wait_s)
+
+    def cancel(self, job: JobLike) -> Job:
+        """Stop a job; no error if it was stopped before. Raises ServiceError (JOB_FINISHED)."""
+        return self._driver.run(jobs.cancel(self._connection.asking(), job))
+
+    def result(self, job: JobLike) -> Result:
+        """What a registration found. Raises ServiceError: JOB_NOT_READY, or the job's own reason where it failed."""
+        return self._driver.run(jobs.result(self._connection.asking(), job))
+
+    def rendering(self, job: JobLike) -> Rendering:
+        """What a rendering made. Raises ServiceError as ``result`` does."""
+        return self._driver.run(jobs.rendering(self._connection.asking(), job))
+
+    def artifact(self, job: JobLike, name: str) -> bytes:
+        """The bytes of one file of a result. Raises ServiceError (ARTIFACT_NOT_FOUND)."""
+        return self._driver.run(artifacts.artifact(self._connection.asking(), job, name))
+
+    def download(self, job: JobLike, name: str, target: str | Path) -> Path:
+        """Write one file of a result."""
+        return self._driver.run(artifacts.download(self._connection.asking(), job, name, Path(target)))
+
+    def save(self, found: Result | Rendering, folder: str | Path, progress: Report | None = None) -> list[Path]:
+        """Write all files of a result into a folder."""
+        return self._driver.run(artifacts.save(self._connection.asking(progress), found, Path(folder)))

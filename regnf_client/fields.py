@@ -1,0 +1,251 @@
+"""Fields: what names one, and how it gets to the service. Nothing is sent of what the service has."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from regnf_client.answers import checked, parsed, refusal, service_error
+from regnf_client.errors import ServiceError, WaitTimeoutError
+from regnf_client.models import Entry, Field
+from regnf_client.patience import Patience
+from regnf_client.steps import Flow, call, work
+from regnf_client.worker_watch import WorkerWatch, look
+from regnf_core.field_candidates import Said
+from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
+from regnf_core.importing.upload_description import UploadDescription
+
+FieldLike = str | Path | Field | Entry | FieldSource
+"""A file, a training run's folder or an archive of one; the SHA-256 of a field that the service has; or a Field or an
+Entry of its library."""
+Report = Callable[[str, float], None]
+"""Called with a phase and the share of it that is done, 0..1."""
+PIECE_BYTES = 8 << 20
+"""A file that is larger is sent in pieces: a broken connection costs one of them."""
+_MOST_PIECES = 900
+_HOLD_S = 20
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
+
+
+@dataclass(frozen=True)
+class Asking:
+    """How a client asks. watch: of the service's workers · timeout_s: the most that a wait may take; None: any time."""
+
+    patience: Patience
+    watch: WorkerWatch
+    report: Report | None = None
+    timeout_s: float | None = None
+
+    def tell(self, phase: str, share: float) -> None:
+        """Report to the caller, who may not want to know."""
+        if self.report is not None:
+            self.report(phase, share)
+
+    def deadline(self) -> Deadline:
+        """Of a wait that begins now."""
+        return Deadline(self.timeout_s)
+
+
+class Deadline:
+    """When a wait ends. None: never."""
+
+    def __init__(self, timeout_s: float | None) -> None:
+        self._timeout_s = timeout_s
+        self._end = math.inf if timeout_s is None else time.monotonic() + timeout_s
+
+    def hold_s(self) -> int:
+        """For how long the service may hold one answer."""
+        left_s = self._end - time.monotonic()
+        return _HOLD_S if left_s >= _HOLD_S else max(0, math.ceil(left_s))
+
+    def check(self, what: str) -> None:
+        """Raises WaitTimeoutError once the time is over. what: is waited for."""
+        if time.monotonic() >= self._end:
+            hint = "It goes on: the same call finds it again. Give a larger timeout_s, or None."
+            raise WaitTimeoutError(f"{what} has not ended within {self._timeout_s:g} s", hint=hint)
+
+
+def source_of(
+    field: str | Path | FieldSource,
+    description: Mapping[str, Any] | None = None,
+    settings: SettingsChoice = None,
+    role: Role | None = None,
+) -> FieldSource:
+    """What a path stands for. Raises what ``find_source`` does: InvalidInputError, FieldFormatError."""
+    return field if isinstance(field, FieldSource) else find_source(Path(field), description, settings, role)
+
+
+def known_sha256(field: FieldLike) -> str | None:
+    """The SHA-256 of a field that is named by it; None for a file."""
+    if isinstance(field, Field):
+        return field.sha256
+    if isinstance(field, Entry):
+        return field.field
+    is_name = isinstance(field, str) and _SHA256.fullmatch(field) is not None
+    return str(field) if is_name and not Path(str(field)).exists() else None
+
+
+def upload(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
+    """The field at the service, once its import has ended; its bytes are sent only if the service lacks them.
+
+    Raises ServiceError: of a refused field the gate's reason, FIELD_DESCRIPTION_DIFFERS for bytes that are held as
+    another function; both name the file.
+    """
+    source = None if known_sha256(field) is not None else source_of(_path(field), role=role)
+    try:
+        found = yield from send(asking, field if source is None else source)
+        return (yield from ready(asking, found))
+    except ServiceError as error:
+        if source is None or error.unavailable or error.reason in _NOT_OF_A_FILE:
+            raise
+        named = error.told(f"{source.named}: {error}")
+        named.said = Said(source.use, source.said)
+        raise named from error
+
+
+def send(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
+    """The same, while its import may still run."""
+    if known_sha256(field) is not None:
+        return (yield from find(asking, field))
+    source = source_of(_path(field), role=role)
+    sha256 = yield from work(partial(_sha256, source.file))
+    answer = yield from call(asking.patience, "GET", f"/fields/{sha256}")
+    if answer.status_code != 404:
+        known = parsed(Field, checked(answer))
+        if known.state != "rejected":
+            _require_same(known, source)
+            return known
+    with source.packed_settings() as settings:
+        return (yield from _Sending(asking, source, sha256, settings).all())
+
+
+def find(asking: Asking, field: FieldLike) -> Flow[Field]:
+    """A field as the service has it now. Raises ServiceError (FIELD_NOT_FOUND)."""
+    sha256 = known_sha256(field)
+    if sha256 is None:
+        sha256 = yield from work(partial(_sha256, source_of(_path(field)).file))
+    return parsed(Field, checked((yield from call(asking.patience, "GET", f"/fields/{sha256}"))))
+
+
+def ready(asking: Asking, field: Field) -> Flow[Field]:
+    """The field once its import has ended. Raises ServiceError with the gate's reason when it was rejected."""
+    deadline = asking.deadline()
+    while field.state == "validating":
+        asking.tell("importing", 0.0)
+        params = {"wait": deadline.hold_s()}
+        answer = yield from call(asking.patience, "GET", f"/fields/{field.sha256}", params=params)
+        field = parsed(Field, checked(answer))
+        if field.state == "validating":
+            deadline.check(f"the import of {field.sha256[:12]}")
+            yield from look(asking.watch, asking.patience)
+    if field.state == "rejected":
+        raise service_error(field.error or {})
+    return field
+
+
+def _path(field: FieldLike) -> str | Path | FieldSource:
+    assert not isinstance(field, Field | Entry)
+    return field
+
+
+@dataclass(frozen=True)
+class _Sending:
+    """One file on its way."""
+
+    asking: Asking
+    source: FieldSource
+    sha256: str
+    settings: Path | None
+
+    def all(self) -> Flow[Field]:
+        size = self.source.file.stat().st_size
+        if size <= PIECE_BYTES:
+            data = yield from work(self.source.file.read_bytes)
+            return (yield from self._at_once(data))
+        return (yield from self._in_pieces(size))
+
+    def _beside(self) -> dict[str, Any]:
+        """The parts of a form that go with the file."""
+        parts: dict[str, Any] = {}
+        if self.source.description:
+            parts["description"] = (None, json.dumps(self.source.description), "application/json")
+        if self.settings is not None:
+            parts["settings"] = (self.settings.name, self.settings.read_bytes(), "application/octet-stream")
+        return parts
+
+    def _at_once(self, data: bytes) -> Flow[Field]:
+        self.asking.tell("uploading", 0.0)
+        parts = self._beside()
+        if parts:
+            form = {"file": (self.source.file.name, data, "application/octet-stream"), **parts}
+            answer = yield from call(self.asking.patience, "POST", "/fields", files=form)
+        else:
+            how = {"content": data, "headers": {"Content-Type": "application/octet-stream"}}
+            answer = yield from call(self.asking.patience, "PUT", f"/fields/{self.sha256}", **how)
+        self.asking.tell("uploading", 1.0)
+        return parsed(Field, checked(answer))
+
+    def _in_pieces(self, size: int) -> Flow[Field]:
+        """From where an earlier try stopped."""
+        piece = max(PIECE_BYTES, -(-size // _MOST_PIECES))
+        parts = self._beside()
+        complete = {"Upload-Complete": "?0"} if parts else {}
+        answer = yield from self._put(b"", f"bytes */{size}", complete)
+        while True:
+            document = checked(answer)
+            offset = document.get("offset")
+            if offset is None:
+                return parsed(Field, document)
+            self.asking.tell("uploading", offset / size)
+            if offset == size:
+                break
+            data = yield from work(partial(_read, self.source.file, offset, piece))
+            span = f"bytes {offset}-{offset + len(data) - 1}/{size}"
+            answer = yield from self._put(data, span, complete)
+            if answer.status_code == 409 and refusal(answer).offset not in (None, offset):
+                answer = yield from self._put(b"", f"bytes */{size}", complete)  # the answer to a piece was lost
+        form = {"upload": (None, self.sha256), **parts}
+        answer = yield from call(self.asking.patience, "POST", "/fields", files=form)
+        return parsed(Field, checked(answer))
+
+    def _put(self, data: bytes, span: str, complete: Mapping[str, str]) -> Flow[Any]:
+        headers = {"Content-Range": span, "Content-Type": "application/octet-stream", **complete}
+        return call(self.asking.patience, "PUT", f"/fields/{self.sha256}", content=data, headers=headers)
+
+
+def _read(path: Path, offset: int, size: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(offset)
+        return file.read(size)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _require_same(held: Field, source: FieldSource) -> None:
+    """Raises ServiceError FIELD_DESCRIPTION_DIFFERS unless the service has the field as the user wants it.
+
+    What it will be used as is no condition, as long as the user has not said it.
+    """
+    with source.packed_settings() as settings:
+        if not source.said and settings is None:
+            return
+        digest = None if settings is None else _sha256(settings)
+    said = UploadDescription.from_dict(dict(source.said)).non_default()
+    wanted = {name: value for name, value in said.items() if name != "label"}
+    found = {name: value for name, value in held.description.items() if name in wanted or name != "as"}
+    if (wanted, digest) != (found, (held.settings or {}).get("sha256")):
+        message = "the service holds the same bytes with another description or other settings"
+        hint = f"Delete the field there first (DELETE /fields/{held.sha256}), or leave them out."
+        raise ServiceError(message, reason="FIELD_DESCRIPTION_DIFFERS", hint=hint)

@@ -1,0 +1,208 @@
+"""What a service answers, typed. Members that this release does not know are kept: ``model_extra``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
+
+from regnf_core.errors import RegnfError
+
+Floats = NDArray[np.float64]
+Status = Literal["accepted", "running", "successful", "failed", "dismissed"]
+Verdict = Literal["registered", "ambiguous", "rejected"]
+FINISHED = frozenset({"successful", "failed", "dismissed"})
+
+
+def _matrix(value: Any) -> Floats:
+    """(4, 4) of a transform's document."""
+    return _array(value["matrix"] if isinstance(value, dict) else value)
+
+
+def _array(value: Any) -> Floats:
+    return np.asarray(value, dtype=np.float64)  # None becomes NaN
+
+
+_PLAIN = PlainSerializer(lambda array: array.tolist(), return_type=list)
+Matrix = Annotated[Floats, BeforeValidator(_matrix), _PLAIN]
+Array = Annotated[Floats, BeforeValidator(_array), _PLAIN]
+
+
+class Document(BaseModel):
+    """Base of what the service sends."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, arbitrary_types_allowed=True)
+
+    def __str__(self) -> str:
+        return repr(self)
+
+
+class Field(Document):
+    """A field that the service holds. Only a ``ready`` one can be registered; it may be given in place of a path."""
+
+    sha256: str
+    state: Literal["validating", "ready", "rejected"]
+    bytes: int
+    label: str | None = None
+    description: dict[str, Any] = {}
+    settings: dict[str, Any] | None = None
+    report: dict[str, Any] = {}
+    error: dict[str, Any] | None = None
+    kept_until: str | None = None
+
+    def __repr__(self) -> str:
+        return f"Field({self.sha256[:12]}…, {self.state}, {self.bytes / 1e6:.1f} MB)"
+
+
+class Entry(Document):
+    """An object of the library. It may be given in place of a path. field: the SHA-256 of its field."""
+
+    name: str
+    field: str
+    state: Literal["validating", "ready", "rejected"]
+    tags: list[str] = []
+    unit: str | None = None
+    note: str | None = None
+    symmetry: dict[str, Any] | None = None
+    symmetry_source: Literal["said", "detected"] | None = None
+    bounds: Any = None
+
+    def __repr__(self) -> str:
+        tags = f", {', '.join(self.tags)}" if self.tags else ""
+        return f"Entry({self.name}{tags}, {self.state})"
+
+
+class Job(Document):
+    """A job as it was when the service was asked."""
+
+    id: str
+    kind: Literal["registration", "render"]
+    status: Status
+    phase: str | None = None
+    progress: float = 0.0
+    queue_position: int | None = None
+    verdict: Verdict | None = None
+    error: dict[str, Any] | None = None
+    warnings: dict[str, list[str]] = {}
+    links: dict[str, str] = {}
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing will change any more."""
+        return self.status in FINISHED
+
+    def __repr__(self) -> str:
+        found = f", {self.verdict}" if self.verdict else ""
+        return f"Job({self.id}, {self.kind}, {self.status}{found}, {100 * self.progress:.0f} %)"
+
+
+class Event(Document):
+    """One event of a job: ``status`` or ``progress``."""
+
+    id: str
+    name: str
+    data: dict[str, Any]
+
+
+class Artifact(Document):
+    """A file of a result. One that is ``pending`` has no bytes yet: downloading it waits for them."""
+
+    name: str
+    state: Literal["ready", "pending"] = "ready"
+    bytes: int | None = None
+    sha256: str | None = None
+    url: str
+
+
+class Alternative(Document):
+    """Another pose that agrees with the data as well."""
+
+    T_object_scene: Matrix
+    score: float
+    relation: str
+
+
+class Candidate(Document):
+    """What a search found out about one object. source: as the caller named it."""
+
+    object: str
+    stage: str
+    score: float | None = None
+    verdict: Verdict | None = None
+    verdict_reason: str | None = None
+    T_object_scene: Matrix | None = None
+    source: str | None = None
+
+
+class Result(Document):
+    """What a registration or a search found. Transforms are (4, 4) arrays, x -> s R x + t.
+
+    job: its id · object: SHA-256 of the object's field · source: the object as the caller named it.
+    """
+
+    job: str
+    verdict: Verdict
+    verdict_reason: str
+    verdict_detail: str = ""
+    verdict_hint: str = ""
+    T_object_scene: Matrix
+    T_scene_object: Matrix
+    alternatives: list[Alternative] = []
+    covariance: Array | None = None
+    """(7, 7), in the order of ``covariance_ordering``."""
+    covariance_ordering: list[str] | None = None
+    metrics: dict[str, float | None] = {}
+    object: str | None = None
+    source: str | None = None
+    candidates: list[Candidate] | None = None
+    seed: int = 0
+    options: dict[str, Any] = {}
+    artifacts: list[Artifact] = []
+
+    @property
+    def scale(self) -> float:
+        """Object units per scene unit."""
+        return float(np.cbrt(np.linalg.det(self.T_object_scene[:3, :3])))
+
+    @property
+    def probability(self) -> float | None:
+        """That the pose is right, 0..1; None from the preset `paper`."""
+        return self.metrics.get("probability")
+
+    def apply(self, points: ArrayLike) -> Floats:
+        """Points (N, 3) of the scene in the object's frame."""
+        moved: Floats = (
+            np.asarray(points, dtype=np.float64) @ self.T_object_scene[:3, :3].T + self.T_object_scene[:3, 3]
+        )
+        return moved
+
+    def __repr__(self) -> str:
+        return f"Result({self.verdict}, {self.verdict_reason}, scale {self.scale:.4g}, job {self.job})"
+
+
+class Rendering(Document):
+    """What a rendering has made. job: its id · field: SHA-256 of the edited scene's field, if it was asked for."""
+
+    job: str
+    frames: int
+    size: tuple[int, int]
+    depth_unit: float
+    field: str | None = None
+    artifacts: list[Artifact] = []
+
+    def __repr__(self) -> str:
+        width, height = self.size
+        return f"Rendering({self.frames} frames of {width} x {height}, {len(self.artifacts)} files, job {self.job})"
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """Of one pair of a batch: a result, or the error. detection, object: their numbers in the lists."""
+
+    detection: int
+    object: int
+    result: Result | None
+    error: RegnfError | None = None

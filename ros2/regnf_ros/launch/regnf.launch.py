@@ -1,0 +1,26 @@
+"""Starts the node: ros2 launch regnf_ros regnf.launch.py scene:=SHA256 objects:='chair=SHA256'"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+ARGUMENTS = {
+    "server": ("http://127.0.0.1:8080", "Address of the regnf service."),
+    "token": ("", "Access token, if the service asks for one."),
+    "scene": ("", "SHA-256 of the room's field."),
+    "objects": ("", "CLASS=SHA256 of each object, separated by blanks."),
+    "map_frame": ("map", "The fixed frame that the room's field is in."),
+    "dataparser_transforms": ("", "dataparser_transforms.json, if the room's field is in its trainer's frame."),
+    "up_axis": ("", "x, y or z: the vertical axis of room and objects, if it is known."),
+}
+
+
+def generate_launch_description():
+    declared = [
+        DeclareLaunchArgument(name, default_value=value, description=told) for name, (value, told) in ARGUMENTS.items()
+    ]
+    parameters = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in ARGUMENTS}
+    node = Node(package="regnf_ros", executable="register_objects", name="regnf", parameters=[parameters])
+    return LaunchDescription([*declared, node])

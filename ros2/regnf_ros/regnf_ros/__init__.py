@@ -1,0 +1,1 @@
+"""Asks a regnf service where detected objects stand, and publishes their poses."""

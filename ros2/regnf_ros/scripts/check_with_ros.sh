@@ -1,0 +1,25 @@
+#!/usr/bin/env bash
+# Where ROS 2 is installed: builds the package, and asks the built node what it subscribes to and publishes.
+#   source /opt/ros/DISTRIBUTION/setup.bash && ros2/regnf_ros/scripts/check_with_ros.sh
+set -eo pipefail
+package=$(cd "$(dirname "$0")/.." && pwd)
+workspace=$(mktemp -d)
+trap 'kill $node 2>/dev/null; rm -rf "$workspace"' EXIT
+mkdir "$workspace/src" && cp -r "$package" "$workspace/src/"
+cd "$workspace"
+colcon build --packages-select regnf_ros
+source install/setup.bash
+for message in vision_msgs/msg/Detection3DArray geometry_msgs/msg/PoseWithCovarianceStamped; do
+    ros2 interface show "$message" >/dev/null
+done
+ros2 run regnf_ros register_objects --ros-args -p scene:=none -p objects:=chair=none &
+node=$!
+for _ in $(seq 30); do
+    if info=$(ros2 node info /regnf 2>/dev/null) && grep -q Detection3DArray <<<"$info"; then
+        echo "$info"
+        exit 0
+    fi
+    sleep 1
+done
+echo "the node did not come up" >&2
+exit 1
