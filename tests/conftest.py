@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import tests.environment  # noqa: F401 -- first
+
+# isort: split
 import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
 
 import pytest
+from hypothesis import HealthCheck, settings
 from redis import Redis
 
 from regnf_state.record_store import RecordStore
@@ -18,11 +22,21 @@ from tests.live_stack import demo_fields, live_client, live_stack
 from tests.object_store import ObjectServer, object_server
 from tests.redis_server import default_server, installed_servers, private_redis
 
+# A busy machine is no finding: neither an example nor their generation is timed.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
+
 __all__ = ["demo_fields", "live_client", "live_stack", "pytest_collection_modifyitems"]
 
-# Threads of several processes that spin while they wait slow a shared machine tenfold. Set before torch loads.
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+@pytest.fixture(autouse=True)
+def environment_as_before() -> Iterator[None]:
+    """Commands run here set variables for the processes that they start; the next test knows nothing of them."""
+    before = dict(os.environ)
+    yield
+    if os.environ != before:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 @pytest.fixture(scope="session")

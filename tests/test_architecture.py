@@ -5,37 +5,47 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 HTTP = {"fastapi", "starlette", "uvicorn"}
-OURS = {"regnf_core", "regnf_fit", "regnf_data", "regnf_state", "regnf_service", "regnf_worker", "regnf_cli"}
+OURS = {
+    "regnf", "regnf_cli", "regnf_client", "regnf_core", "regnf_data",
+    "regnf_fit", "regnf_service", "regnf_state", "regnf_worker",
+}  # fmt: skip
 HEAVY = {"torch", "open3d", "igl", "trimesh"}
 FOLDERS = {"regnf_service": "service/regnf_service", "regnf_worker": "worker/regnf_worker"}
 FORBIDDEN = {
+    "regnf": HTTP | {"rq", "redis", "regnf_cli", "regnf_service", "regnf_state", "regnf_worker"},
+    "regnf_client": HTTP | HEAVY | {"rq", "redis"} | OURS - {"regnf_client", "regnf_core"},
     "regnf_core": HTTP | {"rq", "redis"} | OURS - {"regnf_core"},
     "regnf_data": HTTP | {"rq", "redis"} | OURS - {"regnf_core", "regnf_data"},
     "regnf_fit": HTTP | {"rq", "redis"} | OURS - {"regnf_core", "regnf_data", "regnf_fit"},
     "regnf_state": HTTP | HEAVY | OURS - {"regnf_core", "regnf_state"},
-    "regnf_service": HEAVY | {"regnf_worker", "regnf_cli", "regnf_fit", "regnf_data"},
-    "regnf_worker": HTTP | {"regnf_service", "regnf_cli", "regnf_fit", "regnf_data"},
+    "regnf_service": HEAVY | {"regnf_worker", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},
+    "regnf_worker": HTTP | {"regnf_service", "regnf_cli", "regnf_client", "regnf_fit", "regnf_data"},
 }
 
 
 MAX_PARAMETERS = 8
 
 
-def imports_of(path: Path) -> Iterator[str]:
+@cache
+def imports_of(path: Path) -> frozenset[str]:
     """Every module a file imports, at whatever depth of the code; ``from a import b`` names both a and a.b."""
+    found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found.add(node.module)
+            found.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return frozenset(found)
 
 
 @pytest.mark.parametrize("package", sorted(FORBIDDEN))
@@ -82,20 +92,20 @@ def child_of(package: str, module: str) -> str:
     return module.removeprefix(f"{package}.").split(".")[0]
 
 
-def cycles_among(edges: dict[str, set[str]]) -> set[frozenset[str]]:
+def cycles_among(edges: Mapping[str, AbstractSet[str]]) -> set[frozenset[str]]:
     """The groups of names that all reach each other."""
     reached = {name: reachable(edges, name) for name in edges}
     groups = {frozenset(other for other in reached[name] if name in reached[other]) for name in edges}
     return {group for group in groups if group}
 
 
-def reachable(edges: dict[str, set[str]], start: str) -> set[str]:
+def reachable(edges: Mapping[str, AbstractSet[str]], start: str) -> set[str]:
     found: set[str] = set()
     ahead = set(edges[start])
     while ahead:
         name = ahead.pop()
         found.add(name)
-        ahead |= edges.get(name, set()) - found
+        ahead |= edges.get(name, frozenset()) - found
     return found
 
 
@@ -107,7 +117,7 @@ def test_cycles_are_found() -> None:
 
 def test_no_import_cycle_of_any_kind() -> None:
     """Neither modules nor the folders that hold them import each other, directly or in a circle, in any package."""
-    modules = {module: (set(imports_of(path)) & MODULES.keys()) - {module} for module, path in MODULES.items()}
+    modules = {module: (imports_of(path) & MODULES.keys()) - {module} for module, path in MODULES.items()}
     assert not cycles_among(modules)
     packages = {module.rpartition(".")[0] for module in MODULES if "." in module}
     found = {
@@ -163,9 +173,11 @@ def too_many_parameters(module: str, path: Path) -> Iterator[str]:
 
 def commands() -> set[str]:
     """The functions that typer makes commands of: their parameters are the options that a user reads in --help."""
-    from regnf_cli.main import app
+    from regnf_cli.commands import app_of
 
-    callbacks = [command.callback for command in app.registered_commands]
+    app = app_of()
+    groups = [app, *(group.typer_instance for group in app.registered_groups if group.typer_instance is not None)]
+    callbacks = [command.callback for group in groups for command in group.registered_commands]
     return {f"{callback.__module__}.{callback.__name__}" for callback in callbacks if callback is not None}
 
 
@@ -188,7 +200,16 @@ def test_descriptions_know_nothing_of_what_evaluates_them() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["regnf_service.app", "regnf_worker.main", "regnf_worker.jobs", "regnf_core", "regnf_cli.main"]
+    "module",
+    [
+        "regnf_service.app",
+        "regnf_worker.main",
+        "regnf_worker.jobs",
+        "regnf_core",
+        "regnf_cli.main",
+        "regnf_client",
+        "regnf",
+    ],
 )
 def test_light_modules_load_without_torch(module: str) -> None:
     code = f"import sys, {module}; heavy = {{'torch', 'open3d'}} & set(sys.modules); sys.exit(', '.join(heavy) or 0)"
@@ -197,8 +218,12 @@ def test_light_modules_load_without_torch(module: str) -> None:
 
 
 def test_public_names_exist() -> None:
+    import regnf
+    import regnf_client
     import regnf_core
 
-    assert sorted(regnf_core.__all__) == regnf_core.__all__
-    for name in regnf_core.__all__:
-        assert getattr(regnf_core, name) is not None
+    for package in (regnf, regnf_client, regnf_core):
+        assert sorted(package.__all__) == package.__all__
+        for name in package.__all__:
+            assert getattr(package, name) is not None
+    assert set(regnf_core.__all__) < set(regnf.__all__)

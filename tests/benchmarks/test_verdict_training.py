@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from scipy.stats import spearmanr
 from benchmarks.worlds.calibration import auroc, calibration_table
 from benchmarks.worlds.training import Evidence, train, trained
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import ProbabilityModel
+from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
 
 NAMES = list(SPEAKS_FOR)
 
@@ -21,7 +23,7 @@ def drawn(count: int, seed: int) -> tuple[Evidence, np.ndarray]:
     features = draw.uniform(0.0, 1.0, (count, len(NAMES)))
     logit = 6.0 * features[:, NAMES.index("confirmed")] - 4.0 * features[:, NAMES.index("free")] - 1.0
     right = (draw.uniform(size=count) < 1.0 / (1.0 + np.exp(-logit))).astype(float)
-    return Evidence(features, right, np.ones(count), np.arange(count) % 7), logit
+    return Evidence(tuple(NAMES), features, right, np.ones(count), np.arange(count) % 7), logit
 
 
 def test_a_known_law_is_found_again() -> None:
@@ -46,7 +48,7 @@ def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
     evidence, _ = drawn(2000, 3)
     turned = evidence.features.copy()
     turned[:, NAMES.index("hidden")] = evidence.right + 0.01 * turned[:, NAMES.index("hidden")]
-    model, _ = train(Evidence(turned, evidence.right, evidence.weight, evidence.world))
+    model, _ = train(replace(evidence, features=turned))
     assert "hidden" not in model.to_dict()["terms"]  # more that is hidden must not make a pose likelier
 
 
@@ -57,12 +59,41 @@ def test_ambiguity_is_no_error_of_the_probability() -> None:
             "mssd": 0.01 if number % 3 else 0.6,
             "listed_mssd": 0.01,
             "winner": True,
+            "found": True,
+            "others": [],
             "world": f"tsdf-{number % 4}-long",
         }
         for number in range(30)
     ]
     _, table = trained([*rows, {**rows[0], "listed_mssd": 0.6, "world": "tsdf-9-long"}])
     assert table.startswith("21 registrations of 5 worlds, 20 with a right pose.")
+
+
+def test_a_lead_over_other_answers_counts() -> None:
+    """Pairs of candidates that look alike, one of them right or none: the one that lies ahead of the other is right."""
+    draw = np.random.default_rng(4)
+    rows = []
+    for number in range(400):
+        ahead = number % 2 == 0
+        for step, confirmed in (
+            (1, draw.uniform(0.6, 0.9)),
+            (-1, draw.uniform(0.1, 0.3) if ahead else draw.uniform(0.6, 0.9)),
+        ):
+            rows.append(
+                {
+                    "features": dict.fromkeys(NAMES, 0.5) | {"confirmed": confirmed},
+                    "mssd": 0.01 if ahead and step == 1 else 0.6,
+                    "listed_mssd": 0.01 if ahead and step == 1 else 0.6,
+                    "winner": step == 1,
+                    "found": True,
+                    "others": [step],
+                    "world": f"tsdf-{number % 5}-long",
+                }
+            )
+    models, table = trained(rows)
+    assert LEAD in models["among"]["terms"]
+    assert LEAD not in models["alone"]["terms"]
+    assert float(table.split("AUROC ")[1].split(",")[0]) > 0.95
 
 
 def test_the_table_counts_what_was_chosen() -> None:

@@ -24,6 +24,8 @@ def start(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         ("02_follow_and_look.py", []),
         ("02_follow_and_look.py", ["--help"]),
         ("03_own_field.py", ["--help"]),
+        ("04_many_pairs.py", ["absent.jsonl", "results.jsonl"]),
+        ("05_pipeline.py", ["http://localhost:1", "absent.jsonl", "results"]),
     ],
 )
 def test_wrong_arguments_are_answered_with_the_usage(name: str, arguments: list[str]) -> None:
@@ -36,5 +38,5 @@ def test_wrong_arguments_are_answered_with_the_usage(name: str, arguments: list[
 
 
 def test_every_example_is_listed_here() -> None:
-    tested = {"01_register.py", "02_follow_and_look.py", "03_own_field.py"}
+    tested = {"01_register.py", "02_follow_and_look.py", "03_own_field.py", "04_many_pairs.py"} | {"05_pipeline.py"}
     assert {path.name for path in EXAMPLES.glob("*.py")} == tested

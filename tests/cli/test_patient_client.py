@@ -10,7 +10,7 @@ import pytest
 
 from regnf_cli.patient_client import PatientClient
 from regnf_cli.remote import RemoteService
-from regnf_cli.remote_errors import ServiceError
+from regnf_client.errors import ServiceError
 from regnf_core.field_source import FieldSource
 
 Handler = Callable[[httpx.Request], httpx.Response]

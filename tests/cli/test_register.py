@@ -59,6 +59,7 @@ def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[o
     np.testing.assert_allclose(np.load(folder / "transform.npy"), document["T_object_scene"]["matrix"])
     assert {"result.json", "aligned.ply", "preview.png"} <= {path.name for path in folder.iterdir()}
     assert all(path.is_file() for path in folder.iterdir())  # nothing half done is left
+    assert f"wrote {folder}: result.json, preview.png" in outcome.stderr
 
 
 def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from regnf_cli.worker_watch import NoWorkerError, WorkerWatch
+from regnf_client.errors import NoWorkerError
+from regnf_client.worker_watch import WorkerWatch
 from tests.cli.conftest import Answer, Answers, Run, Serve
 
 
@@ -88,13 +89,11 @@ def test_the_watch_counts_only_an_absence_without_a_break() -> None:
 
     def look_at(seconds: float) -> None:
         now[0] = seconds
-        watch.look()
+        if watch.due:
+            looks.append(seconds)
+            watch.saw(lives[0])
 
-    def alive() -> bool:
-        looks.append(now[0])
-        return lives[0]
-
-    watch = WorkerWatch(alive, 60.0, clock=lambda: now[0])
+    watch = WorkerWatch(60.0, clock=lambda: now[0])
     look_at(100.0)
     look_at(104.9)
     assert looks == [100.0], "not more often than every five seconds"

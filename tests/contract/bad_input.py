@@ -41,8 +41,8 @@ def announced(data: bytes) -> str:
     return f"sha-256=:{base64.b64encode(bytes.fromhex(sha256(data))).decode()}:"
 
 
-def post(world: World, body: Any, **headers: str) -> Any:
-    """POST /register with a body that may be no JSON at all."""
+def post(world: World, body: Any, address: str = "/register", **headers: str) -> Any:
+    """POST to an address that starts jobs, with a body that may be no JSON at all."""
     # json.dumps writes NaN and Infinity, which httpx would not
     content = body if isinstance(body, bytes) else json.dumps(body).encode()
-    return world.client.post("/register", content=content, headers={"Content-Type": "application/json"} | headers)
+    return world.client.post(address, content=content, headers={"Content-Type": "application/json"} | headers)

@@ -37,6 +37,14 @@ def worlds(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
         world.client.close()
 
 
+@pytest.fixture
+def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
+    """A service that asks for one of two tokens."""
+    made = make_world(tmp_path, any_redis, api_tokens=frozenset({"first-token", "second-token"}))
+    with made.client:
+        yield made
+
+
 @pytest.fixture(scope="session")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     """A real API without a worker, so that what was uploaded lies still. Its users are the group `live api`."""

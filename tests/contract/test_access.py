@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +12,14 @@ from tests.contract.world import NOBODY, World, assert_refused, make_world
 
 TOKENS = frozenset({"first-token", "second-token"})
 CALLS = [
-    ("GET", "/"), ("GET", "/readyz"), ("GET", "/version"), ("GET", "/openapi.yaml"), ("GET", "/docs"),
+    ("GET", "/"), ("GET", "/readyz"), ("GET", "/version"), ("GET", "/openapi.yaml"), ("POST", "/docs"),
+    ("GET", "/openapi.json"),
     ("GET", "/jobs"), ("GET", f"/jobs/{NOBODY}"), ("GET", f"/jobs/{NOBODY}/events"), ("GET", f"/jobs/{NOBODY}/result"),
     ("GET", f"/jobs/{NOBODY}/artifacts/trace.json"), ("POST", f"/jobs/{NOBODY}/cancel"), ("DELETE", f"/jobs/{NOBODY}"),
     ("POST", "/register"), ("GET", "/fields"), ("POST", "/fields"), ("PUT", f"/fields/{NOBODY * 2}"),
     ("GET", f"/fields/{NOBODY * 2}"), ("DELETE", f"/fields/{NOBODY * 2}"), ("GET", "/v1/jobs"), ("GET", "/nowhere"),
     ("POST", f"/jobs/{NOBODY}/view"), ("GET", f"/jobs/{NOBODY}/view/x"),
 ]  # fmt: skip
-
-
-@pytest.fixture
-def guarded(tmp_path: Path, any_redis: Redis) -> Iterator[World]:
-    made = make_world(tmp_path, any_redis, api_tokens=TOKENS)
-    with made.client:
-        yield made
 
 
 @pytest.mark.parametrize(("method", "path"), CALLS)
@@ -53,6 +46,7 @@ def test_the_probe_and_the_page_are_open_and_tell_nothing(guarded: World) -> Non
     page = guarded.client.get(f"/jobs/{NOBODY}/view")
     assert (page.status_code, page.headers["content-type"]) == (200, "text/html; charset=utf-8")
     assert guarded.client.get("/static/js/app.js").status_code == 200
+    assert guarded.client.get("/docs").status_code == 200
 
 
 @pytest.mark.parametrize(

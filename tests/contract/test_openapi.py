@@ -15,12 +15,12 @@ from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
 
 from regnf_core.options import RobustOptions
 from regnf_core.verdicts import VERDICT_REASONS
-from regnf_service.http.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, SCENE
+from regnf_service.http.routes.examples import OBJECT, OTHER, REGISTER_EXAMPLES, RENDER_EXAMPLES, SCENE
 from regnf_state.reasons import REASONS
 from tests.contract.world import World
 
 ROOT = Path(__file__).resolve().parents[2]
-CONTRACT: dict[str, Any] = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
+CONTRACT: dict[str, Any] = yaml.load((ROOT / "openapi.yaml").read_text(encoding="utf-8"), Loader=yaml.CSafeLoader)
 
 
 def operations() -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -47,6 +47,13 @@ def script(name: str) -> Any:
 def test_the_script_writes_what_is_committed() -> None:
     writer = script("write_openapi")
     assert writer.current_contract() == writer.TARGET.read_text(encoding="utf-8")
+
+
+def test_the_table_of_metrics_is_the_one_of_the_page() -> None:
+    writer = script("write_metric_table")
+    text = writer.TARGET.read_text(encoding="utf-8")
+    assert writer.with_table(text) == text, "run scripts/write_metric_table.py"
+    assert writer.with_table(text.replace("near 1", "near 2")) == text  # it would be written anew
 
 
 def test_the_table_of_options_is_the_one_of_the_code() -> None:
@@ -95,7 +102,7 @@ def examples() -> list[Any]:
 
 
 def test_there_are_examples() -> None:
-    assert len(examples()) == len(REGISTER_EXAMPLES)
+    assert len(examples()) == len(REGISTER_EXAMPLES) + len(RENDER_EXAMPLES)
 
 
 def register_example_fields(world: World) -> None:
@@ -114,7 +121,7 @@ def test_every_example_is_accepted(world: World, method: str, path: str, kind: s
     register_example_fields(world)
     answer = world.client.request(method, path, json=value)
     assert answer.status_code == 202, answer.text
-    validator("RegisterRequest").validate(value)
+    validator({"/register": "RegisterRequest", "/render": "RenderBody"}[path]).validate(value)
 
 
 def validator(name: str) -> Draft202012Validator:
@@ -161,6 +168,28 @@ def test_bad_requests_are_bad_by_the_contract_too() -> None:
     for members in ({}, {"candidates": [OBJECT, OBJECT]}, {"candidates": []}, {"candidates": None}):
         search = {"scene": SCENE, "detection": good["detection"], **members}
         assert list(validator("RegisterRequest").iter_errors(search)), members
+
+
+def test_a_refusal_for_want_of_a_token_is_told_wherever_one_is_asked_for(guarded: World) -> None:
+    for method, path, operation in operations():
+        told = "401" in operation["responses"]
+        address = re.sub(r"\{(\w+)\}", lambda match: "1" if match[1] == "number" else "ab" * 32, path)
+        assert (guarded.client.request(method, address).status_code == 401) == told, (method, path)
+        assert (operation.get("security") == [{}]) == (not told), (method, path)
+
+
+def test_times_and_addresses_have_formats_and_closed_sets_are_enums() -> None:
+    schemas = CONTRACT["components"]["schemas"]
+    for name, schema in schemas.items():
+        for member, told in schema.get("properties", {}).items():
+            if member.endswith(("_at", "_until")) and member != "look_at":
+                kinds = [told, *told.get("anyOf", [])]
+                assert "date-time" in [kind.get("format") for kind in kinds], (name, member)
+    job = schemas["JobDocument"]["properties"]
+    assert job["phase"]["anyOf"][0]["enum"][0] == "loading"
+    assert set(job["verdict"]["anyOf"][0]["enum"]) == set(schemas["ResultDocument"]["properties"]["verdict"]["enum"])
+    assert schemas["ArtifactEntry"]["properties"]["url"]["format"] == "uri-reference"
+    assert [name for name in schemas if "__" in name] == []
 
 
 def test_the_documents_list_every_reason_and_address() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,8 @@ import httpx
 import pytest
 from redis import Redis
 
+from regnf_service.batches.feeder import Feeder
+from regnf_service.http.batch_intake import REQUESTS
 from regnf_state.ownership import reference_of
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
@@ -64,12 +67,20 @@ FIELD_ROUTES = [
     ("GET", "/fields/{field}"),
     ("HEAD", "/fields/{field}"),
     ("GET", "/fields/{field}?wait=1"),
+    ("GET", "/fields/{field}/mesh.glb"),
+    ("HEAD", "/fields/{field}/mesh.glb"),
     ("GET", "/fields/{field}/preview.png"),
     ("HEAD", "/fields/{field}/preview.png"),
     ("GET", "/fields/{field}/candidates/1.png"),
     ("HEAD", "/fields/{field}/candidates/1.png"),
     ("PATCH", "/fields/{field}"),
     ("DELETE", "/fields/{field}"),
+]
+ENTRY_ROUTES = [
+    ("GET", "/library/{entry}"),
+    ("GET", "/library/{entry}/file"),
+    ("PATCH", "/library/{entry}"),
+    ("DELETE", "/library/{entry}"),
 ]
 JOB_ROUTES = [
     ("GET", "/jobs/{job}"),
@@ -81,30 +92,50 @@ JOB_ROUTES = [
     ("POST", "/jobs/{job}/cancel"),
     ("DELETE", "/jobs/{job}"),
 ]
+BATCH_ROUTES = [
+    ("GET", "/batches/{batch}"),
+    ("GET", "/batches/{batch}?wait=1"),
+    ("GET", "/batches/{batch}/results"),
+    ("POST", "/batches/{batch}/cancel"),
+    ("DELETE", "/batches/{batch}"),
+]
 
 
 def test_the_tables_name_every_route_with_an_id(shared: World) -> None:
-    named = {(method, path.split("?")[0]) for method, path in FIELD_ROUTES + JOB_ROUTES}
+    named = {(method, path.split("?")[0]) for method, path in FIELD_ROUTES + ENTRY_ROUTES + JOB_ROUTES + BATCH_ROUTES}
     named |= {("PUT", "/fields/{field}"), ("GET", "/jobs/{job}/view"), ("HEAD", "/jobs/{job}/view")}
-    ids = {"{sha256}": "{field}", "{id}": "{job}", "{name}": "trace.json", "{number}": "1"}
+    ids = {
+        "{entry}": "{entry}",
+        "{batch}": "{batch}",
+        "{sha256}": "{field}",
+        "{id}": "{job}",
+        "{name}": "trace.json",
+        "{number}": "1",
+    }
+    told = shared.app.openapi()["paths"].items()
+    paths = {
+        path.replace("y/{name}", "y/{entry}").replace("batches/{id}", "batches/{batch}"): ops for path, ops in told
+    }
     spelled = {
         (method.upper(), re.sub(r"\{\w+\}", lambda found: ids[found[0]], path))
-        for path, operations in shared.app.openapi()["paths"].items()
+        for path, operations in paths.items()
         for method in operations
-        if path.startswith(("/fields/", "/jobs/", "/register"))
+        if path.startswith(("/fields/", "/library/", "/jobs/", "/register", "/batches"))
     }
-    assert spelled - {("POST", "/register")} == named
+    assert spelled - {("POST", "/register"), ("POST", "/batches"), ("GET", "/batches")} == named
 
 
 @pytest.mark.parametrize("prefix", ["", "/v1"])
-@pytest.mark.parametrize(("method", "path"), FIELD_ROUTES + JOB_ROUTES)
+@pytest.mark.parametrize(("method", "path"), FIELD_ROUTES + ENTRY_ROUTES + JOB_ROUTES)
 def test_anothers_is_not_there(
     shared: World, bob: httpx.Client, alices_job: str, method: str, path: str, prefix: str
 ) -> None:
     """The answer is the one for an id that nobody has, member by member, and alice's still stands afterwards."""
-    body = {"description": {"sign": -1}} if method == "PATCH" else None
-    answer = bob.request(method, prefix + path.format(field=sha256(SCENE), job=alices_job), json=body)
-    unknown = bob.request(method, prefix + path.format(field="0" * 64, job="0" * 32), json=body)
+    shared.client.post("/library", json={"name": "chair", "field": sha256(OBJECT)})
+    changes = {"/fields": {"description": {"sign": -1}}, "/library": {"tags": ["b"]}}
+    body = next(one for part, one in changes.items() if part in path) if method == "PATCH" else None
+    answer = bob.request(method, prefix + path.format(field=sha256(SCENE), job=alices_job, entry="chair"), json=body)
+    unknown = bob.request(method, prefix + path.format(field="0" * 64, job="0" * 32, entry="none"), json=body)
     assert answer.status_code == unknown.status_code == 404
     told, untold = (dict(one.json()) if one.content else {} for one in (answer, unknown))
     for document in (told, untold):
@@ -113,6 +144,38 @@ def test_anothers_is_not_there(
     assert told == untold
     assert shared.client.get(f"/jobs/{alices_job}/result").status_code == 200
     assert shared.client.get(f"/fields/{sha256(SCENE)}").status_code == 200
+    assert shared.client.get("/library/chair").json()["tags"] == []
+
+
+def test_a_library_is_each_callers_own(shared: World, bob: httpx.Client, alices_job: str) -> None:
+    entry = {"name": "chair", "field": sha256(OBJECT)}
+    assert shared.client.post("/library", json=entry).status_code == 201
+    assert bob.get("/library").json()["entries"] == []
+    assert_refused(bob.post("/library", json=entry), 404, "FIELD_NOT_FOUND")
+    ready(shared, bob, "bob", OBJECT)
+    assert bob.post("/library", json=entry).status_code == 201, "the name is alice's, and bob's too"
+    assert bob.delete("/library/chair").status_code == 204
+    assert shared.client.get("/library/chair").status_code == 200
+    named = {"scene": sha256(SCENE), "object": {"library": "chair"}, "detection": BOX}
+    assert_refused(bob.post("/register", json=named), 404, "LIBRARY_ENTRY_NOT_FOUND")
+
+
+@pytest.mark.parametrize("prefix", ["", "/v1"])
+@pytest.mark.parametrize(("method", "path"), BATCH_ROUTES)
+def test_anothers_batch_is_not_there(
+    shared: World, bob: httpx.Client, alices_job: str, method: str, path: str, prefix: str
+) -> None:
+    line = {"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX}
+    content, headers = json.dumps(line).encode(), {"Content-Type": "application/x-ndjson"}
+    posted = shared.client.post("/batches", content=content, headers=headers)
+    assert posted.status_code == 202, posted.text
+    Feeder(shared.app.state.services, REQUESTS).run_once()
+    assert_refused(bob.request(method, prefix + path.format(batch=posted.json()["id"])), 404, "BATCH_NOT_FOUND")
+    assert bob.get("/batches").json()["batches"] == []
+    assert shared.client.get(f"/batches/{posted.json()['id']}").json()["status"] == "finished"
+    if method == "GET":
+        bobs = bob.post("/batches", content=content, headers=headers).json()
+        assert bobs["status"] == "running", "the same lines are each caller's own batch"
 
 
 def test_a_job_that_has_expired_is_gone_to_its_owner_and_unknown_to_others(
@@ -196,5 +259,7 @@ def test_a_caller_is_one_whichever_of_its_tokens_it_sends(shared: World, bob: ht
 
 def test_no_answer_tells_how_fields_are_called_inside(shared: World, alices_job: str) -> None:
     client = shared.client
-    texts = [client.get(path).text for path in ("/fields", "/jobs", f"/jobs/{alices_job}", f"/fields/{sha256(SCENE)}")]
+    client.post("/library", json={"name": "chair", "field": sha256(OBJECT)})
+    paths = ("/fields", "/jobs", "/library", "/library/chair", f"/jobs/{alices_job}", f"/fields/{sha256(SCENE)}")
+    texts = [client.get(path).text for path in paths]
     assert not [text for text in texts if "_alice" in text]

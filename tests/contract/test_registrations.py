@@ -59,6 +59,17 @@ def test_the_request_is_one_value_from_the_route_to_the_worker(world: World) -> 
     assert (read.seed, read.detection.label, read.options.preset) == (3, "chair", "robust")
 
 
+def test_a_request_without_pictures_is_another_job(world: World) -> None:
+    usual, said, without = (post(world, **more).json() for more in ({}, {"pictures": True}, {"pictures": False}))
+    assert usual["id"] == said["id"] != without["id"]
+    assert (usual["inputs"]["pictures"], without["inputs"]["pictures"]) == (True, False)
+    for id_, pictures in ((usual["id"], True), (without["id"], False)):
+        record = world.records.get_job(id_)
+        assert record is not None
+        assert RegistrationRequest.from_record(record.request).pictures is pictures
+    assert_refused(post(world, pictures="no"), 422, "INVALID_REQUEST")
+
+
 def test_two_spellings_of_one_request_are_one_job(world: World) -> None:
     request = world.valid_request()
     box = {"center": [0, 0.25, 0.5], "size": [1, 1, 1]}

@@ -29,6 +29,35 @@ def test_the_result_lists_its_artifacts(world: World, job_id: str) -> None:
     assert listed["scene_points.ply"]["bytes"] == len(DATA)
 
 
+def test_pictures_follow_the_result(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["preview.png"])
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    listed = {entry["name"]: entry for entry in document["artifacts"]}
+    picture = listed["preview.png"]
+    assert (picture["state"], picture["bytes"], picture["sha256"]) == ("pending", None, None)
+    assert listed["result.json"]["state"] == "ready"
+    refused = world.client.get(picture["url"], params={"wait": 0})
+    assert_refused(refused, 409, "ARTIFACT_NOT_READY")
+    assert refused.headers["retry-after"] == "1"
+    assert world.client.head(picture["url"], params={"wait": 0}).status_code == 409
+    world.finish(job_id, {"preview.png": b"a picture"})
+    assert world.client.get(picture["url"]).content == b"a picture"
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert [entry["state"] for entry in document["artifacts"]] == ["ready", "ready"]
+    assert "missing_artifacts" not in document
+
+
+def test_pictures_whose_worker_has_died_are_missing_in_time(world: World) -> None:
+    job_id = world.submit(seed=1)
+    world.succeed(job_id, pending=["preview.png"])
+    world.records.ahead_s = world.settings.lost_after_s + 1
+    document = world.client.get(f"/jobs/{job_id}/result").json()
+    assert document["missing_artifacts"] == ["preview.png"]
+    assert [entry["name"] for entry in document["artifacts"]] == ["result.json"]
+    assert_refused(world.client.get(f"/jobs/{job_id}/artifacts/preview.png"), 404, "ARTIFACT_NOT_FOUND")
+
+
 def test_a_result_comes_when_it_is_there_and_not_before(world: World) -> None:
     job_id = world.submit(seed=1)
     for path in ("result", "artifacts/trace.json"):

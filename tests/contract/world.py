@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import httpx
 from fastapi import FastAPI
 from redis import Redis
+from starlette.routing import BaseRoute
 
 from regnf_service.app import create_app
 from regnf_state.queue import Work
@@ -19,6 +21,7 @@ from regnf_state.settings import Settings
 from tests.contract.asgi import client_of
 from tests.stores import HeldBlobs, ShiftedJournaledRecords, WatchedQueue, stores_over
 
+_ROUTES: list[BaseRoute] = []
 BOX = {"min": [-0.4, -0.3, 0.0], "max": [0.1, 0.2, 0.4]}
 BOUNDS = [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]
 NOBODY = "0" * 32
@@ -103,22 +106,38 @@ class World:
         assert record is not None
         return self.records.update_job(job_id, record.attempt, status="running", phase="loading")
 
-    def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None) -> None:
-        """What a worker leaves behind in the end."""
+    def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, pending: Sequence[str] = ()) -> None:
+        """What a worker leaves behind in the end; ``pending`` is still to come."""
         attempt = self.run(job_id).attempt
-        files = {"result.json": json.dumps(RESULT).encode()} | (artifacts or {})
+        listed = self._put(job_id, attempt, {"result.json": json.dumps(RESULT).encode()} | (artifacts or {}))
+        document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
+        self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
+        self.records.update_job(job_id, attempt, status="successful")
+
+    def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
+        """What it leaves behind of what was still to come."""
+        document = {"artifacts": self._put(job_id, 1, artifacts), "missing": []}
+        self.blobs.put(f"jobs/{job_id}/rest.json", json.dumps(document).encode())
+
+    def _put(self, job_id: str, attempt: int, files: dict[str, bytes]) -> list[dict[str, Any]]:
         for name, data in files.items():
             self.blobs.put(f"jobs/{job_id}/{attempt}/{name}", data)
-        listed = [
+        return [
             {"name": name, "bytes": len(data), "media_type": "application/octet-stream", "sha256": sha256(data)}
             for name, data in files.items()
         ]
-        self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps({"attempt": attempt, "artifacts": listed}).encode())
-        self.records.update_job(job_id, attempt, status="successful")
 
     def fail(self, job_id: str, **error: Any) -> None:
         attempt = self.run(job_id).attempt
         self.records.update_job(job_id, attempt, status="failed", error=error)
+
+
+def share_routes(app: FastAPI) -> None:
+    """Give every application the routes of the first one: no setting changes them, and the framework takes longer to
+    work them out, at an application's first request, than most tests take for theirs."""
+    if not _ROUTES:
+        _ROUTES.extend(app.router.routes)
+    app.router.routes[:] = _ROUTES
 
 
 def make_world(folder: Path, redis: Redis, **settings: Any) -> World:
@@ -127,6 +146,7 @@ def make_world(folder: Path, redis: Redis, **settings: Any) -> World:
     chosen = Settings(**(usual | settings))
     stores = stores_over(redis, chosen.blob_dir, chosen.retention_s)
     app = create_app(chosen, stores)
+    share_routes(app)
     return World(chosen, redis, stores.records, stores.blobs, stores.queue, app, client_of(app))
 
 

@@ -86,7 +86,8 @@ def test_the_builder_is_sent_what_the_wheel_is_made_of_and_no_more(tmp_path: Pat
     with ZipFile(build_wheel(tmp_path, tmp_path / "sent")) as made, ZipFile(build_wheel(tmp_path / "all")) as whole:
         assert sorted(made.namelist()) == sorted(whole.namelist())
     folders = {name.parts[0] for name in sent_files()}
-    assert not {"tests", "docs", "benchmarks", "deploy", ".ci", ".git", ".venv"} & folders
+    assert not {"tests", "benchmarks", "deploy", ".ci", ".git", ".venv"} & folders
+    assert {name.parts[1] for name in sent_files() if name.parts[0] == "docs"} & {"adr", "images", "reference"} == set()
 
 
 def test_the_service_image_has_no_torch() -> None:

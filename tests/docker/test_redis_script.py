@@ -28,7 +28,10 @@ SCRIPT = ROOT / "docker/redis.sh"
 
 
 def started(program: str, folder: Path) -> subprocess.Popen[bytes]:
-    environment = os.environ | {"REDIS_SERVER": program, "REDIS_DATA": str(folder), "REDIS_RUN": str(folder)}
+    server = folder / "redis-server"  # a program that is a server or a checker of files goes by its name
+    if not server.is_symlink():
+        server.symlink_to(program)
+    environment = os.environ | {"REDIS_SERVER": str(server), "REDIS_DATA": str(folder), "REDIS_RUN": str(folder)}
     given = services()["redis"]["command"][2:]
     options = [*given, "--port", "0", "--unixsocket", str(folder / "s"), "--loglevel", "warning"]
     process = subprocess.Popen(["sh", str(SCRIPT), *options], env=environment, stdout=subprocess.DEVNULL)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from regnf_core.field_views import FieldViews
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.blobs.base import BlobStore
 from regnf_state.logs import configure_logging
@@ -20,11 +21,14 @@ from regnf_state.manifest import Manifest
 from regnf_state.queue import Kind
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
-from regnf_worker import artifacts, registration
+from regnf_worker import artifacts
+from regnf_worker import attempt as attempts
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
+from regnf_worker.drawing import draw_field
+from regnf_worker.engine import Made
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.process import Function, RegnfWorker
-from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 from tests.worker.tiny_engine import Report, TinyEngine, tiny_importer
@@ -51,7 +55,7 @@ class HeldEngine(TinyEngine):
         report: Report,
         folder: Path,
         notes: Any,
-    ) -> list[str]:
+    ) -> Made:
         held = replace(request, detection=replace(request.detection, label="while_held"))
         return super().register(scene, object_, model, held, report, folder, notes)
 
@@ -82,13 +86,18 @@ def context(existing: bool = True) -> Context:
 
 def run_registration(job_id: str, attempt: int, worker: str) -> None:
     shorten_waits()
-    registration.publish = publish
+    attempts.publish = publish
     run_attempt(context(), job_id, attempt, worker, HeldEngine)
 
 
 def run_import(sha256: str, attempt: int, worker: str) -> None:
     shorten_waits()
     run_import_attempt(context(), sha256, attempt, worker, held_importer)
+
+
+def run_drawing(reference: str) -> None:
+    """Nothing is seen of the fields here."""
+    draw_field(context(), reference, lambda _: FieldViews())
 
 
 FUNCTIONS: Mapping[Kind, Function] = {"import": run_import, "registration": run_registration}
@@ -98,7 +107,7 @@ FUNCTIONS: Mapping[Kind, Function] = {"import": run_import, "registration": run_
 def work() -> None:
     scratch = Scratch(Settings().scratch_dir)
     try:
-        RegnfWorker(context(existing=False), scratch, functions=FUNCTIONS).serve()
+        RegnfWorker(context(existing=False), scratch, functions=FUNCTIONS, draw=run_drawing).serve()
     finally:
         scratch.remove()
 

@@ -42,10 +42,15 @@ def tar_bytes(members: Members, **kinds: dict[str, object]) -> bytes:
     return buffer.getvalue()
 
 
-def with_settings(content: str | bytes, name: str = "run/config.yml") -> Callable[[Seeds], bytes]:
-    """A zip of a run with this file of settings in it."""
-    data = content.encode() if isinstance(content, str) else content
-    return lambda s: zip_bytes([(CHECKPOINT, s.archive), (name, data)], zipfile.ZIP_DEFLATED)
+def with_settings(content: str | bytes | Callable[[], str], name: str = "run/config.yml") -> Callable[[Seeds], bytes]:
+    """A zip of a run with this file of settings in it. What is long is a function: every test process collects it."""
+
+    def made(s: Seeds) -> bytes:
+        text = content() if callable(content) else content
+        data = text.encode() if isinstance(text, str) else text
+        return zip_bytes([(CHECKPOINT, s.archive), (name, data)], zipfile.ZIP_DEFLATED)
+
+    return made
 
 
 def in_tar(**kinds: dict[str, object]) -> Callable[[Seeds], bytes]:
@@ -176,10 +181,13 @@ RUNS: Files = {
     "YAML with a key twice": (with_settings("a: 1\na: 2\n"), "rejected SETTINGS_MALFORMED"),
     "YAML of two documents": (with_settings("a: 1\n---\nb: 2\n"), "rejected SETTINGS_MALFORMED"),
     "YAML nested 1000 deep": (with_settings("[" * 1000 + "]" * 1000), "rejected SETTINGS_TOO_LARGE"),
-    "YAML of 10^6 keys": (with_settings("".join(f"k{i}: 1\n" for i in range(10**6))), "rejected SETTINGS_TOO_LARGE"),
+    "YAML of 10^6 keys": (
+        with_settings(lambda: "".join(f"k{i}: 1\n" for i in range(10**6))),
+        "rejected SETTINGS_TOO_LARGE",
+    ),
     "YAML that is not UTF-8": (with_settings(b"a: \xff\xfe"), "rejected SETTINGS_MALFORMED"),
     "JSON of 10^6 keys": (
-        with_settings(json.dumps({str(i): 1 for i in range(10**6)}), "run/transforms.json"),
+        with_settings(lambda: json.dumps({str(i): 1 for i in range(10**6)}), "run/transforms.json"),
         "rejected SETTINGS_TOO_LARGE",
     ),
     "JSON with a key twice": (with_settings('{"a": 1, "a": 2}', "run/transforms.json"), "rejected SETTINGS_MALFORMED"),

@@ -20,6 +20,7 @@ def quick_and_clean(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("regnf_state.logs", "regnf_worker.main"):
         monkeypatch.setattr(f"{module}.configure_logging", lambda _: None)
     monkeypatch.setattr("redis.backoff.ExponentialWithJitterBackoff.compute", lambda *_: 0.0)
+    monkeypatch.setenv("REGNF_PRELOAD", "false")  # a worker may begin its program anew: here that is the test runner
 
 
 @pytest.fixture

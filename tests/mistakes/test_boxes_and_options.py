@@ -45,9 +45,9 @@ BOXES = [
 OPTIONS = [
     Case("spelling of earlier versions", "INVALID_OPTIONS", 2, "o.json: options.initialisation", "no such option", "did you mean `initialization`", '{"initialisation": {}}'),
     Case("misspelled option", "INVALID_OPTIONS", 2, "o.json: options.robust.rotation", "no such option", "did you mean `robust.rotations`", '{"robust": {"rotation": 5}}'),
-    Case("option of another type", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "valid integer", "docs/api.md", '{"robust": {"rotations": "many"}}'),
-    Case("option out of range", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "less than or equal to 20000", "docs/api.md", '{"robust": {"rotations": 1000000}}'),
-    Case("misspelled preset", "INVALID_OPTIONS", 2, "o.json: options.preset", "'paper' or 'robust'", "docs/api.md", '{"preset": "papr"}'),
+    Case("option of another type", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "valid integer", "regnf manual api", '{"robust": {"rotations": "many"}}'),
+    Case("option out of range", "INVALID_OPTIONS", 2, "o.json: options.robust.rotations", "less than or equal to 20000", "regnf manual api", '{"robust": {"rotations": 1000000}}'),
+    Case("misspelled preset", "INVALID_OPTIONS", 2, "o.json: options.preset", "'paper' or 'robust'", "regnf manual api", '{"preset": "papr"}'),
     Case("options as a list", "MALFORMED_JSON", 2, "o.json", "expected a JSON object", "Write an object", "[]"),
 ]  # fmt: skip
 

@@ -102,7 +102,7 @@ def install_wheel(venv_folder: Path, wheel: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def run(command: list[str | Path], folder: Path, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
+def run(command: list[str | Path], folder: Path, timeout_s: float = 280.0) -> subprocess.CompletedProcess[str]:
     """Run a program of a clean environment, away from the checkout and from this process' Python settings."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "REGNF_"))}
     environment |= {"HOME": str(folder), "OMP_NUM_THREADS": "1"}

@@ -14,13 +14,15 @@ import pytest
 import yaml
 
 from regnf_cli.demo_data import FILES
+from regnf_cli.manual import pages_of
 from regnf_core.version import __version__
 from scripts import wheel_hook
 from tests.packaging.environments import ROOT, build_wheel, clean_environment, install_wheel, run
 
 pytestmark = pytest.mark.xdist_group("packaging")
 PACKAGES = {
-    "regnf_cli", "regnf_core", "regnf_data", "regnf_fit", "regnf_service", "regnf_state", "regnf_worker",
+    "regnf", "regnf_cli", "regnf_client", "regnf_core", "regnf_data",
+    "regnf_fit", "regnf_service", "regnf_state", "regnf_worker",
 }  # fmt: skip
 FOLDERS = {"regnf_service": "service/regnf_service", "regnf_worker": "worker/regnf_worker"}
 
@@ -54,6 +56,12 @@ def test_every_file_of_a_package_is_in_it(names: set[str], package: str) -> None
 def test_the_demo_has_its_files(names: set[str]) -> None:
     assert wheel_hook.FILES == FILES
     assert {f"regnf_cli/demo_files/{name}" for name in FILES} <= names
+
+
+def test_the_manual_has_its_pages(names: set[str]) -> None:
+    """Those that a checkout shows: the wheel's list and the command's are made in different ways."""
+    assert {f"regnf_cli/manual_pages/{name}.md" for name in pages_of(ROOT / "docs")} <= names
+    assert {"families.md", "how-to/batch.md"} <= set(wheel_hook.pages(ROOT))
 
 
 def test_the_metadata_is_complete_and_names_no_address(wheel: Path) -> None:
@@ -142,6 +150,7 @@ with running_service(pathlib.Path("state")) as address:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_with_everything_the_demo_and_the_page_work(wheel: Path, tmp_path: Path) -> None:
     programs = clean_environment(tmp_path / "venv", wheel, "all")
     done = run([programs / "regnf", "demo", "--exit"], tmp_path)

@@ -20,6 +20,9 @@ from tests.object_store import ObjectServer
 from tests.redis_server import private_redis
 from tests.worker.bench import eventually
 
+PATIENCE_S = 300.0
+"""Pictures follow with a low priority."""
+
 
 @contextmanager
 def process(module: list[str], environment: dict[str, str], log: Path, *passed: int) -> Iterator[None]:
@@ -89,14 +92,18 @@ def test_a_registration_between_two_machines(client: httpx.Client, tmp_path: Pat
     assert finished(client, job_id)["status"] == "successful", logs(tmp_path)
     result = client.get(f"/jobs/{job_id}/result").json()
     assert result["verdict"] == "registered"
-    for artifact in result["artifacts"]:
+    for artifact in result["artifacts"]:  # the answer waits a while for those that follow the result
+        address = f"/jobs/{job_id}/artifacts/{artifact['name']}"
+        eventually(lambda of=address: client.get(of).status_code == 200, lambda: logs(tmp_path), PATIENCE_S)
+    for artifact in client.get(f"/jobs/{job_id}/result").json()["artifacts"]:
         address = f"/jobs/{job_id}/artifacts/{artifact['name']}"
         content = client.get(address).content
         assert hashlib.sha256(content).hexdigest() == artifact["sha256"]
         middle = len(content) // 2
         part = client.get(address, headers={"Range": f"bytes={middle}-{middle + 9}"})
         assert (part.status_code, part.content) == (206, content[middle : middle + 10])
-    assert client.get(f"/fields/{scene}/preview.png").content.startswith(b"\x89PNG")
+    picture = f"/fields/{scene}/preview.png"
+    eventually(lambda: client.get(picture).content.startswith(b"\x89PNG"), lambda: logs(tmp_path), PATIENCE_S)
     assert len(list((tmp_path / "worker" / "field-cache").iterdir())) >= 2, "the fields stay with the worker"
     assert not (tmp_path / "api" / "blobs").exists()
     assert not (tmp_path / "worker" / "blobs").exists()

@@ -183,3 +183,14 @@ def test_once_an_hour_is_enough(world: World) -> None:
         world.blobs.put("jobs/unknown/1/result.json", b".")
         world.blobs.age()
         assert keeper.run_if_due(term) == Removed()
+
+
+def test_lines_of_a_batch_whose_head_was_never_written_go_after_a_day(world: World) -> None:
+    for name in ("left", "kept"):
+        world.blobs.put(f"batches/data/anyone/{name}/pairs", b"{}")
+        world.blobs.put(f"batches/data/anyone/{name}/results/00000000", b"{}")
+    world.blobs.put("batches/heads/anyone/kept", b"{}")
+    assert world.tidy() == Removed()
+    world.blobs.age()
+    assert world.tidy() == Removed(temporary=1)
+    assert {key.split("/")[3] for key in world.blobs.list("batches/data")} == {"kept"}

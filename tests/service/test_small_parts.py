@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.ranges import ByteRange, parse_range
-from regnf_service.http.routes.registrations import preferred_wait
+from regnf_service.http.routes.submitting import preferred_wait
 from regnf_service.http.strict_json import parse_json
 from regnf_service.jobs import identity
 from regnf_service.jobs.identity import digest, job_id_of

@@ -3,9 +3,9 @@
     python -m tests.ui.fixture_server        then open the printed addresses
 
 The job's id chooses the story: done, ambiguous, running, queued, failed, dismissed, live, polled
-(live without an event stream), asked (the scene's file may be two functions), locked (wants a token), bare (a result
-with little in it), roomy (with the scene round the detection), broken (damaged clouds), searched (the best of a
-library) or tipped (y is up).
+(live without an event stream), asked (the scene's file may be two functions), locked (wants a token), numbers (made
+without pictures), bare (a result with little in it), roomy (with the scene round the detection), broken (damaged
+clouds), searched (the best of a library), tipped (y is up), meshed (with display meshes) or rendered (a rendering).
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ from typing import Any, ClassVar
 from PIL import Image
 
 from tests.ui.synthetic import JOB_ID, Synthetic, synthetic
-from tests.ui.verdicts import ambiguous_result, searched_result
+from tests.ui.synthetic_meshes import object_mesh, scene_mesh
+from tests.ui.verdicts import ambiguous_result, judged_result, searched_result
 
 WEB = Path(__file__).resolve().parents[2] / "service" / "regnf_service" / "web"
 CONTENT_SECURITY_POLICY = "default-src 'self'"
 TOKEN = "open-sesame"
 STORIES = (
     "done",
+    "judged",
     "ambiguous",
     "running",
     "queued",
@@ -44,6 +46,9 @@ STORIES = (
     "broken",
     "searched",
     "tipped",
+    "meshed",
+    "numbers",
+    "rendered",
 )
 STEPS: tuple[dict[str, Any], ...] = (
     {"status": "accepted", "queue_position": 3},
@@ -107,19 +112,35 @@ class Stage:
             document |= {"status": "failed", "phase": "sampling", "progress": 0.2, "error": FAILURE}
         elif story == "asked":
             document |= {"status": "failed", "phase": "loading", "progress": 0.0, "error": FAILURE | REJECTED}
+        elif story == "meshed":
+            document["inputs"] |= MESHED
+        elif story == "numbers":
+            document["inputs"] |= {"pictures": False}
         elif story == "dismissed":
             document |= {"status": "dismissed"}
+        elif story == "rendered":
+            document |= {"id": story, "kind": "render", "inputs": {"scene": "a3" * 32}} | RENDERING
         elif story in ("live", "polled"):
             document |= {"phase": None, "progress": 0.0} | STEPS[self.step]
         return document
 
+    def rendering(self) -> dict[str, Any]:
+        """What the service answers when a rendering is asked for."""
+        return self.job("rendered") | {"status": "accepted", "phase": None, "progress": 0.0}
+
     def result(self, story: str) -> dict[str, Any]:
+        if story == "rendered":
+            return {"frames": 1, "size": [48, 32], "artifacts": [{"name": STRIP, "bytes": 1, "kind": "strip"}]}
         if story == "bare":
             return {k: self.data.result[k] for k in ("verdict", "verdict_reason", "T_object_scene", "metrics")}
+        if story == "numbers":
+            return self.data.result | {"artifacts": [{"name": "trace.json"}, {"name": "transform.npy"}]}
         if story == "roomy":
             return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
         if story == "searched":
             return searched_result(self.data)
+        if story == "judged":
+            return judged_result(self.data)
         if story == "tipped":
             return self.data.result | {"options": {"preset": "robust", "up_axis": "y"}}
         if story != "ambiguous":
@@ -137,6 +158,10 @@ FAILURE = {
     "request_id": "req-7f3a",
 }
 
+STRIP = "before-after.png"
+MESHED = {"scene": "a4" * 32, "object": "7d" * 32}
+LABELS = {"a4": "hall.ply", "7d": "armchair.glb", "a3": "living <b>room</b>.ply", "7c": "chair.glb"}
+RENDERING = {"links": {"view": "/jobs/rendered/view"}}
 REJECTED = {"title": "Field rejected", "reason": "FIELD_REJECTED", "detail": "the field was rejected: LAYOUT_AMBIGUOUS"}
 CANDIDATES = [
     {"name": "<i>smooth</i>", "description": {"hash": {"interpolation": "smoothstep"}}, "picture": "/1.png"},
@@ -147,8 +172,14 @@ CANDIDATES = [
 def field_document(sha256: str) -> dict[str, Any]:
     """The scene was asked about, the object is ready."""
     if not sha256.startswith("a3"):
-        return {"sha256": sha256, "state": "ready", "error": None}
-    return {"sha256": sha256, "state": "rejected", "error": {"reason": "LAYOUT_AMBIGUOUS", "candidates": CANDIDATES}}
+        links = {"mesh": f"/fields/{sha256}/mesh.glb"} if sha256 in MESHED.values() else {}
+        return {"sha256": sha256, "state": "ready", "label": LABELS.get(sha256[:2]), "links": links, "error": None}
+    return {
+        "sha256": sha256,
+        "state": "rejected",
+        "label": LABELS["a3"],
+        "error": {"reason": "LAYOUT_AMBIGUOUS", "candidates": CANDIDATES},
+    }
 
 
 def field_picture(sha256: str) -> bytes:
@@ -171,6 +202,9 @@ class Handler(BaseHTTPRequestHandler):
         field = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})", path)
         if field:
             return self._json(200, field_document(field[1]))
+        mesh = re.fullmatch(r"/fields/([0-9a-f]{64})/mesh\.glb", path)
+        if mesh:
+            return self._bytes(200, scene_mesh() if mesh[1] == MESHED["scene"] else object_mesh(), "model/gltf-binary")
         picture = re.fullmatch(r"(?:/v1)?/fields/([0-9a-f]{64})/(?:preview|candidates/1)\.png", path)
         if picture:
             if "/locked/" in self.headers.get("Referer", "") and self.headers.get("Authorization") != f"Bearer {TOKEN}":
@@ -189,6 +223,9 @@ class Handler(BaseHTTPRequestHandler):
         return self._job(story, rest)
 
     def do_POST(self) -> None:
+        self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        if self.path.endswith("/render"):
+            return self._json(202, self.stage.rendering())
         if not self.path.endswith("/cancel"):
             return self._problem(404, "NOT_FOUND")
         with self.stage.changed:
@@ -204,6 +241,8 @@ class Handler(BaseHTTPRequestHandler):
         if rest == "/events":
             return self._problem(404, "NOT_FOUND") if story == "polled" else self._events(story)
         name = rest.removeprefix("/artifacts/")
+        if (story, name) == ("rendered", STRIP):
+            return self._bytes(200, field_picture("7c" * 32), "image/png")
         if name not in self.stage.data.artifacts or (story == "bare" and name == "trace.json"):
             return self._problem(404, "ARTIFACT_NOT_FOUND")
         data = self.stage.data.artifacts[name]

@@ -52,8 +52,8 @@ def box_surface(
     return np.concatenate(points), np.concatenate(normals)
 
 
-def chair(spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """A chair standing on z = 0, facing +y, about 0.9 high."""
+def chair_boxes() -> list[tuple[list[float], list[float]]]:
+    """The lower and upper corners of the boxes of a chair standing on z = 0, facing +y, about 0.9 high."""
     boxes: list[tuple[list[float], list[float]]] = [([-0.24, -0.24, 0.42], [0.24, 0.24, 0.47])]
     boxes += [
         ([x - 0.022, y - 0.022, 0.0], [x + 0.022, y + 0.022, 0.42 if y > 0 else 0.92])
@@ -65,7 +65,12 @@ def chair(spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
         ([0.22, -0.21, 0.64], [0.26, 0.16, 0.67]),
         ([0.225, 0.1, 0.47], [0.255, 0.14, 0.64]),
     ]  # one arm: no symmetry
-    parts = [box_surface(low, high, spacing, rng) for low, high in boxes]
+    return boxes
+
+
+def chair(spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Points on the chair and their normals."""
+    parts = [box_surface(low, high, spacing, rng) for low, high in chair_boxes()]
     return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
 
 
@@ -131,6 +136,10 @@ def ply(points: Array, normals: Array, color: tuple[int, int, int]) -> bytes:
     return ("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes()
 
 
+CHAIR_IN_SCENE = similarity(1.0, rotation([0, 0, 1], math.radians(-125)), [0.25, 0.1, 0.0])
+LIBRARY_FROM_CHAIR = similarity(1.6, rotation([0, 0, 1], math.radians(30)), [0.0, 0.0, -0.72])
+
+
 @dataclass(frozen=True)
 class Synthetic:
     """What the fixture serves: the result document, the detection and the artifacts' bytes."""
@@ -188,6 +197,14 @@ def _residuals(scene: Array, obj: Array, rng: np.random.Generator) -> bytes:
     return buffer.getvalue()
 
 
+def _considered(scene: Array, obj: Array) -> bytes:
+    """Of two poses: nothing speaks against the first, everything against the second."""
+    signs = {f"{side}_signs": np.array([[0], [1]], np.uint8).repeat(300, 1) for side in ("scene", "object")}
+    packed = io.BytesIO()
+    np.savez(packed, scene_points=scene[:300].astype(np.float32), object_points=obj[:300].astype(np.float32), **signs)
+    return packed.getvalue()
+
+
 def _detection(seen: Array) -> dict[str, Any]:
     low, high = seen.min(axis=0) - 0.04, seen.max(axis=0) + 0.04
     return {
@@ -224,8 +241,7 @@ def _result(T_scene_object: Array, initial: Array, artifacts: dict[str, bytes]) 
 def synthetic(seed: int = 7, spacing: float = 0.018) -> Synthetic:
     """The whole made-up registration; deterministic for ``seed``."""
     rng = np.random.default_rng(seed)
-    chair_in_scene = similarity(1.0, rotation([0, 0, 1], math.radians(-125)), [0.25, 0.1, 0.0])
-    library_from_chair = similarity(1.6, rotation([0, 0, 1], math.radians(30)), [0.0, 0.0, -0.72])
+    chair_in_scene, library_from_chair = CHAIR_IN_SCENE, LIBRARY_FROM_CHAIR
     T_scene_object = chair_in_scene @ np.linalg.inv(library_from_chair)
     T_object_scene = np.linalg.inv(T_scene_object)
 
@@ -247,6 +263,7 @@ def synthetic(seed: int = 7, spacing: float = 0.018) -> Synthetic:
         "residuals.npz": _residuals(seen, library, rng),
     }
     result = _result(T_scene_object, initial, artifacts)
+    artifacts["considered.npz"] = _considered(seen, library)  # listed by the one story that has it
     # Held, but listed by the one story that has it: older results have no surroundings.
     artifacts["context_points.ply"] = ply(around, around_normals, (200, 200, 200))
     return Synthetic(result, _detection(seen), artifacts, T_object_scene, initial)

@@ -28,6 +28,7 @@ from tests.ui.conftest import Visit
 from tests.ui.fixture_server import field_picture
 from tests.ui.pixels import canvas_pixels, colored
 from tests.ui.synthetic import JOB_ID, Synthetic
+from tests.ui.synthetic_meshes import object_mesh, scene_mesh
 
 pytestmark = pytest.mark.browser
 SCENE, OBJECT = "a3" * 32, "7c" * 32
@@ -105,6 +106,7 @@ def accept(stores: Stores, detection: dict[str, object], owner: str) -> None:
         reference = reference_of(owner, sha256)
         records.create_field(FieldRecord(reference, "ready", bytes=1, created=now, updated=now))
         blobs.put(f"fields/{reference}/preview.png", field_picture(sha256))
+        blobs.put(f"fields/{reference}/mesh.glb", scene_mesh() if sha256 == SCENE else object_mesh())
 
 
 def test_follows_a_job_of_the_real_service_to_its_picture(visit: Visit) -> None:

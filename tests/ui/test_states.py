@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.ui.conftest import Visit
 
@@ -43,6 +43,21 @@ def test_follows_a_job_to_its_result(visit: Visit, story: str) -> None:
     assert len(asked) == 1, asked
     # Only the refused stream may be complained about, and only where it is refused.
     assert len(visit.complaints) == (1 if story == "polled" else 0), visit.complaints
+
+
+def test_waits_for_the_files_that_follow_a_result(visit: Visit) -> None:
+    answers = []
+
+    def still_to_come(route: Route) -> None:
+        answers.append(route.request.url)
+        if len(answers) > 2:
+            return route.continue_()
+        return route.fulfill(status=409, json={"reason": "ARTIFACT_NOT_READY"}, headers={"Retry-After": "0"})
+
+    visit.page.route("**/artifacts/trace.json", still_to_come)
+    page = visit.open("done")
+    page.wait_for_selector("#tools:not([hidden])")
+    assert len(answers) == 3
 
 
 def test_cancel_ends_the_job(visit: Visit) -> None:
@@ -90,3 +105,12 @@ def test_lost_connection_is_told_and_mended(visit: Visit) -> None:
     visit.server.stage.advance()
     page.context.set_offline(False)
     expect(page.locator("#message-title")).to_have_text("Loading", timeout=30_000)
+
+
+def test_a_result_without_pictures_says_so_and_has_its_numbers(visit: Visit) -> None:
+    page = visit.open("numbers")
+    expect(page.locator("#message")).to_contain_text("without pictures")
+    expect(page.locator("#tools")).to_be_hidden()
+    expect(page.locator("#matrix")).to_be_visible()
+    assert not [one for one in visit.requests if one.endswith(".ply")]
+    assert visit.complaints == []

@@ -12,11 +12,12 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import TOKEN
+from tests.ui.fixture_server import LABELS, TOKEN, WEB
 from tests.ui.pixels import canvas_pixels, center_of, changed_share, colored, differs, overlap
 from tests.ui.synthetic import ITERATIONS
 
 pytestmark = pytest.mark.browser
+ROOM, CHAIR = LABELS["a3"], LABELS["7c"]
 
 
 def seek(visit: Visit, position: int) -> None:
@@ -115,7 +116,50 @@ def test_numbers_are_the_documents(visit: Visit) -> None:
     assert "12.3 s" in figures
     assert page.locator("#shares").inner_text().split("\n")[:2] == ["Scene inliers", "96.2 %"]
     assert page.locator("#time-key li").count() == 6
-    assert page.locator("#loss svg").get_attribute("aria-label") == "Loss over 40 iterations, from 0.148 to 3.17e−4"
+    label = page.locator("#distance svg").get_attribute("aria-label")
+    rows = json.loads(visit.server.stage.data.artifacts["trace.json"])
+    end = (rows[-1]["residual_scene"] + 1.6 * rows[-1]["residual_object"]) / 2  # the latter is in the scene's units
+    assert label is not None
+    told = re.fullmatch(r"Mean distance over 40 iterations, from (\S+) to (\S+) object units", label)
+    assert told is not None
+    assert float(told[2]) == pytest.approx(end, rel=0.01)
+    assert float(told[1]) > 5 * float(told[2])
+
+
+def test_fields_are_called_by_their_names(visit: Visit) -> None:
+    page = visit.open("done")
+    expect(page.locator("#job-title")).to_have_text(f"{CHAIR} in {ROOM}")
+    assert page.title() == f"{CHAIR} in {ROOM} – regnf"
+    facts = page.locator("#job-facts").inner_text()
+    assert ROOM in facts
+    assert CHAIR in facts
+    assert "a3" * 32 not in page.locator("body").inner_text()
+    assert page.locator("#job-facts [title]").first.get_attribute("title") == "a3" * 32
+    page.route("**/fields/*", lambda route: route.fulfill(status=404, json={"reason": "FIELD_NOT_FOUND"}))
+    page.reload()
+    expect(page.locator("#job-title")).to_have_text(f"{('7c' * 32)[:12]} in {('a3' * 32)[:12]}")
+
+
+def test_every_metric_has_a_sentence_and_the_time_is_the_whole(visit: Visit) -> None:
+    page = visit.open("done")
+    about = json.loads((WEB / "metrics.json").read_text(encoding="utf-8"))
+    said = page.locator("#agreement").inner_text()
+    names = [name for name in visit.server.stage.data.result["metrics"] if not name.startswith("seconds")]
+    assert [name for name in names if about[name]["meaning"] not in said] == []
+    assert "14.0 s" in page.locator("#figures").inner_text()  # created 20:26:40, finished 20:26:54
+    assert page.locator("#time-total").inner_text() == "12.3 s of 14.0 s from request to result"
+
+
+def test_the_curve_is_in_shares_of_the_diameter_where_that_is_known(visit: Visit) -> None:
+    result = visit.server.stage.data.result
+    metrics = result["metrics"] | {"object_diameter": 0.5}
+    visit.page.route("**/result", lambda route: route.fulfill(status=200, json=result | {"metrics": metrics}))
+    page = visit.open("done")
+    assert page.locator("#distance-note").inner_text() == "of the diameter"
+    label = page.locator("#distance svg").get_attribute("aria-label") or ""
+    end = json.loads(visit.server.stage.data.artifacts["trace.json"])[-1]
+    told = float(label.removesuffix(" of the diameter").split()[-1])
+    assert told == pytest.approx((end["residual_scene"] + 1.6 * end["residual_object"]) / 2 / 0.5, rel=0.01)
 
 
 def test_matrix_is_copied_whole(visit: Visit) -> None:
@@ -233,7 +277,7 @@ def colors_of_the_fields(visit: Visit) -> list[str]:
 def test_the_fields_pictures_are_shown(visit: Visit) -> None:
     page = visit.open("done")
     assert colors_of_the_fields(visit) == ["a3" * 3, "7c" * 3]
-    assert page.locator("#field-pictures figcaption").all_inner_texts() == ["Scene", "Object"]
+    assert page.locator("#field-pictures figcaption").all_inner_texts() == [f"Scene: {ROOM}", f"Object: {CHAIR}"]
     labels = page.locator("#field-pictures canvas").evaluate_all("all => all.map(one => one.ariaLabel)")
     assert [label.split(":")[0] for label in labels] == ["Scene", "Object"]
 

@@ -51,6 +51,20 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
     }
 
 
+def judged_result(data: Synthetic) -> dict[str, Any]:
+    """The made-up result with one more pose that was judged, and rejected."""
+
+    def judged(T: dict[str, Any], reason: str, probability: float, free: float) -> dict[str, Any]:
+        metrics = {"probability": probability, "free_space_violations": free, "score": None}
+        return {"T_object_scene": T, "reason": reason, "detail": f"<b>{reason}</b>", "metrics": metrics}
+
+    tipped = sim3_document(similarity(1.0, rotation([1, 0, 0], 1.0), np.zeros(3)) @ data.T_object_scene)
+    poses = [judged(data.result["T_object_scene"], "SURFACES_AGREE", 0.97, 0.0)]
+    poses.append(judged(tipped, "FREE_SPACE_VIOLATED", 0.02, 0.4))
+    listed = [*data.result["artifacts"], {"name": "considered.npz"}]
+    return data.result | {"considered": poses, "artifacts": listed}
+
+
 def searched_result(data: Synthetic) -> dict[str, Any]:
     """The made-up result as the best of a search among twelve objects."""
 

@@ -12,7 +12,8 @@ def test_a_manifest_says_what_lies_where(tmp_path: Path) -> None:
     blobs = HeldBlobs(tmp_path / "blobs")
     (tmp_path / "result.json").write_bytes(b"{}")
     (tmp_path / "trace.unknown").write_bytes(b"xyz")
-    manifest = store_artifacts(blobs, "j1", 3, tmp_path, ["result.json", "trace.unknown"])
+    stored = store_artifacts(blobs, "j1", 3, tmp_path, ["result.json", "trace.unknown"])
+    manifest = Manifest("j1", 3, stored)
     assert read_manifest(blobs, "j1") is None, "stored is not yet published"
     assert publish(blobs, manifest)
     assert read_manifest(blobs, "j1") == manifest

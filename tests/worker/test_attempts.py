@@ -6,9 +6,9 @@ from regnf_core.errors import CancelledError
 from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.records import FieldRecord
 from regnf_worker.artifacts import publish
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
 from regnf_worker.heartbeat import Heartbeat
-from regnf_worker.registration import run_attempt
 from tests.stores import ShiftedRecords, WatchedQueue
 from tests.worker.doubles import SHA, accept, job
 from tests.worker.tiny_engine import TinyEngine

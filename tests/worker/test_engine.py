@@ -15,24 +15,28 @@ from tests.requests import registration_request
 START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
 
 
-@pytest.mark.parametrize("start", [None, START])
-def test_the_initial_transform_reaches_the_engine(start: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("start", "pictures"), [(None, True), (START, True), (None, False)])
+def test_the_request_reaches_the_engine(
+    start: Any, pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls: list[Any] = []
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
-    monkeypatch.setattr("regnf_core.registration.register", lambda *given: calls.append(given))
+    monkeypatch.setattr("regnf_core.registration.register", lambda *given, clouds: calls.append((*given, clouds)))
     written: list[Any] = []
 
-    def write_artifacts(result: Any, folder: Path, **said: Any) -> list[str]:
+    def write_result(result: Any, folder: Path, **said: Any) -> list[str]:
         written.append(said["fields"])
         return ["result.json"]
 
-    monkeypatch.setattr("regnf_core.viewing.write_artifacts", write_artifacts)
-    request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), seed=3, initial_transform=start)
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", write_result)
+    asked: dict[str, Any] = {"seed": 3, "initial_transform": start, "pictures": pictures}
+    request = registration_request("a" * 64, "b" * 64, options=RegistrationOptions(), **asked)
     files = Path("scene"), Path("object")
     notes = {"scene": FieldNotes("neus", None, ("SIGN_UNCERTAIN: perhaps",))}
-    names = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
-    ((scene, obj, box, options, seed, _, warm),) = calls
-    assert (scene, obj, seed, warm.object_model, names) == ("scene", "object", 3, "the model", ["result.json"])
+    made = CoreEngine("cpu").register(*files, "the model", request, lambda phase, share: None, tmp_path, notes)
+    ((scene, obj, box, options, seed, _, warm, clouds),) = calls
+    assert (scene, obj, seed, warm.object_model, clouds) == ("scene", "object", 3, "the model", False)
+    assert (made.names, "preview.png" in made.to_come) == (["result.json"], pictures)
     assert written == [{"scene": notes["scene"], "object": FieldNotes()}]
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]

@@ -12,15 +12,17 @@ import pytest
 from redis import Redis
 
 from regnf_core.errors import FieldFormatError, NoSurfaceError
+from regnf_core.library_entries import EntryNotes
 from regnf_core.options import RegistrationOptions
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker import models
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
-from regnf_worker.engine import Candidate
+from regnf_worker.engine import Candidate, Made
+from regnf_worker.library_models import is_unmodeled_entry, model_entry
 from regnf_worker.models import model_key
-from regnf_worker.registration import run_attempt
 from tests.requests import request_record
 from tests.worker.doubles import context_over
 
@@ -50,11 +52,11 @@ class ModelEngine:
         report: Any,
         folder: Path,
         notes: Any,
-    ) -> list[str]:
+    ) -> Made:
         self.registered.append(model)
         self.notes.append(notes)
         (folder / "result.json").write_text("{}")
-        return ["result.json"]
+        return Made(["result.json"])
 
     def search(
         self,
@@ -64,11 +66,11 @@ class ModelEngine:
         report: Any,
         folder: Path,
         notes: Any,
-    ) -> list[str]:
+    ) -> Made:
         self.searched.append(candidates)
         opened = [one.open().read_bytes().decode() for one in candidates]
         (folder / "result.json").write_text(json.dumps(opened))
-        return ["result.json"]
+        return Made(["result.json"])
 
     def make_model(self, field: Path, options: RegistrationOptions, target: Path) -> None:
         data = field.read_bytes()
@@ -244,3 +246,29 @@ def test_what_the_imports_said_reaches_the_result_and_the_job(context: Context) 
     assert notes["scene"].to_dict() == {**report, "settings": None}
     assert notes[CHAIR].to_dict() == {"family": None, "settings": used, "warnings": []}
     assert run(context, engine, "j2", candidates=[CHAIR, TABLE]).inputs["warnings"] == record.inputs["warnings"]
+
+
+def entered(context: Context, sha256: str) -> None:
+    known = context.records.get_field(sha256)
+    assert known is not None
+    context.records.set_entry(known, EntryNotes.checked(f"entry {sha256[0]}"))
+
+
+def test_the_model_of_a_librarys_object_is_there_before_its_first_search(context: Context) -> None:
+    engine = ModelEngine()
+    assert not is_unmodeled_entry(context, CHAIR, 1)
+    entered(context, CHAIR)
+    assert is_unmodeled_entry(context, CHAIR, 1)
+    assert not is_unmodeled_entry(context, CHAIR, 2)
+    model_entry(context, CHAIR, engine)
+    assert (engine.made, symmetry_of(context, CHAIR)) == ([b"chair"], SYMMETRY)
+    assert not is_unmodeled_entry(context, CHAIR, 1)
+    assert run(context, engine, "j1", candidates=[CHAIR, TABLE]).status == "successful"
+    assert engine.made == [b"chair", b"table"]
+
+
+def test_an_entry_that_is_no_object_stays_without_a_model(context: Context) -> None:
+    entered(context, AIR)
+    model_entry(context, AIR, ModelEngine())
+    assert symmetry_of(context, AIR) is None
+    assert not context.blobs.exists(model_key(AIR))

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+from redis.exceptions import ConnectionError as RedisConnectionError
+
+from regnf_state.settings import Settings
+from regnf_worker import main
+from regnf_worker.preload import PreloadError
 from tests.worker.bench import bench
 
 CODE = """
@@ -43,7 +50,58 @@ preload.preload()
     assert ended.returncode == 1
 
 
-def test_a_worker_told_to_holds_torch_before_its_first_job(tmp_path: Path) -> None:
+def test_a_worker_holds_torch_before_its_first_job(tmp_path: Path) -> None:
     with bench(tmp_path) as table:
-        worker = table.start_worker("regnf_worker.main", preload=True)
+        worker = table.start_worker("regnf_worker.main")
         assert "libtorch" in Path(f"/proc/{worker.pid}/maps").read_text()
+
+
+def test_threads_are_a_reason_to_start_without_only_where_nobody_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise PreloadError("threads")
+
+    started: list[tuple[list[str], dict[str, str]]] = []
+    monkeypatch.setattr(main, "preload", refuse)
+    monkeypatch.setattr(main.os, "execve", lambda _, arguments, environment: started.append((arguments, environment)))
+    main._preload({"A": "b"})
+    assert started == [(sys.orig_argv, {"A": "b", "REGNF_PRELOAD": "false"})]
+    with pytest.raises(PreloadError):
+        main._preload({"REGNF_PRELOAD": "true"})
+
+
+def test_a_worker_whose_redis_does_not_run_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("redis.backoff.ExponentialWithJitterBackoff.compute", lambda *_: 0.0)
+    monkeypatch.setattr(main, "configure_logging", lambda _: None)
+    monkeypatch.setattr(main, "_preload", lambda _: pytest.fail("the engine was loaded first"))
+    priority = os.nice(0)
+    with pytest.raises(RedisConnectionError):
+        main.run_worker(Settings(redis_url="redis://127.0.0.1:9/0"))
+    assert os.nice(0) == priority
+
+
+IMPORTS = """
+import sys, os
+from pathlib import Path
+from regnf_worker.preload import preload
+preload()
+from regnf_core.geometry.box import OrientedBox
+from tests.core.analytic import chair, chair_box, chair_pose, room
+before = set(sys.modules)
+child = os.fork()
+if child == 0:
+    from regnf_core.registration import register
+    from regnf_core.viewing.artifacts import write_pictures, write_result
+    found = register(room(chair_pose()), chair(), chair_box(chair_pose()))
+    write_result(found, Path(sys.argv[1]))
+    write_pictures(found, Path(sys.argv[1]))
+    print(*sorted(set(sys.modules) - before))
+    sys.stdout.flush()
+    os._exit(0)
+raise SystemExit(os.waitpid(child, 0)[1])
+"""
+
+
+def test_a_job_imports_nothing(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", IMPORTS, str(tmp_path)]
+    done = subprocess.run(command, check=True, timeout=300, capture_output=True, text=True)
+    assert done.stdout.split() == []

@@ -137,7 +137,7 @@ def test_the_handler_of_a_signal_does_not_write(monkeypatch: pytest.MonkeyPatch)
 class ChildlessWorker(RegnfWorker):
     """Does what a worker does around a job, and notes the job instead of forking for it."""
 
-    def _run_child(self, job: Any, queue: Any) -> int | None:
+    def _run_child(self, job: Any, queue: Any, *_: Any) -> int | None:
         self.prepare_job_execution(job)
         done.append(job.id)
         self.report_running(job)

@@ -12,10 +12,10 @@ from rq.exceptions import StopRequested
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.process import RegnfWorker
-from regnf_worker.registration import run_attempt
 from regnf_worker.retry import MAX_WAIT_S, passes, retry_until_available
 from regnf_worker.scratch import Scratch
 from tests.requests import request_record

@@ -69,11 +69,14 @@ def test_oom_kills_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_scratch_folder_is_emptied_and_goes_with_its_owner(tmp_path: Path) -> None:
     first, second = Scratch(tmp_path), Scratch(tmp_path)
-    (first.folder / "folder").mkdir()
-    (first.folder / "folder" / "file").write_bytes(b".")
-    (first.folder / "link").symlink_to(tmp_path)
-    first.empty()
-    assert [path.name for path in first.folder.iterdir()] == [".lock"]
+    one, other = first.of_job(), first.of_job()
+    for folder in (one, other):
+        (folder / "folder").mkdir(parents=True)
+        (folder / "folder" / "file").write_bytes(b".")
+        (folder / "link").symlink_to(tmp_path)
+    first.drop(one)
+    first.drop(one)
+    assert sorted(path.name for path in first.folder.iterdir()) == [".lock", other.name]
     Scratch(tmp_path).remove()
     assert first.folder.is_dir(), "its owner lives"
     first._lock.close()  # what the kernel does when the owner is killed

@@ -13,9 +13,9 @@ from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.records import FieldRecord, JobRecord
 from regnf_state.settings import Settings
 from regnf_worker import kernel
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
-from regnf_worker.registration import run_attempt
 from regnf_worker.scratch import Scratch
 from regnf_worker.settle import ChildExit, settle_import, settle_registration
 from tests.requests import request_record
@@ -120,7 +120,23 @@ def test_a_job_whose_files_are_gone_is_run_again(context: Context, store: AwaySt
 def test_a_worker_whose_temporary_files_are_out_of_reach_goes_on(tmp_path: Path) -> None:
     scratch = Scratch(tmp_path / "scratch")
     (tmp_path / "scratch").rename(tmp_path / "elsewhere")
-    scratch.empty()
+    scratch.drop(scratch.of_job())
     assert not (tmp_path / "scratch").exists()
     (tmp_path / "elsewhere").rename(tmp_path / "scratch")
+    scratch.remove()
+
+
+def test_what_a_job_left_on_a_volume_that_was_away_goes_once_it_is_back(tmp_path: Path) -> None:
+    volume, elsewhere = tmp_path / "volume", tmp_path / "elsewhere"
+    scratch = Scratch(volume)
+    folder = scratch.of_job()
+    folder.mkdir()
+    (folder / "file").write_bytes(b"left")
+    volume.rename(elsewhere)
+    scratch.drop(folder)
+    assert scratch.drop_left(), "it is not forgotten"
+    elsewhere.rename(volume)
+    assert folder.exists()
+    assert not scratch.drop_left()
+    assert not folder.exists()
     scratch.remove()

@@ -9,7 +9,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -18,10 +18,13 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import NoSurfaceError
+from regnf_core.rendering.request import RenderRequest
+from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
+from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
-from regnf_worker.registration import run_attempt
+from regnf_worker.engine import Made
 
 Report = Callable[[str, float], None]
 
@@ -44,17 +47,41 @@ class TinyEngine:
         report: Report,
         folder: Path,
         notes: Any,
-    ) -> list[str]:
+    ) -> Made:
         report("sampling", 0.1)
         (folder / "half-written").write_bytes(b".")
         getattr(self, request.detection.label or "")(report)
         report("exporting", 0.9)
         (folder / "result.json").write_text(json.dumps({"pid": os.getpid()}))
         (folder / "aligned.ply").write_bytes(scene.read_bytes() + object_.read_bytes())
-        return ["result.json", "aligned.ply"]
+        names = ["result.json", "aligned.ply"]
+        if request.detection.label == "draw_for_ever":
+            return Made(names, ["preview.png"], lambda: self.iterate(lambda *_: None) or [])  # type: ignore[func-returns-value]
+        return Made(names)
 
-    def search(self, *_: Any) -> list[str]:
+    def search(self, *_: Any) -> Made:
         raise AssertionError("no job here has candidates")
+
+    def render(
+        self,
+        scene: Path,
+        objects: Mapping[str, Callable[[], Path]],
+        request: RenderRequest,
+        report: Report,
+        folder: Path,
+    ) -> list[str]:
+        """A picture of what was opened; the edited scene as the scene's own bytes. An edit's name is a method's."""
+        report("composing", 0.1)
+        (folder / "frame-0000.png").write_bytes(b"half")
+        for edit in request.edits:
+            getattr(self, edit.name or "succeed")(report)
+        opened = b"".join(objects[name]().read_bytes() for name in sorted(objects))
+        (folder / "frame-0000.png").write_bytes(scene.read_bytes() + opened)
+        (folder / "result.json").write_text(json.dumps({"frames": 1}))
+        if "field" not in request.outputs:
+            return ["frame-0000.png", "result.json"]
+        (folder / EDITED_FIELD).write_bytes(scene.read_bytes())
+        return ["frame-0000.png", EDITED_FIELD, "result.json"]
 
     def make_model(self, *_: Any) -> None:
         raise AssertionError("no job here names a preset")
@@ -63,6 +90,8 @@ class TinyEngine:
 
     def succeed(self, report: Report) -> None:
         report("optimizing", 0.5)
+
+    draw_for_ever = succeed
 
     def refuse(self, report: Report) -> None:
         raise NoSurfaceError("nothing in the box")
@@ -164,3 +193,18 @@ def tiny_importer(
         os.kill(os.getpid(), signal.SIGKILL)
     (folder / "field.safetensors").write_bytes(upload.read_bytes())
     return {"family": "tiny"}
+
+
+def run_drawing(reference: str) -> None:
+    """Says that it has begun, and goes on once the file `draw` is in the state folder."""
+    from regnf_core.field_views import FieldViews
+    from regnf_worker.drawing import draw_field
+
+    def draw(path: Path) -> FieldViews:
+        folder = Settings().state_dir
+        (folder / "drawing").touch()
+        while not (folder / "draw").exists():
+            time.sleep(0.01)
+        return FieldViews(path.read_bytes())
+
+    draw_field(Context.from_settings(Settings()), reference, draw)

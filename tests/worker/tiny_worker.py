@@ -25,6 +25,6 @@ if __name__ == "__main__":
     context = Context.from_settings(Settings())
     scratch = Scratch(context.settings.scratch_dir)
     try:
-        process.RegnfWorker(context, scratch, functions=FUNCTIONS).serve()
+        process.RegnfWorker(context, scratch, functions=FUNCTIONS, draw=tiny_engine.run_drawing).serve()
     finally:
         scratch.remove()

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field, open_field
+from regnf_core.fields.color import ColoredField, has_color
 from regnf_core.schema.parsing import parse_description
 from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.schema.tensor_check import TensorSpec
 from tests.core.fields.grids import numeric_gradient, slow_trilinear
 
 EDGE, SIZE = 4, 0.1
@@ -120,3 +122,56 @@ def test_faulty_tensors_are_refused(tmp_path: Path, values: Any, blocks: Any, re
     with pytest.raises(FieldFormatError) as caught:
         write_and_open()
     assert caught.value.reason == reason
+
+
+def slow_color(node: tuple[int, int, int], colors: NDArray[Any]) -> NDArray[Any]:
+    """A node's color: its block's, or that of the nearest node of any block."""
+    away = []
+    for block in BLOCKS:
+        local = np.array(node) - EDGE * block
+        away.append(float(np.linalg.norm(local - np.clip(local, 0, EDGE - 1))))
+    nearest = int(np.argmin(away))
+    inside = np.clip(np.array(node) - EDGE * BLOCKS[nearest], 0, EDGE - 1)
+    found: NDArray[Any] = colors[nearest][tuple(inside)]
+    return found
+
+
+def colored(colors: NDArray[Any]) -> ColoredField:
+    tensors = {"values": VALUES, "blocks": BLOCKS, "color.values": colors}
+    parsed = parse_description(description(color={"form": "values"}))
+    made = build_field(parsed, {name: torch.from_numpy(array) for name, array in tensors.items()})
+    assert has_color(made)
+    return made
+
+
+def test_colors_are_interpolated() -> None:
+    rng = np.random.default_rng(5)
+    colors = rng.random((*VALUES.shape, 3)).astype(np.float32)
+    cells = EDGE * BLOCKS[rng.integers(0, 4, 60)] + rng.integers(0, EDGE - 1, (60, 3))
+    points = ORIGIN + SIZE * (cells + rng.random((60, 3)))
+    found = colored(colors).color(torch.from_numpy(points), torch.zeros(60, 3)).numpy()
+    for point, color in zip(points, found, strict=True):
+        expected = [
+            slow_trilinear(lambda node, c=c: slow_color(node, colors)[c], (point - ORIGIN) / SIZE) for c in range(3)
+        ]
+        np.testing.assert_allclose(color, expected, rtol=0, atol=1e-5)
+
+
+def test_nodes_without_color_do_not_count() -> None:
+    colors = np.full((*VALUES.shape, 3), -1.0, np.float32)
+    colors[:, 0] = [0.25, 0.5, 0.75]
+    point = ORIGIN + SIZE * np.array([0.9, 1.5, 1.5])  # between the first nodes along x and the second
+    found = colored(colors).color(torch.from_numpy(point)[None], torch.zeros(1, 3)).numpy()
+    np.testing.assert_allclose(found, [[0.25, 0.5, 0.75]], rtol=0, atol=1e-6)
+
+
+def test_colors_of_another_shape_are_refused() -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        parse_description(description(color={"form": "values"})).check(
+            {
+                "values": TensorSpec(VALUES.shape, "F32"),
+                "blocks": TensorSpec(BLOCKS.shape, "I32"),
+                "color.values": TensorSpec(VALUES.shape, "F16"),
+            }
+        )
+    assert caught.value.reason == "FIELD_SHAPES_MISMATCH"

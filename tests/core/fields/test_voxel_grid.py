@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import build_field, open_field
+from regnf_core.fields.color import has_color
 from regnf_core.schema.parsing import parse_description
 from regnf_core.schema.safe_format import write_safe_field
 from tests.core.fields.grids import numeric_gradient, slow_trilinear
@@ -70,6 +71,31 @@ def test_there_is_no_jump_at_the_box_and_none_beyond() -> None:
     steepest = np.abs(np.diff(VALUES, axis=0)).max() / SPACING.min() * 3
     assert np.abs(np.diff(value)).max() < step * (steepest + 1.0)
     assert np.isfinite(field().signed_distance(torch.tensor([[1e8, -1e8, 1e8]])).numpy()).all()
+
+
+def test_colors_are_interpolated_between_the_nodes_that_have_one() -> None:
+    rng = np.random.default_rng(8)
+    colors = rng.random((*VALUES.shape, 3)).astype(np.float32)
+    colors[rng.random(VALUES.shape) < 0.3] = -1.0
+    tensors = {"values": torch.from_numpy(VALUES), "color.values": torch.from_numpy(colors)}
+    made = build_field(parse_description(description(color={"form": "values"})), tensors)
+    assert has_color(made)
+    where = np.concatenate([points(80, 0.0), points(40, 0.5)])
+    found = made.color(torch.from_numpy(where).float(), torch.zeros(len(where), 3)).numpy()
+    for point, color in zip(where, found, strict=True):
+        position = np.clip((np.clip(point, ORIGIN, FAR) - ORIGIN) / SPACING, 0.0, np.array(VALUES.shape) - 1.000000001)
+        known = slow_trilinear(lambda node: float(colors[node][0] >= 0.0), position)
+        total = [slow_trilinear(lambda n, k=k: max(float(colors[n][k]), 0.0), position) for k in range(3)]
+        np.testing.assert_allclose(color, np.array(total) / known if known > 1e-6 else 0.0, atol=2e-5)
+    assert not has_color(field())
+
+
+def test_colors_of_other_shapes_are_refused(tmp_path: Path) -> None:
+    described = description(color={"form": "values"})
+    colors = np.zeros((*VALUES.shape[:2], 3), np.float32)
+    with pytest.raises(FieldFormatError) as error:
+        write_safe_field(tmp_path / "f.safetensors", described, {"values": VALUES, "color.values": colors})
+    assert error.value.reason == "FIELD_SHAPES_MISMATCH"
 
 
 def test_half_precision_stays_half_and_is_evaluated_in_single(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from regnf_core.geometry.euler import euler_from_rotation, rotation_from_euler
@@ -21,7 +21,6 @@ def _about(axis: int, angle: float) -> torch.Tensor:
     return Sim3.exp(tangent).rotation
 
 
-@settings(deadline=None)
 @given(_angle, st.floats(-1.55, 1.55), _angle)
 def test_order_and_round_trip(roll: float, pitch: float, yaw: float) -> None:
     angles = torch.tensor([roll, pitch, yaw], dtype=torch.float64)

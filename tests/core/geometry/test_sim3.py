@@ -40,7 +40,7 @@ def generator_matrix(tangent: Tensor) -> Tensor:
     return M
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(tangents())
 def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
     # torch's own matrix exponential is off by 2e-11 for a turn of 1/32 about z, scipy's is not
@@ -48,14 +48,13 @@ def test_exp_is_the_matrix_exponential(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(tangent).matrix(), expected, rtol=1e-11, atol=1e-11)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(tangents())
 @example(torch.tensor([math.pi - 1e-9, 0.0, 0.0, 0.3, -0.2, 0.9, 0.7], dtype=torch.float64))
 def test_log_undoes_exp(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(tangent).log(), tangent, rtol=1e-7, atol=1e-7)
 
 
-@settings(deadline=None)
 @given(tangents())
 def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
     half_turn = tangent.clone()
@@ -64,7 +63,6 @@ def test_exp_undoes_log_even_at_half_a_turn(tangent: Tensor) -> None:
     torch.testing.assert_close(Sim3.exp(T.log()).matrix(), T.matrix(), rtol=1e-9, atol=1e-9)
 
 
-@settings(deadline=None)
 @given(tangents(), tangents(), tangents())
 def test_group_laws(a: Tensor, b: Tensor, c: Tensor) -> None:
     A, B, C = Sim3.exp(a), Sim3.exp(b), Sim3.exp(c)
@@ -75,7 +73,6 @@ def test_group_laws(a: Tensor, b: Tensor, c: Tensor) -> None:
     torch.testing.assert_close((A.inverse() @ A).matrix(), identity, rtol=1e-9, atol=1e-9)
 
 
-@settings(deadline=None)
 @given(tangents())
 def test_dictionary_round_trip(tangent: Tensor) -> None:
     T = Sim3.exp(tangent)

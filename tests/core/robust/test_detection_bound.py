@@ -87,3 +87,14 @@ def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str) -> 
     part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
     options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
     assert register(scene, obj, part, options, seed=0, clouds=False).verdict_reason == verdict
+
+
+def test_a_flat_boxs_thickness_is_compared_with_more_than_itself() -> None:
+    """A thing of 2 % of its length, whose field is three times as thick as its box, as coarse maps have it."""
+    box = OrientedBox(torch.zeros(3), torch.tensor([1.0, 1.0, 0.02]), torch.eye(3, dtype=torch.float64))
+    thick = CORNERS * torch.tensor([1.0, 1.0, 0.06])
+    true = Sim3(
+        torch.tensor([math.hypot(1.0, 1.0, 0.02)]).double(), torch.eye(3)[None].double(), torch.zeros(1, 3).double()
+    )
+    twice = Sim3(true.scale / 2.2, true.rotation, true.translation)
+    assert DetectionBound.of(box, thick, 0.5).admits(Sim3.cat([true, twice])).tolist() == [True, False]

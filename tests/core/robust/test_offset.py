@@ -76,8 +76,8 @@ def test_a_thick_copy_keeps_its_scale() -> None:
     start = truth[None].perturb(torch.tensor([[0.03, -0.02, 0.02, 0.01, 0.01, -0.01, 0.04]], dtype=D))
     widths = [0.05, 0.04, 0.03, 0.02, *[0.01] * 8]
     surfaces = SurfacePair(source.field, target.field, source.samples, target.samples)
-    without = minimize(surfaces, start, widths, Settings(adaptive=True))
-    free = minimize(surfaces, start, widths, Settings(adaptive=True), offset=torch.zeros(1, dtype=D))
+    without = minimize(surfaces, start, widths, Settings(widest=0.04))
+    free = minimize(surfaces, start, widths, Settings(widest=0.04), offset=torch.zeros(1, dtype=D))
     assert free.residuals.offset is not None
     assert abs(float(without.T.scale / truth.scale) - 1.0) > 0.008
     assert abs(float(free.T.scale / truth.scale) - 1.0) < 0.002

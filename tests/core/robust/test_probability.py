@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import ProbabilityModel, probability_model
+from regnf_core.robust.verdict.probability import LEAD, PoseOdds, ProbabilityModel, pose_odds
 
 STORED: dict[str, Any] = {
     "bias": 2.0,
@@ -55,18 +55,33 @@ def test_a_file_whose_terms_are_not_monotone_is_refused(broken: dict[str, Any]) 
         ProbabilityModel.from_dict({"bias": 0.0, "terms": broken})
 
 
+def test_the_lead_is_taken_from_the_odds_alone() -> None:
+    """Three candidates; the first two are one answer, so the lead of each is over the third."""
+    alone = ProbabilityModel.from_dict(STORED)
+    among = ProbabilityModel.from_dict({"bias": 1.0, "terms": {LEAD: {"knots": [-1.0, 3.0], "values": [-4.0, 0.0]}}})
+    elsewhere = torch.tensor([[False, False, True], [False, False, True], [True, True, False]])
+    told = {"confirmed": torch.tensor([0.9, 0.7, 0.6]), "free": torch.zeros(3)}
+    of_each, of_all = PoseOdds(alone, among).log_odds(told, elsewhere)
+    assert of_each.tolist() == pytest.approx([2.0, 1.5, 1.0])
+    assert of_all.tolist() == pytest.approx([1.0 - 2.0, 1.0 - 2.5, 1.0 - 4.0])  # leads 1, .5 and -1
+
+
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
-def test_the_shipped_model_is_monotone(name: str, low: float, step: float) -> None:
-    model = probability_model()
+def test_the_shipped_models_are_monotone(name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
-    less, more = model.logit(others | {name: torch.tensor([low, low + step], dtype=torch.float64)}).tolist()
-    assert more >= less if SPEAKS_FOR[name] else more <= less
+    changed = others | {name: torch.tensor([low, low + step], dtype=torch.float64)}
+    for logits in pose_odds().log_odds(changed, torch.zeros(2, 2, dtype=torch.bool)):
+        less, more = logits.tolist()
+        assert more >= less if SPEAKS_FOR[name] else more <= less
 
 
-def test_the_shipped_model_uses_what_it_must() -> None:
-    """A pose that is perfect in all respects is likely; one in free space, or without any agreement, is not."""
-    best = {name: torch.tensor([1e3 if better else -1e3], dtype=torch.float64) for name, better in SPEAKS_FOR.items()}
+def test_the_shipped_models_use_what_they_must() -> None:
+    """A pose that is perfect in all respects is likely; one in free space, or without any agreement, is not; one of two
+    perfect poses is less likely than a single one."""
+    best = {name: torch.tensor([1e3 if better else -1e3] * 2).double() for name, better in SPEAKS_FOR.items()}
     worst = {name: -values for name, values in best.items()}
-    model = probability_model()
-    assert float(model.logit(best).sigmoid()) > 0.99
-    assert float(model.logit(worst).sigmoid()) < 1e-4
+    single, several = torch.zeros(2, 2, dtype=torch.bool), ~torch.eye(2, dtype=torch.bool)
+    likely = [float(one[0].sigmoid()) for one in pose_odds().log_odds(best, single)]
+    assert min(likely) > 0.98
+    assert max(float(one[0].sigmoid()) for one in pose_odds().log_odds(worst, single)) < 1e-4
+    assert float(pose_odds().log_odds(best, several)[1][0].sigmoid()) < likely[1]

@@ -102,6 +102,27 @@ def test_a_wrong_object_is_rejected() -> None:
     assert result.alternatives == []
 
 
+def test_the_poses_that_were_judged_are_told_with_what_speaks_against_them() -> None:
+    """The signs are those that the metrics count."""
+    scene, obj = room(chair_pose()), chair()
+    for result in (run(scene, obj, detection()), run(scene, table(), detection())):
+        seen = result.considered
+        assert seen is not None
+        first = seen.poses[0]
+        assert (first.reason == "SURFACES_AGREE") == (result.verdict == "registered")
+        assert len(seen.poses) == len(seen.scene_signs) == len(seen.object_signs) <= 6
+        assert seen.object_signs.shape[1] == len(seen.object_points)
+        for pose, of_object, of_scene in zip(seen.poses, seen.object_signs, seen.scene_signs, strict=True):
+            unseen, free = (of_object == 2).float().mean(), (of_object == 1).float()
+            assert float(unseen) == pytest.approx(pose.metrics["occluded_share_object"], abs=1e-6)
+            assert float(free.sum() / (of_object != 2).sum()) == pytest.approx(
+                pose.metrics["free_space_violations"], abs=1e-6
+            )
+            explained = (of_scene == 0).float().mean()
+            assert float(explained) == pytest.approx(pose.metrics["explained_share_scene"], abs=1e-6)
+        torch.testing.assert_close(first.T_object_scene.matrix(), result.T_object_scene.matrix(), rtol=0, atol=0)
+
+
 def test_the_same_seed_gives_the_same_numbers_and_the_report_is_whole() -> None:
     scene, obj = room(chair_pose()), chair()
     reports: list[tuple[str, float]] = []

@@ -28,11 +28,11 @@ NAMES = [
     "object_points.ply",
     "aligned.ply",
     "residuals.npz",
+    "context_points.ply",
+    "preview.png",
     "trace.json",
     "transform.npy",
-    "preview.png",
     "result.json",
-    "context_points.ply",
 ]
 
 
@@ -66,6 +66,7 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
         "metrics",
         "object",
         "candidates",
+        "considered",
         "seed",
         "options",
         "engine",

@@ -6,6 +6,7 @@ import torch
 
 from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
 from regnf_core.fields.build import open_field
+from regnf_core.fields.color import has_color
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.images.fit import FitFiles, reconstruct
@@ -49,6 +50,9 @@ def test_a_ball_and_a_box_from_eight_depth_images(tmp_path):
     error, matter = surface_errors(open_field(path), scenes.distance)
     assert error < 0.01
     assert matter == 0.0
+    assert has_color(open_field(path))
+    assert report.psnr is not None
+    assert report.ssim is not None
     assert report.depth_error_median is not None
     assert report.depth_error_median < 0.01 * scenes.SIZE
     description = read_description(path)

@@ -1,0 +1,175 @@
+"""``regnf library``: a folder's entries, archives of them, and searches among them."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from regnf_cli import main as cli
+from regnf_core.errors import RegnfError
+from regnf_core.library_archive import open_archive, write_archive
+from regnf_core.library_entries import EntryNotes
+from regnf_core.library_folder import INDEX, FolderEntry, LibraryFolder, digest_of
+from tests.live_stack import DATA
+
+CHAIR = DATA / "armchair.safetensors"
+SYMMETRY = {"order": 4, "axis": [0, 0, 1], "continuous": False}
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr("sys.argv", ["regnf", *map(str, arguments)])
+    return cli._run()
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory: pytest.TempPathFactory) -> LibraryFolder:
+    """A library with the demo's chair."""
+    folder = tmp_path_factory.mktemp("library")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        said = ("--tag", "seat", "--unit", "m")
+        assert run(patch, "library", "add", "arm chair", CHAIR, *said, "--library", folder) == 0
+    return LibraryFolder(folder)
+
+
+def test_an_entry_has_field_picture_and_symmetry(shelf: LibraryFolder) -> None:
+    entry = shelf.get("arm chair")
+    assert (entry.notes.tags, entry.notes.unit) == (("seat",), "m")
+    assert entry.detected == {"order": 1, "axis": None, "continuous": False}
+    assert digest_of(shelf.file(entry)) == entry.field
+    assert shelf.picture(entry).read_bytes()[:4] == b"\x89PNG"
+    assert [one.notes.name for one in shelf.entries(tag="seat", part="CHAIR")] == ["arm chair"]
+    assert shelf.entries(tag="table") == shelf.entries(part="table") == []
+
+
+def test_from_one_library_to_another_and_into_a_search(
+    shelf: LibraryFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive, other = tmp_path / "chairs.zip", tmp_path / "other"
+    assert run(monkeypatch, "library", "export", archive, "--library", shelf.folder) == 0
+    first = archive.read_bytes()
+    assert run(monkeypatch, "library", "export", archive, "--library", shelf.folder) == 0
+    assert archive.read_bytes() == first, "the same library gives the same bytes"
+    assert run(monkeypatch, "library", "import", archive, "--library", shelf.folder) == 2
+    assert "LIBRARY_NAME_TAKEN" in capsys.readouterr().err
+    assert run(monkeypatch, "library", "import", archive, "--skip-taken", "--library", shelf.folder) == 0
+    assert run(monkeypatch, "library", "import", archive, "--library", other) == 0
+    assert LibraryFolder(other).entries() == shelf.entries()
+    edit = ("library", "edit", "arm chair", "--library", other)
+    assert run(monkeypatch, *edit, "--rename", "stool", "--tag", "none", "--symmetry", json.dumps(SYMMETRY)) == 0
+    (stool,) = LibraryFolder(other).entries()
+    assert (stool.notes.name, stool.notes.tags, stool.notes.unit) == ("stool", (), "m")
+    assert (stool.symmetry or {})["order"] == 4
+    capsys.readouterr()
+    again = ("library", "edit", "stool", "--library", other, "--symmetry")
+    found = (shelf.get("arm chair").symmetry or {})["order"]
+    for said, order, source in (
+        ("none", 1, "said"),
+        ("detected", found, "detected"),
+        (json.dumps(SYMMETRY), 4, "said"),
+    ):
+        assert run(monkeypatch, *again, said) == 0
+        capsys.readouterr()
+        assert run(monkeypatch, "library", "list", "--library", other, "--json") == 0
+        (listed,) = json.loads(capsys.readouterr().out)
+        assert (listed["symmetry_source"], listed["symmetry"]["order"]) == (source, order)
+    monkeypatch.setenv("REGNF_LIBRARY", str(other))
+    search = ("search", DATA / "mix-room.safetensors", "--detection", DATA / "detection.json", "--json")
+    assert run(monkeypatch, *search, "--tag", "seat") == 2
+    assert "no entries with the tag" in capsys.readouterr().err
+    assert run(monkeypatch, *search) == 0
+    assert json.loads(capsys.readouterr().out)["candidates"][0]["object"] == "stool"
+    assert run(monkeypatch, "library", "remove", "stool", "--library", other) == 0
+    assert sorted(path.name for path in other.iterdir()) == [".lock", INDEX]
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> tuple[FolderEntry, Path]:
+    field = tmp_path / "field"
+    field.write_bytes(b"bytes of a field")
+    return FolderEntry(EntryNotes.checked("chair"), digest_of(field)), field
+
+
+def written(tmp_path: Path, entry: tuple[FolderEntry, Path], change: Callable[[dict[str, bytes]], None]) -> Path:
+    """An archive whose members somebody has changed."""
+    good, bad = tmp_path / "good.zip", tmp_path / "bad.zip"
+    write_archive(good, [entry])
+    with zipfile.ZipFile(good) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(bad, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return bad
+
+
+def index(**changes: Any) -> Callable[[dict[str, bytes]], None]:
+    """Changes of the index' only entry."""
+
+    def change(members: dict[str, bytes]) -> None:
+        document = json.loads(members[INDEX])
+        document["entries"][0] |= changes
+        members[INDEX] = json.dumps(document).encode()
+
+    return change
+
+
+def field_of(members: dict[str, bytes]) -> str:
+    return next(name for name in members if name != INDEX)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda members: members.pop(INDEX), "LIBRARY_INDEX_INVALID"),
+        (lambda members: members.update({INDEX: b"[" * 100_000}), "LIBRARY_INDEX_INVALID"),
+        (lambda members: members.update({INDEX: b'{"format": 2, "entries": []}'}), "LIBRARY_INDEX_INVALID"),
+        (lambda members: members.update({INDEX: b'{"format": 1, "entries": 3}'}), "LIBRARY_INDEX_INVALID"),
+        (lambda members: members.update(more=b"what no index names"), "ARCHIVE_MALFORMED"),
+        (lambda members: members.pop(field_of(members)), "ARCHIVE_MALFORMED"),
+        (lambda members: members.update({field_of(members): b"other bytes"}), "ARCHIVE_HASH_MISMATCH"),
+        (index(name="../../etc/passwd"), "LIBRARY_INDEX_INVALID"),
+        (index(field="../" + "a" * 61), "LIBRARY_INDEX_INVALID"),
+        (index(field="b" * 64), "ARCHIVE_MALFORMED"),
+        (index(tags=[3]), "LIBRARY_INDEX_INVALID"),
+        (index(unit="parsec"), "LIBRARY_INDEX_INVALID"),
+        (index(detected_symmetry={"order": 1e99}), "LIBRARY_INDEX_INVALID"),
+    ],
+)
+def test_archives_that_were_changed_are_refused(
+    tmp_path: Path, entry: tuple[FolderEntry, Path], change: Callable[[dict[str, bytes]], None], reason: str
+) -> None:
+    path = written(tmp_path, entry, change)
+    with pytest.raises(RegnfError) as caught, open_archive(path) as archive:
+        archive.extract(archive.entries[0], tmp_path / "out")
+    assert caught.value.reason == reason
+
+
+def test_files_that_are_no_archives_are_refused(tmp_path: Path, entry: tuple[FolderEntry, Path]) -> None:
+    write_archive(tmp_path / "good.zip", [entry])
+    whole = (tmp_path / "good.zip").read_bytes()
+    for data, reason in (
+        (b"", "FILE_EMPTY"),
+        (b"no archive", "ARCHIVE_PREFIXED_DATA"),
+        (whole + b"more", "ARCHIVE_TRAILING_DATA"),
+        (whole[:-30], "FILE_TRUNCATED"),
+    ):
+        path = tmp_path / "bad.zip"
+        path.write_bytes(data)
+        with pytest.raises(RegnfError) as caught, open_archive(path):
+            pass
+        assert caught.value.reason == reason
+
+
+def test_compressed_members_are_refused(tmp_path: Path, entry: tuple[FolderEntry, Path]) -> None:
+    path = tmp_path / "packed.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(INDEX, json.dumps({"format": 1, "entries": []}) + " " * 100_000)
+    with pytest.raises(RegnfError) as caught, open_archive(path):
+        pass
+    assert caught.value.reason == "ARCHIVE_COMPRESSED_ENTRY"

@@ -1,0 +1,55 @@
+"""What commands load: of libraries no more than they need."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from regnf_cli.commands import COMMANDS, app_of
+
+DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
+NEEDED = {
+    "PIL", "annotated_doc", "annotated_types", "click", "numpy", "pydantic", "pydantic_core", "regnf_cli", "regnf_core",
+    "rich", "safetensors", "scipy", "shellingham", "torch", "torchgen", "typer", "typing_extensions",
+    "typing_inspection",
+}  # fmt: skip
+"""What `register` loads of its own and of others. torch itself loads torchgen, rich and numpy look for some more."""
+SOUGHT = {"charset_normalizer", "cython_runtime", "pygments", "markdown_it", "mdurl", "colorama"}
+CODE = """
+import sys
+sys.argv = ["regnf", *sys.argv[1:]]
+from regnf_cli.main import main
+try:
+    main()
+finally:
+    names = {name.partition(".")[0] for name in sys.modules if not name.startswith("_")}
+    print(*sorted(names - set(sys.stdlib_module_names)), file=sys.stderr)
+"""
+
+
+def loaded(*arguments: str) -> set[str]:
+    """The packages that a command has loaded when it ends, those of Python left out."""
+    command = [sys.executable, "-c", CODE, *arguments]
+    done = subprocess.run(command, cwd=DATA, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode in (0, 4), done.stderr
+    return set(done.stderr.splitlines()[-1].split())
+
+
+def test_register_loads_what_it_needs() -> None:
+    pair = ["mix-room.safetensors", "dining-chair.safetensors", "--detection", "detection-dining-chair.json", "--json"]
+    found = loaded("register", *pair)
+    assert found >= {"torch", "regnf_core"}
+    assert found - NEEDED - SOUGHT == set()
+
+
+@pytest.mark.parametrize("command", ["register", "serve"])
+def test_help_loads_neither_torch_nor_http(command: str) -> None:
+    assert not loaded(command, "--help") & {"torch", "scipy", "httpx", "fastapi", "PIL", "redis"}
+
+
+def test_every_command_is_there_whatever_is_asked_for() -> None:
+    assert [one.name for one in app_of().registered_commands] == list(COMMANDS)
+    assert [one.name for one in app_of(["search"]).registered_commands] == ["search"]

@@ -1,0 +1,169 @@
+"""The client with a real service and its worker: from files to poses and pictures."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from regnf_client import AsyncClient, Client, Result, ServiceError, WaitTimeoutError
+from tests.client.transports import Counted
+from tests.contract.live import Live
+from tests.live_stack import DATA, LIVE, QUICK
+
+pytestmark = LIVE
+UPRIGHT = {"up_axis": "z"}
+ROOM, CHAIR = DATA / "mix-room.safetensors", DATA / "armchair.safetensors"
+BOX = json.loads((DATA / "detection.json").read_text())
+TRUTH = np.array(json.loads((DATA / "truth.json").read_text())["T_object_scene"]["matrix"])
+
+
+@pytest.fixture
+def client(live_stack: Live) -> Iterator[Client]:
+    with Client(live_stack.address) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def found(live_stack: Live) -> Result:
+    """The demo's registration."""
+    with Client(live_stack.address) as made:
+        return made.register(ROOM, CHAIR, BOX, UPRIGHT, seed=4711)
+
+
+def test_a_pose_from_files(found: Result) -> None:
+    assert found.verdict == "registered"
+    assert np.abs(found.T_object_scene - TRUTH).max() < 0.01
+    assert found.scale == pytest.approx(float(np.cbrt(np.linalg.det(TRUTH[:3, :3]))), rel=0.002)
+    point = np.array([[0.1, 0.2, 0.3]])
+    assert np.allclose(found.apply(point), point @ TRUTH[:3, :3].T + TRUTH[:3, 3], atol=0.01)
+    assert np.allclose(found.T_scene_object @ found.T_object_scene, np.eye(4), atol=1e-9)
+    assert found.covariance is not None
+    assert found.covariance.shape == (7, 7)
+    assert found.source == str(CHAIR)
+
+
+def test_fields_that_the_service_has_are_not_sent(live_stack: Live, found: Result) -> None:
+    counted = Counted(httpx.HTTPTransport())
+    with Client(live_stack.address, transport=counted) as client:
+        again = client.register(ROOM, CHAIR, BOX, UPRIGHT, seed=4711)
+    assert again.job == found.job
+    assert counted.bytes < 10_000
+
+
+def test_what_a_box_may_be(client: Client) -> None:
+    low, high = np.array(BOX["center"]) - np.array(BOX["size"]) / 2, np.array(BOX["center"]) + np.array(BOX["size"]) / 2
+    jobs = [client.submit(ROOM, CHAIR, box, QUICK) for box in (BOX, (low, high), {"min": low, "max": high})]
+    assert len({job.id for job in jobs[1:]}) == 1
+    assert client.wait(jobs[0]).finished
+    assert client.wait(jobs[1]).finished
+
+
+def test_files_of_a_result(client: Client, found: Result, tmp_path: Path) -> None:
+    paths = client.save(found, tmp_path / "out")
+    assert {path.name for path in paths} == {one.name for one in found.artifacts}
+    assert np.allclose(np.load(tmp_path / "out" / "transform.npy"), found.T_object_scene)
+    assert client.artifact(found, "preview.png").startswith(b"\x89PNG")
+    assert not list((tmp_path / "out").glob("*.part"))
+    with pytest.raises(ServiceError) as caught:
+        client.artifact(found, "nothing.png")
+    assert (caught.value.status, caught.value.reason) == (404, "ARTIFACT_NOT_FOUND")
+
+
+def test_a_download_goes_on_where_it_stopped(live_stack: Live, found: Result, tmp_path: Path) -> None:
+    ranges: list[str | None] = []
+
+    class Breaks(httpx.HTTPTransport):
+        def handle_request(self, request: httpx.Request) -> httpx.Response:
+            answer = super().handle_request(request)
+            ranges.append(request.headers.get("range"))
+            if len(ranges) > 1:
+                return answer
+            start = answer.read()[:1000]
+            answer.close()
+            return httpx.Response(200, stream=_BrokenStream(start), request=request)
+
+    with Client(live_stack.address, transport=Breaks()) as client:
+        path = client.download(found, "aligned.ply", tmp_path / "aligned.ply")
+    with Client(live_stack.address) as client:  # the file was made after the result
+        whole = {one.name: one for one in client.result(found).artifacts}["aligned.ply"]
+    assert path.stat().st_size == whole.bytes
+    assert ranges == [None, "bytes=1000-"]
+
+
+class _BrokenStream(httpx.SyncByteStream):
+    def __init__(self, start: bytes) -> None:
+        self._start = start
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield self._start
+        raise httpx.ReadError("the connection broke")
+
+
+def test_events_as_they_come(client: Client) -> None:
+    job = client.submit(ROOM, CHAIR, BOX, UPRIGHT, seed=4712)
+    events = list(client.watch(job))
+    assert events[-1].data["status"] == "successful"
+    assert {event.name for event in events} == {"status", "progress"}
+    assert client.job(job).verdict == client.result(job).verdict
+    assert job.id in {one.id for one in client.jobs("successful")}
+
+
+def test_a_search_among_files(client: Client) -> None:
+    ranked = client.search(ROOM, [ROOM, CHAIR], BOX, UPRIGHT)
+    assert ranked.candidates is not None
+    assert ranked.source == ranked.candidates[0].source == str(CHAIR)
+    assert {one.source for one in ranked.candidates} == {str(ROOM), str(CHAIR)}
+
+
+def test_each_detection_with_each_object(client: Client) -> None:
+    far = {"min": [50, 50, 50], "max": [51, 51, 51]}
+    outcomes = client.register_batch(ROOM, [BOX, far], [CHAIR], options=UPRIGHT, seed=4713)
+    assert [(one.detection, one.object) for one in outcomes] == [(0, 0), (1, 0)]
+    assert outcomes[0].result is not None
+    assert outcomes[1].result is None
+    assert outcomes[1].error is not None
+    assert outcomes[1].error.reason == "DETECTION_OUTSIDE_SCENE"
+
+
+def test_a_rendering(client: Client, found: Result) -> None:
+    edits = [{"kind": "substitution", "job": found}]
+    made = client.render(ROOM, edits, {"orbit": {"edit": 0, "frames": 1}, "size": (32, 24), "outputs": ["color"]})
+    assert (made.frames, made.size) == (1, (32, 24))
+    assert client.artifact(made, made.artifacts[0].name)
+
+
+def test_a_job_can_be_cancelled_and_started_anew(client: Client) -> None:
+    request = {**QUICK, "optimization": {"iterations": 10_000, "stop_residual": 0.0}}
+    job = client.submit(ROOM, CHAIR, BOX, request, seed=4714)
+    client.cancel(job)
+    assert client.wait(job).status == "dismissed"
+    with pytest.raises(ServiceError):
+        client.result(job)
+    assert client.submit(ROOM, CHAIR, BOX, request, seed=4714).id == job.id
+    with pytest.raises(WaitTimeoutError, match="has not ended within"):
+        client.wait(job, timeout_s=0.0)
+    client.cancel(job)
+
+
+def test_the_same_to_be_awaited(live_stack: Live, found: Result, tmp_path: Path) -> None:
+    async def program() -> None:
+        async with AsyncClient(live_stack.address) as client:
+            again, other = await asyncio.gather(
+                client.register(ROOM, CHAIR, BOX, UPRIGHT, seed=4711),
+                client.register(ROOM, CHAIR, BOX, UPRIGHT, seed=4715),
+            )
+            assert (again.job, other.seed) == (found.job, 4715)
+            events = [event async for event in client.watch(other)]
+            assert events[-1].data["status"] == "successful"
+            path = await client.download(again, "transform.npy", tmp_path / "T.npy")
+            assert np.allclose(np.load(path), found.T_object_scene)
+            with pytest.raises(ServiceError, match="job"):
+                await client.job("nothing")
+
+    asyncio.run(program())

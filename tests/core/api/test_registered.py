@@ -1,0 +1,145 @@
+"""What users call: fields by paths, boxes of others, options as dictionaries; results that print, draw and save."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import regnf
+from regnf_core.viewing import window
+from tests.cli.conftest import DATA
+
+BOX = json.loads((DATA / "detection.json").read_text())
+ROOM, CHAIR = DATA / "mix-room.safetensors", DATA / "armchair.safetensors"
+
+
+@pytest.fixture(scope="module")
+def found() -> regnf.Registered:
+    return regnf.register(ROOM, str(CHAIR), BOX, {"up_axis": "z"}, seed=3)
+
+
+def test_a_result_says_what_it_is(found: regnf.Registered) -> None:
+    assert isinstance(found, regnf.RegistrationResult)
+    assert isinstance(found.scale, float)
+    assert found.scale == pytest.approx(1.25, rel=0.01)
+    assert found.matrix.shape == (4, 4)
+    assert found.matrix.dtype == np.float64
+    assert np.array_equal(found.matrix, np.asarray(found.T_object_scene))
+    assert repr(found).startswith("<registered: SURFACES_AGREE, scale 1.2")
+    assert len(repr(found)) < 100
+
+
+def test_paths_and_open_fields_are_the_same(found: regnf.Registered) -> None:
+    box = regnf.OrientedBox.from_dict(BOX)
+    options = regnf.RegistrationOptions(up_axis="z")
+    again = regnf.register(regnf.open_field(ROOM), regnf.open_field(CHAIR), box, options, seed=3)
+    assert np.array_equal(again.matrix, found.matrix)
+    assert (found.object_name, again.object_name) == (str(CHAIR), None)
+
+
+def test_save_writes_what_the_command_writes(found: regnf.Registered, tmp_path: Path) -> None:
+    paths = found.save(tmp_path / "out")
+    names = {path.name for path in paths}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    assert {"result.json", "preview.png", "aligned.ply", "transform.npy", "trace.json"} <= names
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert document["object"] == str(CHAIR)
+    assert set(document["fields"]) == {"scene", "object"}
+    assert document == json.loads(json.dumps(found.to_dict()))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(regnf.RegnfError, match="expected a folder"):
+        found.save(tmp_path / "file")
+
+
+def test_plot_draws(found: regnf.Registered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr("regnf_core.api.registered.show", shown.append)
+    picture = found.plot(tmp_path / "chair.png")
+    assert picture.size[0] > 1000
+    assert (tmp_path / "chair.png").read_bytes().startswith(b"\x89PNG")
+    assert shown == []
+    found.plot()
+    assert shown == [found]
+
+
+def test_a_window_needs_a_display(found: regnf.Registered, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert window.show(found) is False
+    drawn: list[tuple[str, int]] = []
+    monkeypatch.setattr(window, "has_display", lambda: True)
+    monkeypatch.setattr("regnf_core.viewing.window.importlib.import_module", lambda name: name)
+    monkeypatch.setattr(window, "_with_pyvista", lambda library, clouds: drawn.append((library, len(clouds))))
+    assert window.show(found) is True
+    assert drawn == [("pyvista", 2)]
+
+
+def test_notebooks_show_picture_and_verdict(found: regnf.Registered) -> None:
+    html = found._repr_html_()
+    assert "<b>registered</b>" in html
+    assert "data:image/png;base64," in html
+    png = found._repr_png_()
+    assert png is not None
+    assert png.startswith(b"\x89PNG")
+
+
+def test_a_batch_and_a_search() -> None:
+    box = regnf.OrientedBox.from_dict(BOX)
+    scene, thing = regnf.open_field(ROOM), regnf.open_field(CHAIR)
+    (outcome,) = regnf.register_batch(scene, [BOX], [CHAIR], options={"up_axis": "z"}, clouds=False)
+    assert outcome.result is not None
+    assert (outcome.result.verdict, outcome.result.object_name) == ("registered", str(CHAIR))
+    ranked = regnf.search(scene, {"a chair": thing, "the room": scene}, box, {"up_axis": "z"})
+    assert ranked.ranking[0].name == ranked.result.object_name == "a chair"
+    assert "a chair" in repr(ranked)
+
+
+@dataclass
+class Oriented:
+    """As Open3D's OrientedBoundingBox."""
+
+    center: Any
+    extent: Any
+    R: Any
+
+
+@dataclass
+class Aligned:
+    """As Open3D's AxisAlignedBoundingBox."""
+
+    min_bound: Any
+    max_bound: Any
+
+
+def test_boxes_that_people_have() -> None:
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    first = regnf.OrientedBox.from_center([1, 2, 3], np.array([2.0, 4.0, 6.0]), turn, label="chair")
+    second = regnf.OrientedBox.from_open3d(Oriented(np.array([1.0, 2, 3]), np.array([2.0, 4, 6]), turn), "chair")
+    for one in (first, second):
+        assert one.center.tolist() == [1, 2, 3]
+        assert one.size.tolist() == [2, 4, 6]
+        assert np.allclose(one.rotation, turn)
+        assert repr(one) == "OrientedBox(center [1.0, 2.0, 3.0], size [2.0, 4.0, 6.0], turned, 'chair')"
+    third = regnf.OrientedBox.from_open3d(Aligned([0, 0, 0], [2, 4, 6]))
+    fourth = regnf.OrientedBox.from_corners(np.zeros(3), np.array([2.0, 4.0, 6.0]))
+    assert repr(third) == repr(fourth) == "OrientedBox(center [1.0, 2.0, 3.0], size [2.0, 4.0, 6.0])"
+
+
+def test_open3ds_own_boxes() -> None:
+    open3d = pytest.importorskip("open3d")
+    aligned = open3d.geometry.AxisAlignedBoundingBox([0, 0, 0], [2, 4, 6])
+    assert regnf.OrientedBox.from_open3d(aligned).size.tolist() == [2, 4, 6]
+    oriented = aligned.get_oriented_bounding_box()
+    assert sorted(regnf.OrientedBox.from_open3d(oriented).size.tolist()) == [2, 4, 6]
+
+
+def test_short_words_for_transforms_and_fields() -> None:
+    assert repr(regnf.Sim3.identity()) == "Sim3(scale 1, quaternion xyzw [0, 0, 0, 1], translation [0, 0, 0])"
+    assert repr(regnf.Sim3.identity()[None]) == "Sim3(1 transforms)"
+    assert len(repr(regnf.open_field(CHAIR))) < 150
+    assert "bounds" in repr(regnf.open_field(CHAIR))

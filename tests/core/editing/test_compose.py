@@ -1,0 +1,261 @@
+"""Edited scenes against closed forms: rooms and things whose distances are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from regnf_core import Camera, Insertion, Removal, RenderOptions, Replacement, Sim3, Substitution, compose, render
+from regnf_core.editing.measured_matter import without_unseen
+from regnf_core.editing.parts import SCENE_PART
+from regnf_core.editing.standing import standing_alike
+from regnf_core.errors import NoSurfaceError, RegnfError
+from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.schema.observation_grid import SURFACE
+from tests.core.analytic import AnalyticField, boxes, sphere, union
+
+BOUNDS = [[-1.0, -1.0, -0.1], [1.0, 1.0, 1.0]]
+FLOOR = ([-1.0, -1.0, -0.1], [1.0, 1.0, 0.0])
+WALL = ([-1.0, -1.0, -0.1], [-0.9, 1.0, 1.0])
+STOOL = [
+    ([-0.2, -0.2, 0.3], [0.2, 0.2, 0.36]),
+    ([-0.2, -0.2, 0.0], [-0.13, -0.13, 0.3]),
+    ([0.13, 0.13, 0.0], [0.2, 0.2, 0.3]),
+]
+SCALE = 2.5
+
+
+def turned(scale: float = SCALE) -> Sim3:
+    """T_object_scene of a stool that stands in the middle of the scene, turned by 30 degrees in its own frame."""
+    return Sim3.exp(torch.tensor([0.0, 0.0, np.radians(30.0), 0.1, -0.2, 0.3, np.log(scale)], dtype=torch.float64))
+
+
+def stool(T: Sim3) -> AnalyticField:
+    """The stool in its own frame: S_object(y) = s S_scene(T^-1 y)."""
+    here, scale = boxes(STOOL, BOUNDS), float(T.scale)
+    corners = T.apply(
+        torch.tensor([[x, y, z] for x in (-0.25, 0.25) for y in (-0.25, 0.25) for z in (-0.05, 0.4)]).double()
+    )
+    bounds = torch.stack([corners.amin(0), corners.amax(0)])
+    return AnalyticField(lambda y: scale * here.formula(T.inverse().apply(y)), bounds.tolist())
+
+
+def room(*more: tuple[list[float], list[float]]) -> AnalyticField:
+    return boxes([FLOOR, WALL, *more], BOUNDS)
+
+
+def free_points(count: int = 4000, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor([-0.8, -0.8, 0.02]), torch.tensor([0.8, 0.8, 0.9])
+    return low + (high - low) * torch.rand(count, 3, generator=generator)
+
+
+def test_a_substitution_of_the_same_thing_changes_nothing() -> None:
+    T, whole = turned(), room(*STOOL)
+    edited = compose(whole, [Substitution(stool(T), T)])
+    points = free_points()
+    distance, gradient = edited.signed_distance_and_gradient(points)
+    exact = whole.signed_distance(points)
+    near = exact.abs() < 0.05
+    assert (distance - exact)[near].abs().max() < 2e-3
+    assert ((distance > 0) == (exact > 0))[exact.abs() > 2e-3].all()
+    assert (distance <= exact + 2e-3)[exact > 0].all()  # never farther than the surface: rays may trust it
+    assert torch.equal(distance, edited.signed_distance(points))
+    moved = []
+    for move in 1e-3 * torch.eye(3):
+        moved.append(edited.signed_distance(points + move) - edited.signed_distance(points - move))
+    differences = torch.stack(moved, -1) / 2e-3
+    assert ((gradient - differences).abs().amax(-1) < 0.05).float().mean() > 0.97  # but for edges
+
+
+def test_distances_are_in_scene_units_at_any_scale() -> None:
+    for scale in (0.2, 1.0, 7.0):
+        T = turned(scale)
+        edited = compose(room(), [Insertion(stool(T), T)])
+        points = free_points(1000, seed=3)
+        exact = room(*STOOL).signed_distance(points)
+        near = exact.abs() < 0.03
+        assert (edited.signed_distance(points) - exact)[near].abs().max() < 1e-3
+
+
+def test_a_removal_leaves_the_room() -> None:
+    T, empty = turned(), room()
+    for removal in (
+        Removal(obj=stool(T), T_object_scene=T),
+        Removal(detection=OrientedBox.from_corners([-0.22, -0.22, -0.01], [0.22, 0.22, 0.38])),
+    ):
+        edited = compose(room(*STOOL), [removal])
+        points = free_points()
+        assert ((edited.signed_distance(points) > 0) == (empty.signed_distance(points) > 0)).all()
+        above = torch.cartesian_prod(torch.linspace(-0.7, 0.7, 40), torch.linspace(-0.7, 0.7, 40), torch.tensor([4e-3]))
+        distance, gradient = edited.signed_distance_and_gradient(above)
+        assert (distance - 4e-3).abs().max() < 1.5e-3  # the floor goes on where legs stood, without a seam
+        assert (gradient[:, 2] > 0.98).all()
+        below = above * torch.tensor([1.0, 1.0, -1.0])
+        assert (edited.signed_distance(below) < 0).all()
+
+
+def test_a_thing_at_a_wall_leaves_floor_and_wall() -> None:
+    thing = ([-0.9, -0.15, 0.0], [-0.6, 0.15, 0.5])
+    detection = OrientedBox.from_corners([-0.9, -0.16, 0.0], [-0.59, 0.16, 0.51])
+    edited = compose(room(thing), [Removal(detection=detection)])
+    points = torch.cartesian_prod(torch.tensor([-0.895]), torch.linspace(-0.5, 0.5, 25), torch.linspace(0.02, 0.9, 25))
+    assert (edited.signed_distance(points) - 5e-3).abs().max() < 2e-3
+    assert (edited.signed_distance(points - torch.tensor([0.01, 0.0, 0.0])) < 0).all()
+
+
+def test_what_reaches_in_from_outside_stays() -> None:
+    """A table's top over the stool is no part of it."""
+    top = ([-0.9, -0.5, 0.5], [0.8, 0.1, 0.56])
+    T = turned()
+    tall = [*STOOL, ([-0.2, -0.2, 0.36], [-0.15, -0.15, 0.48])]  # its box reaches the table's top
+    scene = room(*tall, top)
+    here = boxes(tall, BOUNDS)
+    frame = stool(T)
+    obj = AnalyticField(lambda y: SCALE * here.formula(T.inverse().apply(y)), frame.bounds.tolist())
+    edited = compose(scene, [Removal(obj=obj, T_object_scene=T)])
+    inside = torch.cartesian_prod(torch.linspace(-0.8, 0.7, 30), torch.linspace(-0.4, 0.0, 20), torch.tensor([0.53]))
+    assert (edited.signed_distance(inside) < 0).all()
+    seat = torch.cartesian_prod(torch.linspace(-0.18, 0.18, 9), torch.linspace(-0.18, 0.18, 9), torch.tensor([0.33]))
+    assert (edited.signed_distance(seat) > 0).all()
+
+
+def test_a_table_ends_where_it_ended() -> None:
+    """A thing at a table's edge: no floor is continued beyond the edge."""
+    top = ([-0.5, -0.5, 0.4], [0.0, 0.5, 0.45])
+    vase = ([-0.2, -0.1, 0.45], [-0.02, 0.1, 0.7])
+    scene = room(top, vase)
+    edited = compose(scene, [Removal(detection=OrientedBox.from_corners([-0.21, -0.11, 0.45], [0.1, 0.11, 0.71]))])
+    on = torch.cartesian_prod(torch.linspace(-0.45, -0.03, 20), torch.linspace(-0.4, 0.4, 20), torch.tensor([0.446]))
+    assert (edited.signed_distance(on) < 0).all()
+    beyond = torch.cartesian_prod(
+        torch.linspace(0.02, 0.3, 10), torch.linspace(-0.3, 0.3, 10), torch.tensor([0.44, 0.45, 0.46])
+    )
+    assert (edited.signed_distance(beyond) > 0).all()
+    above = on + torch.tensor([0.0, 0.0, 0.02])
+    assert (edited.signed_distance(above) > 0).all()
+
+
+def test_a_replacement_stands_on_the_same_base() -> None:
+    T = turned()
+    ball = sphere(3.0, bounds=[[-4.0] * 3, [4.0] * 3])
+    edited = compose(room(*STOOL), [Replacement(stool(T), T, ball)])
+    low, high = edited.objects[0][1].bounds
+    assert abs(float(low[2])) < 0.02  # the floor
+    assert abs(float(high[2]) - 0.36) < 0.03  # as high as the stool
+    known = Sim3.exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.log(4.0)], dtype=torch.float64))
+    given = compose(room(*STOOL), [Replacement(stool(T), T, ball, known)]).objects[0][1].T_object_scene
+    assert torch.allclose(given.matrix(), (known @ T).matrix())
+
+
+def test_standing_alike_maps_base_to_base_and_up_to_up() -> None:
+    here = OrientedBox.from_corners([-1, -2, 0], [1, 2, 5])
+    other = OrientedBox.from_corners([-1, -10, 0], [3, 0, 4])  # its vertical is -y
+    T = standing_alike(here, other, "z", "-y")
+    assert torch.allclose(T.apply(torch.tensor([[0.0, 0.0, 0.0]]).double()), torch.tensor([[1.0, 0.0, 2.0]]).double())
+    assert torch.allclose(T.apply(torch.tensor([[0.0, 0.0, 5.0]]).double()), torch.tensor([[1.0, -10.0, 2.0]]).double())
+    assert float(T.scale) == pytest.approx(2.0)
+
+
+def test_parts_tell_whose_the_surface_is() -> None:
+    T = turned()
+    edited = compose(room(), [Insertion(stool(T), T, tint=(1.0, 0.0, 0.0), name="stool")])
+    frame = render(edited, Camera.look_at([0.8, 0.7, 0.8], [0.0, 0.0, 0.2], (48, 36)), RenderOptions())
+    seat = frame.part == 1
+    assert seat.sum() > 50
+    assert (frame.part[~seat & (frame.depth > 0)] == SCENE_PART).all()
+    assert (frame.color[seat][:, 0] > 3 * frame.color[seat][:, 1].astype(int)).all()
+    assert edited.parts[1].name == "stool"
+
+
+def test_an_edited_scene_is_edited_again() -> None:
+    T = turned()
+    once = compose(room(*STOOL), [Removal(obj=stool(T), T_object_scene=T)])
+    ball = sphere(0.2, bounds=[[-0.3] * 3, [0.3] * 3])
+    place = Sim3.from_translation(torch.tensor([-0.3, -0.3, -0.21], dtype=torch.float64))
+    twice = compose(once, [Insertion(ball, place)])
+    exact = union([room(), sphere(0.2, (0.3, 0.3, 0.21))], BOUNDS)
+    points = free_points()
+    truth = exact.signed_distance(points)
+    assert ((twice.signed_distance(points) > 0) == (truth > 0))[truth.abs() > 2e-3].all()
+    assert len(twice.parts) == 3
+
+
+def test_what_objects_say_outside_of_their_bounds_counts_for_nothing() -> None:
+    """Trained fields mean nothing there: this one has a second ball beyond them."""
+    ghost = union([sphere(0.2), sphere(0.2, (0.0, 0.0, 0.9))], [[-0.3] * 3, [0.3] * 3])
+    T = Sim3.from_translation(torch.tensor([0.0, 0.0, -0.2], dtype=torch.float64))
+    edited = compose(room(), [Insertion(ghost, T)])
+    points = free_points()
+    exact = union([room(), sphere(0.2, (0.0, 0.0, 0.2))], BOUNDS).signed_distance(points)
+    assert ((edited.signed_distance(points) > 0) == (exact > 0))[exact.abs() > 2e-3].all()
+
+
+BALL = sphere(0.2)
+SHEARED = [[1.0, 0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+FAR = Sim3.from_translation(torch.tensor([50.0, 0.0, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("reason", "make"),
+    [
+        ("INVALID_TRANSFORM", lambda: Substitution(sphere(0.2), Sim3.from_matrix(SHEARED))),
+        ("INVALID_TRANSFORM", lambda: Insertion(sphere(0.2), Sim3.identity()[None].expand(2))),
+        (
+            "INVALID_TRANSFORM",
+            lambda: Insertion(
+                sphere(0.2), Sim3(torch.tensor(torch.nan).double(), torch.eye(3).double(), torch.zeros(3).double())
+            ),
+        ),
+        ("EDIT_INVALID", lambda: Removal()),
+        ("EDIT_INVALID", lambda: Removal(obj=sphere(0.2))),
+        ("EDIT_INVALID", lambda: Substitution(sphere(0.2), Sim3.identity(), residual=-1.0)),
+        (
+            "EDIT_INVALID",
+            lambda: compose(room(), [Replacement(sphere(0.2), Sim3.identity(), sphere(0.2), up_object="up")]),
+        ),
+        ("EDIT_OUTSIDE_SCENE", lambda: compose(room(), [Insertion(sphere(0.2), FAR)])),
+        ("EDITS_OVERLAP", lambda: compose(room(*STOOL), [Removal(obj=stool(turned()), T_object_scene=turned())] * 2)),
+        ("EDITS_OVERLAP", lambda: compose(room(), [Insertion(stool(turned()), turned())] * 2)),
+    ],
+)
+def test_bad_edits_have_reasons(reason: str, make: object) -> None:
+    assert callable(make)
+    with pytest.raises(RegnfError) as caught:
+        make()
+    assert caught.value.reason == reason
+
+
+def test_an_object_without_surface() -> None:
+    empty = AnalyticField(lambda p: p.norm(dim=-1) + 5.0, [[-1.0] * 3, [1.0] * 3])
+    with pytest.raises(NoSurfaceError, match="edit 0") as caught:
+        compose(room(), [Insertion(empty, Sim3.identity())])
+    assert caught.value.reason == "NO_SURFACE_IN_OBJECT"
+
+
+def test_neighbors_may_touch() -> None:
+    T = turned()
+    beside = Sim3.from_translation(torch.tensor([-0.405, 0.0, -0.2], dtype=torch.float64))
+    ball = sphere(0.2, bounds=[[-0.3] * 3, [0.3] * 3])
+    assert len(compose(room(), [Insertion(stool(T), T), Insertion(ball, beside)]).objects) == 2
+
+
+def test_matter_that_nobody_saw_goes() -> None:
+    """A ball of which only the upper half was measured, in a turned and scaled grid: a shell of it is left."""
+    states = torch.zeros(40, 40, 40, dtype=torch.uint8)
+    T_grid_frame = Sim3.exp(torch.tensor([0.0, 0.0, 0.3, 1.0, 2.0, 3.0, np.log(2.0)], dtype=torch.float64))
+    low, voxel = T_grid_frame.apply(torch.zeros(1, 3).double())[0] - 2.0, 0.1
+    index = torch.cartesian_prod(*(torch.arange(40),) * 3)
+    at = T_grid_frame.inverse().apply(low + voxel * (index + 0.5))
+    measured = ((at.norm(dim=-1) - 0.5).abs() < 0.05) & (at[:, 2] > 0.0)
+    states.view(-1)[measured] = SURFACE
+    ball = ObservedField(sphere(0.5), Observation(states, low, voxel, T_grid_frame))
+    shell = without_unseen(ball)
+    points = torch.tensor([[0.0, 0.0, 0.48], [0.0, 0.0, 0.52], [0.0, 0.0, -0.48], [0.0, 0.0, 0.0]])
+    assert (shell.signed_distance(points) > 0).tolist() == [False, True, True, True]
+    distance, gradient = shell.signed_distance_and_gradient(points[:2])
+    assert torch.allclose(distance, torch.tensor([-0.02, 0.02]), atol=1e-4)
+    assert (gradient[:, 2] > 0.99).all()
+    assert isinstance(without_unseen(sphere(0.5)), AnalyticField)

@@ -1,0 +1,114 @@
+"""Color in any frame and unit: the same place seen along the same line has the same color."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from torch import Tensor
+
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.color import ColoredField, has_color, inverse_deviation_of
+from regnf_core.fields.composite import BoxField, UnionField
+from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.fields.scaled import ScaledField
+from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.sim3 import Sim3
+from tests.core.analytic import sphere
+
+
+class PaintedBox(BoxField):
+    """A box whose color tells the place and the direction that were asked for."""
+
+    inverse_deviation = 40.0
+
+    def color(self, points: Tensor, directions: Tensor) -> Tensor:
+        return 0.5 + 0.05 * points + 0.3 * directions
+
+
+PAINTED = PaintedBox((-1.0, -0.5, -0.25), (1.0, 0.5, 0.25))
+PLAIN = BoxField((-1.0, -0.5, -0.25), (1.0, 0.5, 0.25))
+T_BOX_FRAME = Sim3.exp(torch.tensor([0.4, -0.8, 2.1, 0.3, -0.2, 0.1, 0.9], dtype=torch.float64))
+
+
+def unseen() -> Observation:
+    return Observation(torch.zeros(2, 2, 2, dtype=torch.uint8), torch.zeros(3, dtype=torch.float64), 1.0)
+
+
+def questions(count: int = 50) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points, directions = torch.randn(2, count, 3, generator=generator)
+    return points, torch.nn.functional.normalize(directions, dim=-1)
+
+
+def test_a_field_without_color_has_none() -> None:
+    views: list[SdfField] = [PLAIN, TransformedField(PLAIN, T_BOX_FRAME), ScaledField(PLAIN, 2.0)]
+    views += [ObservedField(PLAIN, unseen()), UnionField([PLAIN, PAINTED]), sphere(0.5)]
+    for view in views:
+        assert not has_color(view)
+        assert not isinstance(view, ColoredField)
+        assert inverse_deviation_of(view) is None
+
+
+def test_color_in_another_frame() -> None:
+    points, directions = questions()
+    view = TransformedField(PAINTED, T_BOX_FRAME)
+    assert isinstance(view, ColoredField)
+    rotation = T_BOX_FRAME.rotation.float()
+    expected = (
+        0.5 + 0.05 * T_BOX_FRAME.apply(points.double()).float() + 0.3 * (rotation @ directions[:, :, None])[:, :, 0]
+    )
+    torch.testing.assert_close(view.color(points, directions), expected)
+    # Lengths of the new frame are multiplied by the scale.
+    assert view.inverse_deviation == pytest.approx(40.0 * float(T_BOX_FRAME.scale))
+
+
+def test_color_in_another_unit() -> None:
+    points, directions = questions()
+    view = ScaledField(PAINTED, 4.0, -1)
+    assert has_color(view)
+    torch.testing.assert_close(view.color(4.0 * points, directions), PAINTED.color(points, directions))
+    assert view.inverse_deviation == pytest.approx(10.0)
+
+
+def test_the_opacity_between_two_points_is_the_same_in_every_frame() -> None:
+    """NeuS's opacity depends on s S(x) alone, so that s must change with the unit of S."""
+    points, _ = questions()
+    for view, there in (
+        (TransformedField(PAINTED, T_BOX_FRAME), T_BOX_FRAME.inverse().apply(points.double()).float()),
+        (ScaledField(PAINTED, 4.0), 4.0 * points),
+    ):
+        assert view.inverse_deviation is not None
+        torch.testing.assert_close(
+            view.signed_distance(there) * view.inverse_deviation, PAINTED.signed_distance(points) * 40.0
+        )
+
+
+def test_views_of_views_and_an_observation() -> None:
+    points, directions = questions()
+    view = TransformedField(ScaledField(ObservedField(PAINTED, unseen()), 3.0), T_BOX_FRAME)
+    assert has_color(view)
+    moved = T_BOX_FRAME.apply(points.double()).float()
+    rotation = T_BOX_FRAME.rotation.float()
+    torch.testing.assert_close(view.color(points, directions), PAINTED.color(moved / 3.0, directions @ rotation.T))
+    assert view.inverse_deviation == pytest.approx(40.0 * float(T_BOX_FRAME.scale) / 3.0)
+    assert has_color(view.to("cpu"))
+
+
+def test_a_union_has_the_color_of_the_nearest_part() -> None:
+    moved = TransformedField(PAINTED, Sim3.from_translation(torch.tensor([-5.0, 0.0, 0.0], dtype=torch.float64)))
+    union = UnionField([PAINTED, moved])
+    assert has_color(union)
+    points = torch.tensor([[0.9, 0.0, 0.0], [4.1, 0.0, 0.0]])
+    directions = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    expected = PAINTED.color(torch.tensor([[0.9, 0.0, 0.0], [-0.9, 0.0, 0.0]]), directions)
+    torch.testing.assert_close(union.color(points, directions), expected)
+    assert union.inverse_deviation == 40.0
+
+
+def test_a_view_with_color_can_be_sent_to_another_process() -> None:
+    points, directions = questions()
+    view = TransformedField(ScaledField(PAINTED, 3.0), T_BOX_FRAME)
+    again = pickle.loads(pickle.dumps(view))
+    torch.testing.assert_close(again.color(points, directions), view.color(points, directions))

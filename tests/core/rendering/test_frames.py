@@ -1,0 +1,195 @@
+"""Frames against closed forms: rays and solids whose meeting is known exactly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from regnf_core import Camera, RegnfError, RenderOptions, render
+from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
+from regnf_core.geometry.box import OrientedBox
+from regnf_core.rendering.frame import NOTHING
+from regnf_core.rendering.paths import Orbit
+from regnf_core.rendering.render import render_frames
+from tests.core.analytic import AnalyticField, boxes, sphere
+
+SIZE = (48, 36)
+CAMERA = Camera.look_at([0.9, -0.7, 0.6], [0.05, 0.0, 0.02], SIZE, 40.0)
+MODES = ("surface", "volume")
+
+
+def rays_of(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions (H, W, 3) by the pinhole's definition in float64, and the cosines to the viewing axis."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack(
+        [(u - camera.middle[0]) / camera.focal[0], (v - camera.middle[1]) / camera.focal[1], np.ones_like(u)], axis=-1
+    )
+    directions = local @ camera.axes.numpy().T
+    length = np.linalg.norm(directions, axis=-1)
+    return directions / length[..., None], 1.0 / length, camera.position.numpy()
+
+
+def sphere_depth(camera: Camera, center: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Depth along the viewing axis and normals of a ball, by the quadratic formula; NaN where it is missed."""
+    directions, cosine, origin = rays_of(camera)
+    offset = origin - center
+    b = directions @ offset
+    square = b**2 - offset @ offset + radius**2
+    with np.errstate(invalid="ignore"):
+        length = -b - np.sqrt(square)
+    points = origin + length[..., None] * directions
+    return length * cosine, (points - center) / radius
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_ball(mode: str) -> None:
+    center = np.array([0.05, 0.0, 0.02])
+    field = sphere(0.35, center.tolist())
+    options = RenderOptions(mode=mode, inverse_deviation=20_000.0 if mode == "volume" else None)
+    frame = render(field, CAMERA, options)
+    depth, normal = sphere_depth(CAMERA, center, 0.35)
+    hit = np.isfinite(depth)
+    seen = frame.depth > 0
+    assert hit.sum() > 200
+    assert (seen != hit).mean() < 0.01  # the outline's pixels alone
+    both = seen & hit
+    error, cosine = np.abs(frame.depth - depth), -(normal * rays_of(CAMERA)[0]).sum(-1)
+    assert error[both & (cosine > 0.3)].max() < 5e-4
+    assert error[both].max() < 5e-3
+    assert (frame.normal * normal).sum(-1)[both & (cosine > 0.3)].min() > 0.999
+    assert (frame.part[seen] == 0).all()
+    assert (frame.part[~seen] == NOTHING).all()
+    assert (frame.opacity[~seen] < 0.5).all()
+
+
+def test_a_box_of_sharp_edges() -> None:
+    low, high = np.array([-0.3, -0.2, -0.25]), np.array([0.25, 0.3, 0.2])
+    frame = render(boxes([(low.tolist(), high.tolist())]), CAMERA)
+    directions, cosine, origin = rays_of(CAMERA)
+    with np.errstate(divide="ignore"):
+        first, second = (low - origin) / directions, (high - origin) / directions
+    near, far = np.minimum(first, second).max(-1), np.maximum(first, second).min(-1)
+    hit = near < far
+    both = hit & (frame.depth > 0)
+    assert (hit != (frame.depth > 0)).mean() < 0.01
+    assert np.median(np.abs(frame.depth - near * cosine)[both]) < 1e-4
+
+
+def test_volume_is_the_formula_on_dense_samples() -> None:
+    """Opacity and depth of the same rays by the paper's formula: 4000 even samples a ray, float64."""
+    field, s = sphere(0.35), 60.0
+    camera = CAMERA.resized((24, 18))
+    frame = render(field, camera, RenderOptions(mode="volume", inverse_deviation=s))
+    directions, cosine, origin = rays_of(camera)
+    t = np.linspace(0.2, 2.4, 4000)
+    points = origin + directions[..., None, :] * t[:, None]
+    inside = (np.abs(points) <= 1.0).all(-1)
+    d = np.linalg.norm(points, axis=-1) - 0.35
+    phi = 1.0 / (1.0 + np.exp(-s * d))
+    alpha = np.clip((phi[..., :-1] - phi[..., 1:]) / phi[..., :-1], 0.0, 1.0) * (inside[..., :-1] & inside[..., 1:])
+    passed = np.cumprod(np.concatenate([np.ones_like(alpha[..., :1]), 1.0 - alpha], axis=-1), axis=-1)
+    weight = passed[..., :-1] * alpha
+    opacity = weight.sum(-1)
+    assert np.abs(frame.opacity - opacity).max() < 0.02
+    solid = opacity > 0.95
+    depth = (weight * (t[:-1] + t[1:]) / 2).sum(-1) / np.maximum(opacity, 1e-9) * cosine
+    assert np.abs(frame.depth - depth)[solid].max() < 0.25 / s
+    assert np.abs(frame.depth - depth)[solid].mean() < 0.05 / s
+
+
+def test_thin_sheets_are_not_stepped_over() -> None:
+    """A plate of .3 % of the bounds' diagonal before a wall, also seen at a grazing angle."""
+    field = boxes([([-0.6, -0.005, -0.6], [0.6, 0.005, 0.6]), ([-0.9, 0.5, -0.9], [0.9, 0.6, 0.9])])
+    for place in ([0.1, -0.9, 0.1], [0.85, -0.12, 0.1]):
+        frame = render(field, Camera.look_at(place, [0.0, 0.0, 0.0], SIZE, 20.0))
+        directions, cosine, origin = rays_of(frame.camera)
+        along = (-0.005 - origin[1]) / directions[..., 1]
+        met = origin + along[..., None] * directions
+        on = (np.abs(met[..., [0, 2]]) < 0.58).all(-1) & (along > 0)
+        assert on.sum() > 100
+        assert np.abs(frame.depth - along * cosine)[on].max() < 2e-3
+
+
+def test_tiles_and_antialiasing_change_little() -> None:
+    field = sphere(0.35)
+    whole = render(field, CAMERA)
+    tiled = render(field, CAMERA, RenderOptions(memory_mb=16))
+    assert np.array_equal(whole.color, tiled.color)
+    fine = render(field, CAMERA, RenderOptions(antialias=3))
+    assert np.array_equal(fine.depth, whole.depth)
+    assert len(np.unique(fine.opacity)) > 3
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_threads_change_nothing_that_is_seen(mode: str) -> None:
+    before, frames = torch.get_num_threads(), []
+    field = boxes([([-0.3, -0.2, -0.25], [0.25, 0.3, 0.2])])
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        frames.append(render(field, CAMERA, RenderOptions(mode=mode)))
+    torch.set_num_threads(before)
+    one, three = frames
+    assert (np.abs(one.depth - three.depth) > 1e-3).mean() < 0.002
+    assert (np.abs(one.color.astype(int) - three.color) > 4).mean() < 0.002
+
+
+def test_progress_and_cancelling() -> None:
+    cameras = Orbit(frames=3).cameras(OrientedBox.from_corners([-0.3] * 3, [0.3] * 3), (40, 30))
+    told: list[float] = []
+    frames = list(render_frames(sphere(0.3), cameras, progress=told.append))
+    assert len(frames) == 3
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    answers = iter([False, True])
+    with pytest.raises(CancelledError):
+        list(render_frames(sphere(0.3), cameras, cancelled=lambda: next(answers)))
+
+
+def test_a_camera_in_matter() -> None:
+    field = sphere(0.35)
+    inside = Camera.look_at([0.1, 0.0, 0.0], [1.0, 0.0, 0.0], SIZE)
+    with pytest.raises(InvalidInputError) as caught:
+        render(field, inside)
+    assert caught.value.reason == "CAMERA_IN_MATTER"
+    assert (render(field, inside, RenderOptions(cut_away=True)).depth == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("reason", "make"),
+    [
+        ("RENDER_TOO_LARGE", lambda: Camera.look_at([1, 0, 0], [0, 0, 0], (100_000, 10_000))),
+        ("RENDER_TOO_LARGE", lambda: Orbit(frames=1_000_000).cameras(OrientedBox.from_corners([0] * 3, [1] * 3))),
+        ("CAMERA_INVALID", lambda: Camera.look_at([1, 0, 0], [1, 0, 0])),
+        ("CAMERA_INVALID", lambda: Camera.look_at([math.nan, 0, 0], [1, 0, 0])),
+        ("CAMERA_INVALID", lambda: Camera.look_at([1, 0, 0], [0, 0, 0], (64, 48), 180.0)),
+        ("CAMERA_INVALID", lambda: Camera.look_at([1, 0, 0], [0, 0, 0], up="w")),
+        ("CAMERA_INVALID", lambda: Camera(torch.zeros(3), 2 * torch.eye(3), 4, 4, (4.0, 4.0), (2.0, 2.0))),
+        ("CAMERA_INVALID", lambda: Camera.look_at([1, 0, 0], [0, 0, 0], (0, 4))),
+        ("CAMERA_INVALID", lambda: Orbit(frames=0).cameras(OrientedBox.from_corners([0] * 3, [1] * 3))),
+        ("COLORS_MISSING", lambda: render(sphere(0.3), CAMERA, RenderOptions(coloring="field"))),
+        ("FIELD_NOT_FINITE", lambda: render(AnalyticField(lambda p: p[:, 0] * math.nan, [[-1] * 3, [1] * 3]), CAMERA)),
+    ],
+)
+def test_bad_requests_have_reasons(reason: str, make: object) -> None:
+    assert callable(make)
+    with pytest.raises(RegnfError) as caught:
+        make()
+    assert caught.value.reason == reason
+
+
+def test_a_field_without_surface() -> None:
+    with pytest.raises(NoSurfaceError) as caught:
+        render(AnalyticField(lambda p: p.norm(dim=-1) + 5.0, [[-1] * 3, [1] * 3]), CAMERA)
+    assert caught.value.reason == "NO_SURFACE_IN_SCENE"
+
+
+def test_an_orbit_sees_its_box() -> None:
+    box = OrientedBox.from_corners([0.1, 0.2, 0.3], [0.5, 0.4, 0.9])
+    for camera in Orbit(frames=5, elevation_deg=-20.0, start_deg=10.0).cameras(box, (64, 48)):
+        places, depth = camera.pinhole().project(0, box.corners())
+        assert (depth > 0).all()
+        assert ((places > 0) & (places < 1)).all()
+        assert torch.allclose(camera.axes[2, 1].sign(), torch.tensor(-1.0, dtype=torch.float64))  # upright

@@ -1,0 +1,86 @@
+"""The meshes that people look at: bounded, true to the surface, and read by others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from regnf_core.fields.mesh import MeshField
+from regnf_core.viewing.display_mesh import (
+    COARSE_TRIANGLES,
+    FINE_TRIANGLES,
+    FINE_VERTICES,
+    TooSlowError,
+    display_meshes,
+)
+from regnf_core.viewing.mesh_file import mesh_file
+from regnf_core.viewing.vertex_clustering import Triangles, at_most, clustered
+from tests.core.analytic import sphere
+
+
+def test_mesh_is_shown_as_it_is() -> None:
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    shown = display_meshes(MeshField(box.vertices, box.faces), budget_s=1.0)
+    assert shown.coarse is None
+    assert shown.fine.normals is None
+    assert trimesh.Trimesh(shown.fine.vertices, shown.fine.faces).volume == pytest.approx(6.0)
+
+
+def test_large_mesh_is_bounded_and_stays_on_its_surface() -> None:
+    ball = trimesh.creation.icosphere(7)
+    colors = np.broadcast_to(np.float32([0.2, 0.4, 0.6]), ball.vertices.shape)
+    shown = display_meshes(MeshField(ball.vertices, ball.faces, colors=colors), budget_s=1.0)
+    assert len(ball.faces) > FINE_TRIANGLES
+    assert FINE_TRIANGLES / 4 < len(shown.fine.faces) <= FINE_TRIANGLES
+    assert len(shown.fine.vertices) <= FINE_VERTICES
+    assert shown.coarse is not None
+    assert COARSE_TRIANGLES / 4 < len(shown.coarse.faces) <= COARSE_TRIANGLES
+    np.testing.assert_allclose(np.linalg.norm(shown.fine.vertices, axis=1), 1.0, atol=1e-3)
+    assert shown.fine.colors is not None
+    np.testing.assert_allclose(
+        shown.fine.colors, np.broadcast_to([0.2, 0.4, 0.6], shown.fine.vertices.shape), atol=1e-6
+    )
+
+
+def test_field_is_extracted_with_normals() -> None:
+    shown = display_meshes(sphere(0.5), budget_s=20.0)
+    assert shown.fine.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(shown.fine.vertices, axis=1), 0.5, atol=2e-3)
+    np.testing.assert_allclose(shown.fine.normals, shown.fine.vertices / 0.5, atol=1e-2)
+    corners = shown.fine.vertices[shown.fine.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert ((outward * corners.mean(axis=1)).sum(axis=1) >= 0).mean() > 0.99  # triangles face free space
+
+
+def test_slow_field_has_no_mesh() -> None:
+    with pytest.raises(TooSlowError):
+        display_meshes(sphere(0.5), budget_s=0.0)
+
+
+def test_clustering_by_hand() -> None:
+    """Two vertices in one cell become their mean; the triangle that joins them is gone."""
+    vertices = np.array([[0.0, 0, 0], [0.2, 0, 0], [2.5, 0, 0], [0, 2.5, 0]])
+    found = clustered(Triangles(vertices, np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]])), edge=1.0)
+    np.testing.assert_allclose(sorted(found.vertices.tolist()), [[0, 2.5, 0], [0.1, 0, 0], [2.5, 0, 0]])
+    assert len(found.faces) == 1
+
+
+def test_clustering_ends_for_far_and_flat_meshes() -> None:
+    rng = np.random.default_rng(0)
+    vertices = rng.random((3000, 3)) * [1e6, 1e-3, 0.0]
+    faces = rng.permutation(3000).reshape(-1, 3)
+    assert len(at_most(Triangles(vertices, faces), 50, 60).faces) <= 50
+
+
+def test_files_are_read_by_others(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(2)
+    path = tmp_path / "mesh.glb"
+    colors = np.broadcast_to([1.0, 0.5, 0.0], ball.vertices.shape)
+    path.write_bytes(mesh_file(ball.vertices, ball.faces, ball.vertex_normals, colors))
+    read = trimesh.load(path, force="mesh")
+    np.testing.assert_allclose(read.vertices, ball.vertices, atol=1e-6)
+    assert (np.asarray(read.faces) == ball.faces).all()
+    assert read.visual.vertex_colors[0].tolist() == [255, 128, 0, 255]

@@ -1,0 +1,101 @@
+"""Every code block of the pages for readers runs, in the order of its page, as a reader would run it."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.contract.live import eventually
+from tests.docs.pages import DOCS, ROOT, Block, blocks, reader_pages
+
+ADDRESS = "127.0.0.1:8080"
+SERVE = "regnf serve\n"
+RUN = [page for page in reader_pages() if any(block.language in ("bash", "python") for block in blocks(page))]
+ELSEWHERE = re.compile(
+    r"make |source |pip |python3 -m venv|scripts/|cp DATA|cp -r ros2|rosdep|colcon|ros2 |ns-train|regnf \w+"
+)
+
+
+def environment(folder: Path) -> dict[str, str]:
+    tools = folder / "bin"
+    tools.mkdir()
+    for name, module in (("regnf", ["-m", "regnf_cli.main"]), ("python", [])):
+        (tools / name).write_text(f'#!/bin/sh\nexec {" ".join([sys.executable, *module])} "$@"\n')
+        (tools / name).chmod(0o755)
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("REGNF_")}
+    paths = os.pathsep.join(str(ROOT / part) for part in ("", "service", "worker"))
+    own = {"PATH": f"{tools}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": paths}
+    return plain | own | {"REGNF_STATE_DIR": str(folder / "state"), "XDG_CACHE_HOME": str(folder / "cache")}
+
+
+def run(command: list[str], text: str, folder: Path, variables: dict[str, str]) -> None:
+    done = subprocess.run(
+        command, input=text, cwd=folder, env=variables, capture_output=True, text=True, timeout=280, check=False
+    )
+    assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+
+
+@contextmanager
+def serving(wanted: bool, folder: Path, variables: dict[str, str]) -> Iterator[str]:
+    """The service that a page tells its reader to start, at a free port; its address."""
+    if not wanted:
+        yield ADDRESS
+        return
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with (folder / "serve.log").open("wb") as log:
+        command = [sys.executable, "-m", "regnf_cli.main", "serve", "--port", str(port)]
+        process = subprocess.Popen(command, env=variables, cwd=folder, stdout=log, stderr=log)
+    try:
+        eventually(lambda: is_ready(port), f"the service; {(folder / 'serve.log').read_text()}", deadline_s=120)
+        yield f"127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+def is_ready(port: int) -> bool:
+    try:
+        return httpx.get(f"http://127.0.0.1:{port}/readyz", timeout=5).status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(DOCS)))
+def test_the_blocks_of_a_page_run(page: Path, tmp_path: Path) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    variables = environment(tmp_path)
+    found = blocks(page)
+    with serving(Block("bash", SERVE) in found, tmp_path, variables) as address:
+        program = ""
+        for block in found:
+            code = block.code.replace(ADDRESS, address)
+            if block.language == "bash" and block.code != SERVE:
+                run(["bash", "-euo", "pipefail"], code, tmp_path, variables)
+            elif block.language == "python":
+                program += code
+        if program:
+            run([sys.executable, "-W", "error", "-"], program, tmp_path, variables)
+
+
+def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
+    for page in reader_pages():
+        for block in blocks(page):
+            assert block.language in ("bash", "python", "json", "console", "text"), page
+            if block.language == "console":
+                assert ELSEWHERE.match(block.code), f"{page}: {block.code}"
+
+
+def test_there_are_blocks() -> None:
+    assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}

@@ -1,0 +1,108 @@
+"""The package regnf_ros with stubs of everything of ROS that it imports."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar
+
+import pytest
+
+from tests.ros2.messages import TYPES
+
+PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "regnf_ros"
+LOADED = ("regnf_ros", "rclpy", "tf2_ros", "geometry_msgs", "vision_msgs", "launch", "launch_ros")
+
+
+class Recorder:
+    """Keeps what it is called with."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        self.arguments, self.named = arguments, named
+        self.sent: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        self.sent.append(message)
+
+    sendTransform = publish  # noqa: N815 -- the name in tf2_ros
+
+
+class Log:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def info(self, text: str) -> None:
+        self.lines.append(text)
+
+    warning = error = info
+
+
+class Node:
+    """What the node uses of rclpy's. ``given``: parameters, as a launch file gives them."""
+
+    given: ClassVar[dict[str, str]] = {}
+
+    def __init__(self, name: str) -> None:
+        self.name, self.log = name, Log()
+
+    def declare_parameter(self, name: str, default: str) -> SimpleNamespace:
+        return SimpleNamespace(value=self.given.get(name, default))
+
+    def create_publisher(self, kind: type, topic: str, depth: int) -> Recorder:
+        return Recorder(kind, topic, depth)
+
+    def create_subscription(self, kind: type, topic: str, callback: Any, depth: int) -> None:
+        self.subscribed = (kind, topic, callback)
+
+    def get_logger(self) -> Log:
+        return self.log
+
+
+class TransformException(Exception):  # noqa: N818 -- the name in tf2_ros
+    """tf2's error for a transform that is not known."""
+
+
+class Buffer:
+    """Knows one transform, if one is set."""
+
+    known: Any = None
+
+    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+        if self.known is None:
+            raise TransformException(f"no transform from {source} to {target}")
+        return self.known
+
+
+def module(name: str, **members: Any) -> None:
+    made = ModuleType(name)
+    made.__dict__.update(members)
+    sys.modules[name] = made
+
+
+@pytest.fixture
+def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(PACKAGE))
+    before = set(sys.modules)
+    assert not before & set(LOADED), "ROS itself is not to be replaced"
+    time = type("Time", (), {"from_msg": staticmethod(lambda stamp: stamp)})
+    module("rclpy", init=None, spin=None, try_shutdown=None)
+    module("rclpy.node", Node=Node)
+    module("rclpy.time", Time=time)
+    tf = {"Buffer": Buffer, "TransformListener": Recorder, "TransformBroadcaster": Recorder}
+    module("tf2_ros", **tf, TransformException=TransformException)
+    for package in ("geometry_msgs", "vision_msgs"):
+        module(package)
+        own = {name.partition("/")[2]: kind for name, kind in TYPES.items() if name.startswith(f"{package}/")}
+        module(f"{package}.msg", **own)
+    module("launch", LaunchDescription=list)
+    module("launch.actions", DeclareLaunchArgument=Recorder)
+    module("launch.substitutions", LaunchConfiguration=Recorder)
+    module("launch_ros")
+    module("launch_ros.actions", Node=Recorder)
+    module("launch_ros.parameter_descriptions", ParameterValue=Recorder)
+    yield
+    for name in set(sys.modules) - before:
+        if name.partition(".")[0] in LOADED:
+            del sys.modules[name]

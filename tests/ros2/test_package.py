@@ -1,0 +1,259 @@
+"""The ROS 2 package: its logic, its node against stubs of the published messages, its launch file."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import runpy
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import torch
+import yaml
+from jsonschema import Draft202012Validator  # type: ignore[import-untyped]
+
+from regnf_core import Sim3
+from tests.ros2.conftest import PACKAGE, Buffer, Node
+from tests.ros2.messages import TYPES
+
+ROOT = PACKAGE.parents[1]
+SCENE, CHAIR = "ab" * 32, "cd" * 32
+T_OBJECT_FIELD = Sim3.from_quaternion(1.25, [0.1, -0.2, 0.3, 0.9], [0.4, -0.7, 0.2])
+pytestmark = pytest.mark.usefixtures("ros")
+
+
+def part(name: str) -> Any:
+    return importlib.import_module(f"regnf_ros.{name}")
+
+
+def result(verdict: str = "registered", alternatives: tuple[Sim3, ...] = ()) -> dict[str, Any]:
+    return {
+        "verdict": verdict,
+        "T_object_scene": T_OBJECT_FIELD.to_dict(),
+        "alternatives": [{"T_object_scene": one.to_dict()} for one in alternatives],
+        "covariance": (1e-4 * np.eye(7)).tolist(),
+        "metrics": {"probability": 0.97},
+    }
+
+
+class Answers:
+    """A service that answers as the contract says: a job that is running first, then its result."""
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+        self.requests: list[dict[str, Any]] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        assert request.headers["authorization"] == "Bearer open-sesame"
+        if request.method == "POST":
+            self.requests.append(json.loads(request.content))
+            return httpx.Response(202, json={"id": "j1", "status": "running"})
+        if request.url.path == "/jobs/j1/result":
+            return httpx.Response(200, json=self.document)
+        return httpx.Response(200, json={"id": "j1", "status": "successful"})
+
+
+def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: str) -> Any:
+    usual = {"server": "http://127.0.0.1:1", "token": "open-sesame", "scene": SCENE, "objects": f"chair={CHAIR}"}
+    monkeypatch.setattr(Node, "given", usual | given)
+    node_part = part("node")
+    service = part("service").Service
+    transport = httpx.MockTransport(answers)
+    monkeypatch.setattr(node_part, "Service", lambda address, token: service(address, token, transport))
+    monkeypatch.setattr(node_part.RegisterObjects, "work", lambda self: None)
+    return node_part.RegisterObjects()
+
+
+def detections(class_id: str = "chair", frame: str = "map") -> Any:
+    array, one = TYPES["vision_msgs/Detection3DArray"](), TYPES["vision_msgs/Detection3D"]()
+    array.header.frame_id, array.header.stamp.sec = frame, 12
+    hypothesis = TYPES["vision_msgs/ObjectHypothesisWithPose"]()
+    hypothesis.hypothesis.class_id, hypothesis.hypothesis.score = class_id, 0.8
+    less = TYPES["vision_msgs/ObjectHypothesisWithPose"]()
+    less.hypothesis.class_id, less.hypothesis.score = "table", 0.1
+    one.results = [less, hypothesis]
+    one.bbox.center.position.x = 1.0
+    one.bbox.size.x, one.bbox.size.y, one.bbox.size.z = 0.5, 0.6, 0.7
+    array.detections = [one]
+    return array
+
+
+def matrix(pose: Any, scale: float) -> np.ndarray[Any, Any]:
+    """T_map_object of a published pose and scale, by the project's own Sim3."""
+    turn, place = pose.orientation, pose.position
+    quaternion = [turn.x, turn.y, turn.z, turn.w]
+    return Sim3.from_quaternion(scale, quaternion, [place.x, place.y, place.z]).matrix().numpy()
+
+
+def test_a_pose_is_published_in_the_map_with_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = Answers(result())
+    node = make_node(monkeypatch, answers)
+    node.answer(detections())
+    (array,), (pose,), (frame,) = node.found_out.sent, node.pose_out.sent, node.broadcaster.sent
+    wanted = T_OBJECT_FIELD.inverse().matrix().numpy()
+    scale = float(array.detections[0].id.rpartition("=")[2])
+    np.testing.assert_allclose(scale, 0.8)
+    np.testing.assert_allclose(matrix(pose.pose.pose, scale), wanted, atol=1e-6)
+    np.testing.assert_allclose(matrix(array.detections[0].results[0].pose.pose, scale), wanted, atol=1e-6)
+    assert (frame.header.frame_id, frame.child_frame_id, frame.header.stamp.sec) == ("map", "regnf/chair_0", 12)
+    assert frame.transform.translation.x == pose.pose.pose.position.x
+    assert array.detections[0].results[0].hypothesis.score == 0.97
+    assert array.detections[0].bbox.size.z == 0.7
+    assert np.any(pose.pose.covariance)
+
+
+def test_the_request_is_one_that_the_contract_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = Answers(result())
+    make_node(monkeypatch, answers, up_axis="z").answer(detections())
+    contract = yaml.safe_load((ROOT / "openapi.yaml").read_text(encoding="utf-8"))
+    schema = {"$ref": "#/components/schemas/RegisterRequest", "components": contract["components"]}
+    (request,) = answers.requests
+    Draft202012Validator(schema).validate(request)
+    assert (request["scene"], request["object"], request["options"]) == (SCENE, CHAIR, {"up_axis": "z"})
+    assert request["detection"]["center"] == [1.0, 0.0, 0.0]
+    assert request["detection"]["size"] == [0.5, 0.6, 0.7]
+
+
+def test_a_field_in_its_trainers_frame_gives_poses_in_meters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    parser = {"transform": [[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.2]], "scale": 0.25}
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps(parser))
+    answers = Answers(result())
+    node = make_node(monkeypatch, answers, dataparser_transforms=str(file))
+    node.answer(detections())
+    # nerfstudio: a point of the dataset is trained at scale * (transform @ point)
+    np.testing.assert_allclose(answers.requests[0]["detection"]["center"], [0.25 * 0.3, 0.25 * 1.1, 0.25 * -0.2])
+    np.testing.assert_allclose(answers.requests[0]["detection"]["size"], [0.125, 0.15, 0.175])
+    T_field_map = np.eye(4)
+    T_field_map[:3] = 0.25 * np.array(parser["transform"])
+    wanted = np.linalg.inv(T_OBJECT_FIELD.matrix().numpy() @ T_field_map)
+    (array,) = node.found_out.sent
+    scale = float(array.detections[0].id.rpartition("=")[2])
+    np.testing.assert_allclose(matrix(node.pose_out.sent[0].pose.pose, scale), wanted, atol=1e-5)
+
+
+def test_a_box_of_another_frame_is_carried_to_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = Answers(result())
+    node = make_node(monkeypatch, answers)
+    node.answer(detections(frame="camera"))
+    assert answers.requests == []
+    assert "no transform from camera to map" in node.log.lines[-1]
+    stamped = TYPES["geometry_msgs/TransformStamped"]()
+    stamped.transform.translation.z = 1.5
+    monkeypatch.setattr(Buffer, "known", stamped)
+    node.answer(detections(frame="camera"))
+    np.testing.assert_allclose(answers.requests[0]["detection"]["center"], [1.0, 0.0, 1.5])
+
+
+def test_all_poses_of_an_ambiguous_result_are_hypotheses(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = make_node(monkeypatch, Answers(result("ambiguous", (Sim3.identity(),))))
+    node.answer(detections())
+    assert len(node.found_out.sent[0].detections[0].results) == 2
+
+
+@pytest.mark.parametrize(
+    ("answers", "class_id", "told"),
+    [
+        (Answers(result("rejected")), "chair", "rejected"),
+        (Answers(result()), "lamp", "no object for the class 'lamp'"),
+        (lambda request: httpx.Response(503, json={"reason": "QUEUE_FULL", "detail": "later"}), "chair", "QUEUE_FULL"),
+        (lambda request: httpx.Response(502, text="<html>"), "chair", "ANSWER_UNREADABLE"),
+    ],
+)
+def test_what_is_not_found_is_not_published_and_is_said(
+    monkeypatch: pytest.MonkeyPatch, answers: Any, class_id: str, told: str
+) -> None:
+    node = make_node(monkeypatch, answers)
+    node.answer(detections(class_id))
+    assert node.found_out.sent[0].detections == []
+    assert node.pose_out.sent == node.broadcaster.sent == []
+    assert told in node.log.lines[-1]
+
+
+def test_more_detections_than_the_service_can_take_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = make_node(monkeypatch, Answers(result()))
+    for _ in range(part("node").WAITING + 1):
+        node.take(detections())
+    assert "dropped" in node.log.lines[-1]
+
+
+def test_the_covariance_is_that_of_small_motions() -> None:
+    """Against the poses themselves: each of the seven directions, by central differences."""
+    poses = part("poses")
+    T_field_map = np.eye(4)
+    T_field_map[:3] = 0.25 * np.array([[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.2]])
+    half = np.random.default_rng(0).normal(size=(7, 7))
+    covariance = half @ half.T
+
+    def pose(step: np.ndarray[Any, Any]) -> Any:
+        moved = T_OBJECT_FIELD.perturb(torch.from_numpy(step))
+        return poses.object_pose(moved.matrix().numpy(), None, T_field_map)
+
+    size, columns = 1e-5, []
+    for direction in np.eye(7):
+        ahead, behind = pose(size * direction), pose(-size * direction)
+        turn = poses.rotation_matrix(ahead.quaternion) @ poses.rotation_matrix(behind.quaternion).T
+        skew = (turn - turn.T) / 2
+        about = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+        columns.append(np.concatenate([np.subtract(ahead.position, behind.position), about]) / (2 * size))
+    J = np.stack(columns, axis=1)
+    found = poses.pose_covariance(T_OBJECT_FIELD.matrix().numpy(), covariance, T_field_map)
+    np.testing.assert_allclose(found, J @ covariance @ J.T, rtol=1e-5, atol=1e-6)
+
+
+def test_quaternions_go_there_and_back() -> None:
+    poses = part("poses")
+    for given in np.random.default_rng(1).normal(size=(50, 4)):
+        R = poses.rotation_matrix(tuple(given))
+        np.testing.assert_allclose(poses.rotation_matrix(poses.quaternion_xyzw(R)), R, atol=1e-12)
+    with pytest.raises(ValueError, match="quaternion"):
+        poses.rotation_matrix((0.0, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "{}", '{"transform": [[1]], "scale": 1}', '{"transform": [], "scale": "x"}', "x"]
+)
+def test_a_bad_dataparser_file_is_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(text)
+    with pytest.raises(ValueError, match="dataparser_transforms"):
+        part("poses").field_from_map(str(file))
+
+
+@pytest.mark.parametrize("text", ["chair", "chair=", "=ab", "chair=ab chair=cd"])
+def test_a_bad_table_of_objects_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="objects"):
+        part("objects").objects_of(text)
+
+
+def test_the_launch_file_gives_each_parameter_of_the_node() -> None:
+    made = runpy.run_path(str(PACKAGE / "launch" / "regnf.launch.py"))["generate_launch_description"]()
+    *declared, node = made
+    names = {one.arguments[0] for one in declared}
+    assert names == set(node.named["parameters"][0]) == set(part("node").TEXTS)
+    assert (node.named["package"], node.named["executable"]) == ("regnf_ros", "register_objects")
+
+
+def test_the_logic_needs_no_ros() -> None:
+    code = "import regnf_ros.objects, sys; print(sorted({'rclpy', 'torch', 'tf2_ros'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_package_is_declared_as_it_is() -> None:
+    package = ElementTree.parse(PACKAGE / "package.xml").getroot()
+    assert package.findtext("name") == "regnf_ros"
+    needed = {one.text for one in package.findall("exec_depend")}
+    assert {"rclpy", "vision_msgs", "geometry_msgs", "tf2_ros", "launch_ros"} <= needed
+    assert package.findtext("export/build_type") == "ament_python"
+    setup = (PACKAGE / "setup.py").read_text(encoding="utf-8")
+    compile(setup, "setup.py", "exec")
+    for file in ("resource/regnf_ros", "package.xml", "launch/regnf.launch.py"):
+        assert (PACKAGE / file).is_file()

@@ -1,0 +1,92 @@
+"""A worker for the tests of the home page: it reads meshes at once, and finds every object where it is told to."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from regnf_core.viewing.mesh_file import mesh_file
+from regnf_state.blobs.base import BlobStore
+from regnf_state.originals import original_key
+from regnf_state.ownership import sha256_of
+from regnf_state.record_store import RecordStore
+from regnf_state.records import FieldRecord, JobRecord
+from tests.ui.fixture_server import field_picture
+
+_LOOK_S = 0.05
+
+
+class PretendWorker:
+    """Ends imports and jobs of ``caller`` while the context is open. pose: T_scene_object, 4x4, of every result."""
+
+    def __init__(self, records: RecordStore, blobs: BlobStore, caller: str, pose: list[list[float]]) -> None:
+        self._records, self._blobs, self._caller, self._pose = records, blobs, caller, pose
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work)
+
+    def __enter__(self) -> PretendWorker:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while not self._stop.wait(_LOOK_S):
+            for field in self._records.list_fields(None, 100, None, self._caller).records:
+                if field.state == "validating":
+                    self._import(field)
+                elif field.views == "pending":
+                    self._draw(field)
+            for job in self._records.list_jobs(None, 100, None, self._caller).records:
+                if job.status == "accepted":
+                    self._finish(job)
+
+    def _import(self, field: FieldRecord) -> None:
+        report = {"family": "mesh", "bounds": self._mesh(field).bounds.tolist()}
+        self._records.update_field(field.sha256, attempt=field.attempt, state="ready", report=report, views="pending")
+
+    def _draw(self, field: FieldRecord) -> None:
+        mesh = self._mesh(field)
+        colors = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255.0 if mesh.visual.kind == "vertex" else None
+        self._blobs.put(f"fields/{field.sha256}/mesh.glb", mesh_file(mesh.vertices, mesh.faces, colors=colors))
+        self._blobs.put(f"fields/{field.sha256}/preview.png", field_picture(sha256_of(field.sha256)))
+        self._records.update_field(field.sha256, attempt=field.attempt, views="ready")
+
+    def _mesh(self, field: FieldRecord) -> trimesh.Trimesh:
+        with self._blobs.open(original_key(field.sha256)) as file:
+            kind = "glb" if file.read(4) == b"glTF" else "ply"
+        with self._blobs.open(original_key(field.sha256)) as file:
+            mesh = trimesh.load(file, file_type=kind, force="mesh")
+        assert isinstance(mesh, trimesh.Trimesh)
+        return mesh
+
+    def _finish(self, job: JobRecord) -> None:
+        self._records.update_job(job.id, 1, status="running", phase="optimizing", progress=0.5)
+        scene_object = np.array(self._pose)
+        result: dict[str, Any] = {
+            "verdict": "registered",
+            "verdict_reason": "SURFACES_AGREE",
+            "verdict_detail": "Object and scene match on held-out points.",
+            "object": job.inputs.get("object"),
+            "T_object_scene": _transform(np.linalg.inv(scene_object)),
+            "T_scene_object": _transform(scene_object),
+            "metrics": {"probability": 0.97, "residual_rms": 0.002, "seconds": {"sampling": 0.5, "optimizing": 1.5}},
+            "options": {"preset": "robust", "up_axis": "z", "robust": {"rotations": 600}},
+            "seed": 0,
+        }
+        data = json.dumps(result).encode()
+        self._blobs.put(f"jobs/{job.id}/1/result.json", data)
+        listed = [{"name": "result.json", "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}]
+        self._blobs.put(f"jobs/{job.id}/manifest.json", json.dumps({"attempt": 1, "artifacts": listed}).encode())
+        self._records.update_job(job.id, 1, status="successful", verdict="registered")
+
+
+def _transform(matrix: np.ndarray[Any, Any]) -> dict[str, Any]:
+    return {"matrix": matrix.tolist(), "scale": float(np.cbrt(np.linalg.det(matrix[:3, :3])))}

@@ -1,0 +1,106 @@
+"""The page of the contract: navigation, search, folding, and the form that tries an address."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from regnf_service.http.routes.examples import REGISTER_EXAMPLES
+from regnf_state.settings import Settings
+from tests.ui.conftest import Visit
+from tests.ui.test_real_app import RealService, real_service
+
+pytestmark = pytest.mark.browser
+TOKEN = "open-sesame-open-sesame"
+
+
+@pytest.fixture
+def service(visit: Visit) -> Iterator[RealService]:
+    with real_service(visit.server.stage.data.detection, Settings()) as started:
+        yield started
+        visit.page.goto("about:blank")  # lets go of the connections before the server ends
+
+
+def open_docs(visit: Visit, service: RealService, anchor: str = "") -> Page:
+    visit.page.goto(f"{service.origin}/docs{anchor}")
+    visit.page.wait_for_selector("html[data-page=ready]")
+    return visit.page
+
+
+def test_every_operation_is_listed_and_folded(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service)
+    expect(page.locator("nav a[href='#register']")).to_have_text("POST /register")
+    assert page.locator("details.operation[open]").count() == 0
+    assert page.locator("details.operation").count() == page.locator("nav a").count()
+    page.locator("nav a[href='#register']").click()
+    expect(page.locator("#register textarea")).to_be_visible()
+    assert visit.complaints == []
+    assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
+
+
+def test_the_search_leaves_what_matches(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service)
+    page.locator("#search").fill("cancel")
+    expect(page.locator("#cancel_job")).to_be_visible()
+    expect(page.locator("#put_field")).to_be_hidden()
+    page.locator("#search").fill("no such address")
+    expect(page.locator("#nothing")).to_be_visible()
+    page.locator("#search").fill("queue_full")
+    expect(page.locator("#register")).to_be_visible()
+
+
+def test_an_address_is_tried(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service, "#get_job")
+    form = page.locator("#get_job form")
+    form.get_by_role("button", name="Send GET").click()
+    expect(form.locator(".answer")).to_contain_text("id is required")
+    form.locator("input[name=id]").fill("none")
+    form.get_by_role("button", name="Send GET").click()
+    expect(form.locator(".answer")).to_contain_text("JOB_NOT_FOUND")
+    page.goto(f"{service.origin}/docs#list_jobs")
+    page.locator("#list_jobs form select").select_option("accepted")
+    page.locator("#list_jobs").get_by_role("button", name="Send GET").click()
+    expect(page.locator("#list_jobs .answer")).to_contain_text("200")
+    expect(page.locator("#list_jobs .answer")).to_contain_text('"next_page_token": null')
+
+
+def test_a_body_is_the_first_example_of_the_contract(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service, "#register")
+    shortest = next(iter(REGISTER_EXAMPLES.values()))["value"]
+    assert shortest["scene"] in page.locator("#register textarea").input_value()
+    page.locator("#register textarea").fill("{}")
+    page.locator("#register").get_by_role("button", name="Send POST").click()
+    expect(page.locator("#register .answer")).to_contain_text("INVALID_DETECTION")
+
+
+def test_a_reason_is_found_by_its_anchor(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service, "#QUEUE_FULL")
+    expect(page.locator("#QUEUE_FULL")).to_be_in_viewport()
+
+
+def test_a_token_is_asked_for_and_sent(visit: Visit) -> None:
+    settings = Settings(api_tokens=frozenset({f"lab:{TOKEN}"}))
+    with real_service(visit.server.stage.data.detection, settings, owner="lab") as service:
+        page = visit.page
+        page.goto(f"{service.origin}/docs")
+        page.wait_for_selector("html[data-page=refused]")
+        expect(page.locator("#problem")).to_contain_text("access token")
+        page.locator("#token").fill(TOKEN)
+        page.locator("#token-form button").click()
+        page.wait_for_selector("html[data-page=ready]")
+        page.locator("nav a[href='#list_jobs']").click()
+        page.locator("#list_jobs").get_by_role("button", name="Send GET").click()
+        expect(page.locator("#list_jobs .answer")).to_contain_text("200")
+        page.evaluate("sessionStorage.clear()")
+        page.goto("about:blank")
+
+
+def test_it_fits_a_phone(visit: Visit, service: RealService) -> None:
+    page = open_docs(visit, service)
+    page.set_viewport_size({"width": 360, "height": 700})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page.locator("nav a[href='#register']").click()
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page.set_viewport_size({"width": 1100, "height": 700})
