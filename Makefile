@@ -1,5 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Each sets up what it needs.
-.PHONY: setup demo test lint sbom clean
+.PHONY: setup demo test lint docs sbom clean
 
 setup:
 	@scripts/setup.sh
@@ -13,6 +13,9 @@ test: setup
 
 lint: setup
 	@scripts/lint.sh
+
+docs: setup
+	@.venv/bin/python -m mkdocs build --strict --quiet && echo "build/site/index.html"
 
 sbom: setup
 	@scripts/sbom.sh

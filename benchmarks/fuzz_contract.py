@@ -71,6 +71,8 @@ def prepare(live: Live, folder: Path, spare_fields: int) -> dict[str, Any]:
         for job in (ended, failed):
             service.follow(job)
         artifacts = [entry["name"] for entry in service.result(ended)["artifacts"]]
+        for name in artifacts:  # those that follow the result, before their process is stopped with the others
+            service.fetch_artifact(ended, name, folder / "artifact")
     with live.client() as client:
         kept = [request["scene"], request["object"]]
         rejected = client.post("/fields", content=_broken(pair)).json()["sha256"]

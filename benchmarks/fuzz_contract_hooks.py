@@ -45,18 +45,60 @@ BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
             "QUOTA_WEBHOOKS",
         }
     ),
+    "POST /render": frozenset(
+        {
+            "FIELD_NOT_FOUND",
+            "FIELD_REJECTED",
+            "INVALID_DETECTION",
+            "INVALID_TRANSFORM",
+            "CAMERA_INVALID",  # a camera at its own target, a transforms.json that is none
+            "EDIT_INVALID",  # which jobs there are
+            "EDIT_POSE_REJECTED",
+            "INVALID_REQUEST",  # members that exclude one another
+            "RENDER_TOO_LARGE",  # products of members
+            "WEBHOOK_NOT_ALLOWED",
+            "IDEMPOTENCY_KEY_REUSED",
+            "QUOTA_ACTIVE_JOBS",
+            "QUOTA_WEBHOOKS",
+        }
+    ),
     "POST /fields": frozenset(
-        {"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS", "INVALID_DESCRIPTION"}
+        {
+            "FIELD_NOT_RECOGNIZED",
+            "DIGEST_MISMATCH",
+            "FIELD_DESCRIPTION_DIFFERS",
+            "INVALID_DESCRIPTION",
+            "MISSING_PART",  # `file` and `upload` exclude one another
+        }
     ),
     "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
-    "PUT /fields/{sha256}": frozenset({"FIELD_NOT_RECOGNIZED", "DIGEST_MISMATCH", "FIELD_DESCRIPTION_DIFFERS"}),
+    "PUT /fields/{sha256}": frozenset(
+        {
+            "FIELD_NOT_RECOGNIZED",
+            "DIGEST_MISMATCH",
+            "FIELD_DESCRIPTION_DIFFERS",
+            "INVALID_HEADER",  # Content-Range against the bytes of the body
+        }
+    ),
     "GET /fields": frozenset({"INVALID_PAGE_TOKEN"}),
     "GET /jobs": frozenset({"INVALID_PAGE_TOKEN"}),
+    "GET /batches": frozenset({"INVALID_PAGE_TOKEN"}),
+    "GET /library": frozenset({"INVALID_PAGE_TOKEN"}),
 }
 """Refusals of requests that fit every schema: they depend on what the service holds, or on sums over members."""
 
 schemathesis.openapi.media_type("application/octet-stream", _FIELD_FILES)
 schemathesis.openapi.format("binary", _FIELD_FILES)
+_LINE = {
+    "scene": _WORLD["fields"]["ready"][0],
+    "object": _WORLD["fields"]["ready"][-1],
+    "detection": _WORLD["detection"],
+}
+_LINES = st.one_of(
+    st.integers(0, 99).map(lambda seed: json.dumps({**_LINE, "seed": seed}).encode()),
+    st.binary(min_size=1, max_size=200).filter(lambda line: bool(line.strip())),
+)
+schemathesis.openapi.media_type("application/x-ndjson", st.lists(_LINES, min_size=1, max_size=4).map(b"\n".join))
 
 
 @schemathesis.hook
@@ -101,7 +143,7 @@ def before_call(ctx: Any, case: Any, kwargs: Any) -> None:  # noqa: ARG001
         _place_ids(case, draw)
     if case.query and "page_token" in case.query and draw.real():
         case.query["page_token"] = draw.one(_WORLD["page_tokens"])
-    if case.operation.label == "POST /register" and isinstance(case.body, dict):
+    if case.operation.label in ("POST /register", "POST /render") and isinstance(case.body, dict):
         _place_fields(case.body, draw)
 
 

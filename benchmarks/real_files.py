@@ -3,9 +3,10 @@
     python -m benchmarks.real_files --folder REPOSITORIES
 
 REPOSITORIES holds what the reader has fetched: folders of DeepSDF runs (specs.json, ModelParameters, LatentCodes),
-DeepSDF in blocks (weights.pt with net.*.0, read with a code of zeros), and .onnx models of points to distances in the
-first column. Nothing of it belongs into this repository. Prints a table: what loads, by how much values differ (of
-their range) and gradients (of the longest), or why a file is refused.
+DeepSDF in blocks (weights.pt with net.*.0, read with a code of zeros), SIREN (model_final.pth, read with the published
+factor of 30), and .onnx models of points to distances in the first column. Nothing of it belongs into this repository.
+Prints a table: what loads, by how much values differ (of their range) and gradients (of the longest), or why a file is
+refused.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ def files(folder: Path) -> Iterator[File]:
     for weights in sorted(folder.rglob("weights.pt")):
         said = {"latent": [0.0] * 64, "skip_layer": _BLOCKS_SKIP, "output_tanh": 1}
         yield File(weights, blocks(weights), said)
+    for weights in sorted(folder.rglob("model_final.pth")):
+        yield File(weights, siren(weights), {"activation_scale": 30.0})
     for model in sorted(folder.rglob("*.onnx")):
         yield File(model, graph(model))
 
@@ -96,6 +99,22 @@ def blocks(weights: Path) -> Function:
         x = x @ _weight(state, "final_layer.0").T + state["final_layer.0.bias"]
         distance: Tensor = x[:, 0].tanh()
         return distance
+
+    return evaluate
+
+
+def siren(weights: Path) -> Function:
+    """Sines of 30 times what the layers give."""
+    state = {name: tensor.double() for name, tensor in _load(weights).items()}
+    layers = sum(name.endswith(".bias") for name in state)
+
+    def evaluate(points: Tensor) -> Tensor:
+        x = points
+        for i in range(layers):
+            x = x @ state[f"net.net.{i}.0.weight"].T + state[f"net.net.{i}.0.bias"]
+            if i < layers - 1:
+                x = (30 * x).sin()
+        return x[:, 0]
 
     return evaluate
 

@@ -10,6 +10,9 @@ engine. What changed is printed, for the changelog. Both files belong into the c
 
 from __future__ import annotations
 
+import tests.environment  # noqa: F401 -- first
+
+# isort: split
 import argparse
 import re
 from collections.abc import Mapping

@@ -17,10 +17,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from regnf_core import register
 from regnf_core.batch import register_batch
 from regnf_core.fields.build import open_field
 from regnf_core.library import search_library
+from regnf_core.registration import register
 
 ENTRIES = tuple(function.__module__ for function in (open_field, register, register_batch, search_library))
 """Where a registration starts, and where the fields that it evaluates come from."""

@@ -5,6 +5,9 @@
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
+# Several workers and hundreds of short processes import the same modules: what one compiles, the others read.
+unset PYTHONDONTWRITEBYTECODE
+
 cores=$(env -u OMP_NUM_THREADS -u OMP_THREAD_LIMIT nproc)
 checks=$(mktemp)
 scripts/lint.sh >"$checks" 2>&1 &

@@ -25,6 +25,8 @@ echo "Installing into .venv (the first time takes a few minutes) ..."
 # The benchmark's peers weigh 2 MB, but not every machine has wheels of them: without them their tests are skipped.
 "${pip[@]}" install -c constraints.txt --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
     echo "The benchmark's optional packages do not install here; tests of them will be skipped." >&2
+# Makes a client from the contract, in a test. Last, because it asks for an older typer than ours; it works with ours.
+"${pip[@]}" install -c constraints.txt --no-deps openapi-python-client
 if ! .venv/bin/python -c 'import open3d' 2>.venv/open3d-error.txt; then
     echo "open3d does not load; a system library is missing:" >&2
     tail -n 1 .venv/open3d-error.txt >&2

@@ -48,7 +48,7 @@ def attack_http(folder: Path, inputs: int, seed: int, tokens: bool) -> Outcome:
         log = house.log()
         if (at := log.find("Traceback")) >= 0:
             outcome.fault(f"{log.count('Traceback')} tracebacks in the log, first: {log[max(0, at - 300) : at + 3000]}")
-        outcome.faults += [f"left behind: {name}" for name in _left(house)]
+        outcome.faults += [f"left behind: {name}" for name in house.left_behind()]
     return outcome
 
 
@@ -105,11 +105,3 @@ def _compare(outcome: Outcome, house: House, before: dict[str, object], known: K
     )
     if states != {"ready": len(known.fields)}:
         outcome.fault(f"the honest caller's fields are {states}")
-
-
-def _left(house: House) -> list[str]:
-    """Temporary files that are there a little later still."""
-    end = time.monotonic() + 20
-    while (left := house.temporary_files()) and time.monotonic() < end:
-        time.sleep(0.2)
-    return left

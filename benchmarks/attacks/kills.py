@@ -42,10 +42,7 @@ def attack_by_kills(folder: Path, kills: int, seed: int) -> Outcome:
             goings = [pool.submit(_go_on, client, pair, chair, number, stop) for number in range(_CLIENTS)]
             for going in (killer, *goings):
                 going.result()
-        end = time.monotonic() + 60
-        while (left := house.temporary_files()) and time.monotonic() < end:
-            time.sleep(0.5)
-        outcome.faults += [f"left behind: {name}" for name in left]
+        outcome.faults += [f"left behind: {name}" for name in house.left_behind()]
     return outcome
 
 

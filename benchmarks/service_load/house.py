@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -43,6 +44,8 @@ class House:
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
     token: str | None = None
     """Of the caller that asks whether the service is ready, where it needs one."""
+    patience_s: float = 60.0
+    """How long processes may take to start: on a crowded machine a worker that loads the engine first takes minutes."""
 
     @property
     def address(self) -> str:
@@ -52,7 +55,7 @@ class House:
         """The API, and so many workers; returns once it is ready."""
         self.launch_api()
         self.workers = [self._worker(index) for index in range(workers)]
-        eventually(self._ready if workers else self._answers, self.log)
+        eventually(self._ready if workers else self._answers, self.log, self.patience_s)
 
     def launch_api(self) -> None:
         """The API's process, however far it gets."""
@@ -87,7 +90,7 @@ class House:
             worker.wait(30)
         self.workers += [self._worker(index) for index in range(len(self.workers), count)]
         with connect(self.redis.url) as client:
-            eventually(lambda: RqJobQueue(client).live_workers() == count, self.log)
+            eventually(lambda: RqJobQueue(client).live_workers() == count, self.log, self.patience_s)
 
     def empty_redis(self) -> None:
         """Everything that it holds is lost."""
@@ -117,8 +120,15 @@ class House:
             str(path.relative_to(state))
             for root in roots
             for path in root.rglob("*")
-            if path.is_file() and path.name != ".lock"
+            if path.is_file() and not path.name.endswith(".lock")  # locks stay
         ]
+
+    def left_behind(self, within_s: float = 60.0) -> list[str]:
+        """The temporary files that stay: a process may still be at the pictures of a result that is out."""
+        end = time.monotonic() + within_s
+        while (left := self.temporary_files()) and time.monotonic() < end:
+            time.sleep(0.2)
+        return left
 
     def log(self) -> str:
         return "\n".join(path.read_text(errors="replace") for path in sorted(self.folder.glob("*.log")))

@@ -145,7 +145,7 @@ def soak(folder: Path, plan: Plan) -> Run:
             for thread in threads:
                 thread.join()
         seconds = time.monotonic() - begun
-        left = house.temporary_files()
+        left = house.left_behind()
     faults += [f"left behind: {name}" for name in left]
     return Run(plan, seconds, outcomes, troubles, done, samples, faults)
 

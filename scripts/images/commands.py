@@ -34,7 +34,7 @@ def documented_commands(root: Path) -> list[ComposeCommand]:
     """Every one of the README, the documentation and the comments of the files in docker/."""
     pages = [root / "README.md", *sorted((root / "docs").rglob("*.md"))]
     found = [_command(page, root, line, exports) for page in pages for line, exports in _lines_of_page(page)]
-    for path in sorted((root / "docker").iterdir()):
+    for path in sorted(filter(Path.is_file, (root / "docker").iterdir())):
         found += [_command(path, root, line, {}) for line in _comments(path)]
     return found
 
