@@ -66,7 +66,7 @@ def make(task: Task) -> str:
     part = part_of_world(task.seed)
     world = make_world(task.seed, read_catalog(task.meshes, part, GIVEN))
     try:
-        seen = see(world, task.length)
+        seen = see(world, task.length, rendered=task.scene == "rendered")
     except RegnfError as error:
         return f"{task.home.name}: none, {error}"
     rough = task.home.with_name(f"{task.home.name}.part")
@@ -154,7 +154,7 @@ def _chosen(world: World, seen: Seen, length: Length, rng: np.random.Generator) 
 
 
 def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.random.Generator) -> dict[str, Any]:
-    if scene == "tsdf":
+    if scene in ("tsdf", "rendered"):
         fuse(seen.taken, seen.fusion, seen.bounds, home / SCENE)
         return {"kind": scene}
     if scene in FROM_IMAGES:

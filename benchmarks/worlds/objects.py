@@ -54,7 +54,7 @@ class ObjectMaker:
         kind: ObjectKind = "mesh"
         extra: dict[str, Array] = {}
         if drawn == 1:
-            _fused_orbit(model, rng, path)
+            _fused_orbit(model, rng, path, self._seen.rendered)
             kind = "orbit"
         elif drawn == 2:
             bounds = self._cut(thing, path)
@@ -101,7 +101,7 @@ class ObjectMaker:
     def _other(self) -> Seen | None:
         """A long walk that is not the scene's."""
         try:
-            return see(self._world, "long", again=1)
+            return see(self._world, "long", self._seen.rendered, again=1)
         except RegnfError:
             return None
 
@@ -116,10 +116,10 @@ def _write_part(field: SdfField, bounds: Array, voxel: float, path: Path) -> Non
     write_dense(path, values, bounds[0], spacing)
 
 
-def _fused_orbit(model: Model, rng: np.random.Generator, path: Path) -> None:
+def _fused_orbit(model: Model, rng: np.random.Generator, path: Path, rendered: bool) -> None:
     """The map of the object alone, as a scanner's orbit gives it."""
     mesh = model.mesh
-    sensor = orbit_sensor(rng, model.diameter)
+    sensor = orbit_sensor(rng, model.diameter, rendered)
     poses = orbit(mesh.bounds, _FRAMES, half_view(sensor.size, sensor.intrinsics), float(mesh.bounds[0, 2]))
     errors = np.tile(np.eye(4), (len(poses), 1, 1))
     taken = capture(ExactScene([mesh]), sensor, poses, errors, [], draw_matter(1, rng) * 0, rng)

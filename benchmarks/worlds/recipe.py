@@ -16,12 +16,12 @@ from regnf_data.worlds.exact import ExactScene
 from regnf_data.worlds.fusing import LARGEST_DENSE, Fusion
 from regnf_data.worlds.mesh import Array
 from regnf_data.worlds.rooms import World
-from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor
+from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor, rendered_sensor
 from regnf_data.worlds.walks import LENGTHS, Length, walk
 
-Scene = Literal["tsdf", "fit", "under-trained", "mesh", "bent"]
-SCENES: tuple[Scene, ...] = ("tsdf", "fit", "under-trained", "mesh", "bent")
-FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "fit", "under-trained")
+Scene = Literal["tsdf", "rendered", "fit", "under-trained", "mesh", "bent"]
+SCENES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "under-trained", "mesh", "bent")
+FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "under-trained")
 """Scenes that the poses' drift bends; the others are exact, or bent in another way."""
 _FRAMES: dict[Length, dict[int, int]] = {
     "long": {120: 150, 240: 90, 480: 40},
@@ -39,28 +39,32 @@ _FEWER = 3
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A world as a walk has seen it. name: of the walk · bounds: (2, 3) of what is of interest."""
+    """A world as a walk has seen it. name: of the walk · bounds: (2, 3) of what is of interest · rendered: images are
+    those of a simulated dataset."""
 
     name: str
     drift: float
     taken: Capture
     fusion: Fusion
     bounds: Array
+    rendered: bool
 
 
-def see(world: World, length: Length, again: int = 0) -> Seen:
+def see(world: World, length: Length, rendered: bool = False, again: int = 0) -> Seen:
     """A walk of some length through the world with a random sensor; ``again``: another one.
+
+    rendered: with the sensor of simulated datasets, and poses without drift.
 
     Raises DatasetError (DATASET_NO_FREE_PATH) where there is no way for a camera.
     """
     rng = np.random.default_rng([world.seed, 16, LENGTHS.index(length), again])
     scene = ExactScene([placed.mesh for placed in world.all])
-    sensor = draw_sensor(rng)
+    sensor = rendered_sensor(rng) if rendered else draw_sensor(rng)
     farthest = min(sensor.farthest_m, rng.uniform(*_FARTHEST_M[world.kind]))
     sensor = replace(sensor, farthest_m=farthest)
     frames = _FRAMES[length][sensor.size[0]] // (1 if again == 0 else _FEWER)
     name, poses = _some_walk(world, scene, (length, frames), rng)
-    drift = draw_drift(rng) if length != "single" else 0.0
+    drift = draw_drift(rng) if length != "single" and not rendered else 0.0
     groups = [
         (len(world.fixed) + number, placed.model.surface @ placed.T_room_model[:3, :3].T + placed.T_room_model[:3, 3])
         for number, placed in enumerate(world.things)
@@ -69,13 +73,13 @@ def see(world: World, length: Length, again: int = 0) -> Seen:
     matter = draw_matter(len(world.all), rng)
     taken = capture(scene, sensor, poses, drifted(poses, drift, rng), groups, matter, rng)
     bounds = _bounds(world)
-    return Seen(name, drift, taken, _draw_fusion(world, bounds, sensor, rng), bounds)
+    return Seen(name, drift, taken, _draw_fusion(world, bounds, sensor, rng), bounds, rendered)
 
 
-def orbit_sensor(rng: np.random.Generator, diameter: float) -> RandomSensor:
-    """A camera for one object alone; small ones are taken with more pixels."""
+def orbit_sensor(rng: np.random.Generator, diameter: float, rendered: bool) -> RandomSensor:
+    """A camera for one object alone; small ones are taken with more pixels. rendered: see :func:`see`."""
     size: Size = (240, 320) if diameter < 0.6 else (120, 160)
-    return draw_sensor(rng, size)
+    return rendered_sensor(rng, size) if rendered else draw_sensor(rng, size)
 
 
 def _some_walk(

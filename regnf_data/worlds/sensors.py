@@ -1,4 +1,7 @@
-"""Depth cameras drawn at random: structured light, time of flight, stereo; what each misses and how it errs."""
+"""Depth cameras drawn at random: structured light, time of flight, stereo; what each misses and how it errs.
+
+And the camera of simulated datasets, which errs little or not at all.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from regnf_data.sensor import jumps
 from regnf_data.worlds.exact import ExactView
 from regnf_data.worlds.mesh import Array
 
-Principle = Literal["structured light", "time of flight", "stereo"]
+Principle = Literal["structured light", "time of flight", "stereo", "rendered"]
 PRINCIPLES: tuple[Principle, ...] = ("structured light", "time of flight", "stereo")
 SIZES: tuple[Size, ...] = ((120, 160), (240, 320), (480, 640))
 _SIZE_SHARES = (0.3, 0.55, 0.15)
@@ -27,9 +30,9 @@ _EDGE_M = 0.04
 class RandomSensor:
     """A depth camera. noise: deviation at depth z is noise[0] + noise[1] z + noise[2] z^2 meters.
 
-    step: readings are multiples of step z^2 (parallax) or of step (time of flight) · grain: over how many pixels of
-    an image 640 wide errors are alike · edge_loss: share of the readings lost at jumps · mixed: share of those at jumps
-    that lie between both sides · black_loss, glossy_loss: shares of the readings lost on such surfaces.
+    step: readings are multiples of step z^2 (parallax) or of step (time of flight, rendered) · grain: over how many
+    pixels of an image 640 wide errors are alike · edge_loss: share of the readings lost at jumps · mixed: share of
+    those at jumps that lie between both sides · black_loss, glossy_loss: shares of the readings lost on such surfaces.
     """
 
     principle: Principle
@@ -90,7 +93,7 @@ class RandomSensor:
     def _rounded(self, read: Array) -> Array:
         if self.step <= 0.0:
             return read
-        if self.principle == "time of flight":
+        if self.principle in ("time of flight", "rendered"):
             return np.asarray(np.round(read / self.step) * self.step)
         inverse = np.divide(1.0, read, out=np.zeros_like(read), where=read > 0.05)
         steps = np.round(inverse / self.step) * self.step
@@ -121,6 +124,21 @@ def draw_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSen
         )
     return RandomSensor(
         principle, size, rng.uniform(*angles), reach[0], reach[1], noise, step, grain, mixed=mixed, **loss
+    )
+
+
+def rendered_sensor(rng: np.random.Generator, size: Size | None = None) -> RandomSensor:
+    """The camera of a simulated dataset: exact, or with the errors of ``regnf_data.sensor.DepthSensor``.
+
+    It misses no matter. size: instead of a random one.
+    """
+    size = size or SIZES[int(rng.choice(3, p=_SIZE_SHARES))]
+    field_of_view, exact = rng.uniform(55.0, 75.0), rng.random() < 0.5
+    # .0012 + .0019 (z - .4)^2, multiplied out.
+    noise = (0.0, 0.0, 0.0) if exact else (0.001504, -0.00152, 0.0019)
+    step, edge_loss, grazing_deg = (0.0, 0.0, 90.0) if exact else (0.001, 0.2, 80.0)
+    return RandomSensor(
+        "rendered", size, field_of_view, 0.05, 9.0, noise, step, 0.0, edge_loss, 0.0, 0.0, 0.0, grazing_deg
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 import trimesh
 
 from benchmarks.worlds.cases import cases_of
-from benchmarks.worlds.making import Task, make
+from benchmarks.worlds.making import WORLD, Task, make
 from benchmarks.worlds.tables import lost_at, lower_bound, markdown, success, upper_bound, wrong
 from regnf_core.errors import DatasetError
 from regnf_core.fields.observation import observation_of
@@ -45,6 +46,21 @@ def test_the_truth_puts_every_object_onto_the_scenes_surface(tmp_path: Path, mes
         assert seen is not None
         assert float((seen.at(placed) == SURFACE).float().mean()) > 0.05
     assert make(task).endswith("there")
+
+
+def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path: Path, meshes: Path) -> None:
+    task = Task(12, "single", "rendered", (meshes,), tmp_path / "worlds")
+    make(task)
+    told = json.loads((task.home / WORLD).read_text())
+    assert (told["sensor"]["principle"], told["drift"], told["scene"]) == ("rendered", 0.0, {"kind": "rendered"})
+    for one in cases_of(task.home):
+        assert one.case.truth is not None
+        assert one.facts["drift_spread"] == 0.0
+        placed = one.case.truth.inverse().apply(one.points)
+        seen = observation_of(one.case.scene)
+        assert seen is not None
+        off = one.case.scene.signed_distance(placed[seen.at(placed) == SURFACE]).abs() * float(one.case.truth.scale)
+        assert float(off.median()) < 0.01 * float(torch.pdist(one.points[::20]).max())
 
 
 def test_parts_share_no_mesh_and_a_folder_without_meshes_is_named(tmp_path: Path, meshes: Path) -> None:

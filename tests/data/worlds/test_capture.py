@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from regnf_core.fields.build import open_field
+from regnf_data.sensor import DepthSensor
 from regnf_data.trajectories import look_at
 from regnf_data.worlds.capture import Capture, capture
 from regnf_data.worlds.drift import drifted, mean_motion
@@ -18,7 +19,7 @@ from regnf_data.worlds.exact import ExactScene, ExactView
 from regnf_data.worlds.fusing import Fusion, fuse
 from regnf_data.worlds.mesh import Array, ball, box, turned
 from regnf_data.worlds.models import Model
-from regnf_data.worlds.sensors import BLACK, GLOSSY, PLAIN, RandomSensor, draw_sensor
+from regnf_data.worlds.sensors import BLACK, GLOSSY, PLAIN, RandomSensor, draw_sensor, rendered_sensor
 from regnf_data.worlds.symmetries import measure_symmetries
 
 SIZE = (60, 80)
@@ -60,6 +61,19 @@ def test_readings_err_as_much_as_the_sensor_says(depth: float) -> None:
         errors = sensor.measure(plane(depth), np.array([PLAIN]), np.random.default_rng(1)) - depth
         assert errors.std() == pytest.approx(float(sensor.deviation_m(np.array(depth))), rel=0.25)
         assert abs(errors.mean()) < 0.3 * errors.std()
+
+
+def test_a_simulated_datasets_camera_is_exact_or_errs_as_that_of_render_dataset() -> None:
+    drawn = [rendered_sensor(np.random.default_rng(seed)) for seed in range(12)]
+    depth = np.linspace(0.4, 4.0, 10)
+    exact = [sensor for sensor in drawn if not sensor.deviation_m(depth).any()]
+    assert 0 < len(exact) < len(drawn)
+    assert all(
+        (sensor.measure(plane(2.0), np.array([BLACK]), np.random.default_rng(0)) == 2.0).all() for sensor in exact
+    )
+    for sensor in drawn:
+        if sensor not in exact:
+            assert np.allclose(sensor.deviation_m(depth), DepthSensor().deviation_m(depth))
 
 
 def test_parallax_is_read_in_steps_that_grow_with_the_square_of_the_depth() -> None:
