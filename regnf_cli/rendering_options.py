@@ -27,12 +27,12 @@ Request = Annotated[
     Path | None,
     typer.Option(help="JSON: the whole request (docs/editing.md); other options take precedence.", **JSON_FILE),
 ]
-Size = Annotated[str | None, typer.Option(help="Of every picture; 640x480 by default.", metavar="WIDTHxHEIGHT")]
+Size = Annotated[str | None, typer.Option(help="Of every picture; 480x360 by default.", metavar="WIDTHxHEIGHT")]
 ModeChoice = Annotated[
     Mode | None,
     typer.Option(help="surface: the zero level (the default). volume: as NeuS renders, about three times slower."),
 ]
-Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 36 by default.")]
+Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
 Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]
 Distance = Annotated[float | None, typer.Option(help="Of the orbit's cameras, scene units; by default all is in view.")]
 Around = Annotated[

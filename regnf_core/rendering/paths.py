@@ -27,7 +27,7 @@ class Orbit:
     units; None: so far that the whole box is in view · up: the scene's vertical.
     """
 
-    frames: int = 36
+    frames: int = 8
     elevation_deg: float = 25.0
     start_deg: float = 0.0
     sweep_deg: float = 360.0

@@ -34,7 +34,7 @@ class OrbitRequest:
 
     edit: Annotated[int, Ge(0)] | None = None
     detection: Box = None
-    frames: _Count = 36
+    frames: _Count = 8
     elevation_deg: Annotated[FiniteFloat, Ge(-89.9), Le(89.9)] = 25.0
     start_deg: FiniteFloat = 0.0
     sweep_deg: FiniteFloat = 360.0
@@ -81,7 +81,7 @@ class PoseRequest:
 class RenderRequest:
     """One rendering of a scene. Exactly one of orbit, look_at and poses; none: an orbit as it is by default.
 
-    size: width and height of every frame; None: 640 x 480, or what a pose says · before: the scene without its edits
+    size: width and height of every frame; None: 480 x 360, or what a pose says · before: the scene without its edits
     is rendered too (files named before-...), as a strip and an animation need it.
     """
 
@@ -132,7 +132,7 @@ class RenderRequest:
         """Width and height of every frame."""
         if self.size is not None:
             return self.size
-        return self.poses[0].size if self.poses else (640, 480)
+        return self.poses[0].size if self.poses else (480, 360)
 
     def check(self) -> None:
         """Raises InvalidInputError: CAMERA_INVALID, RENDER_TOO_LARGE."""

@@ -135,5 +135,5 @@ def test_a_request_reads_what_registrations_write() -> None:
     transform = Sim3.from_matrix(T).to_dict()
     request = RenderRequest.from_dict({"edits": [BALL | {"T_object_scene": transform}]})
     assert request.edits[0].T_object_scene == T
-    assert request.frames == 36
-    assert request.rendered_pixels == 2 * 36 * 640 * 480
+    assert request.frames == 8
+    assert request.rendered_pixels == 2 * 8 * 480 * 360

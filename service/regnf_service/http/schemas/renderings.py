@@ -52,7 +52,7 @@ class RenderBody(Incoming):
     poses: Annotated[list[PoseRequest], Field(min_length=1, max_length=MOST_CAMERAS)] | None = None
     transforms: CameraFile | None = None
     size: tuple[_Count, _Count] | None = Field(
-        None, description="Width and height of every frame. Left out: 640 x 480, or as the cameras say."
+        None, description="Width and height of every frame. Left out: 480 x 360, or as the cameras say."
     )
     options: RenderOptions = Field(default_factory=RenderOptions)
     outputs: Annotated[list[Output], Field(min_length=1, max_length=16)] = Field(
