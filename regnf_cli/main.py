@@ -1,19 +1,22 @@
 """The command ``regnf``: runs the sub-command that is asked for and turns errors into exit codes.
 
-Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable · 130 interrupted.
+Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable · 130 interrupted ·
+143 terminated.
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
+from types import FrameType
 from typing import cast
 
 import typer
 
 from regnf_cli.commands import COMMANDS, GROUPS, app_of
-from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_UNAVAILABLE, fail
+from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_UNAVAILABLE, fail
 from regnf_cli.usage import usage_fault
 from regnf_core.errors import RegnfError
 
@@ -25,7 +28,24 @@ def main() -> None:
     """Entry point of the console script."""
     # Busy waiting of idle threads makes two torch processes on one machine ten times slower. Read when torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    sys.exit(_run())
+    ended_by: list[int] = []
+    _clean_up_when_terminated(ended_by)
+    code = _run()
+    sys.exit(EXIT_TERMINATED if ended_by and code == EXIT_INTERRUPTED else code)
+
+
+def _clean_up_when_terminated(ended_by: list[int]) -> None:
+    """Let SIGTERM do what Ctrl-C does, so that no scratch files are left. The signal is put into ``ended_by``.
+
+    Commands that serve set handlers of their own.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        ended_by.append(number)
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, end)
 
 
 def _run() -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from typer.testing import CliRunner
 
 from regnf_cli.commands import app_of
 from regnf_core.errors import RegnfError
+from tests.contract.live import DEADLINE_S, eventually
 from tests.core.analytic import AnalyticField, boxes, sphere
 
 T = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -0.25], [0.0, 0.0, 0.0, 1.0]]
@@ -44,6 +47,18 @@ def test_an_edit_names_its_files_from_its_own_folder(fields: Path, tmp_path: Pat
     assert done.exit_code == 0, done.output
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"frame-0000.png", "before-0000.png", "before-after.png", "render.json"}
+
+
+def test_a_command_that_is_terminated_leaves_nothing_behind(fields: Path, tmp_path: Path) -> None:
+    """SIGTERM is what schedulers and service managers send."""
+    output = tmp_path / "out"
+    said = ("render", str(fields / "room.safetensors"), "--mode", "volume", "--frames", "500", "--output", str(output))
+    with subprocess.Popen([sys.executable, "-m", "regnf_cli.main", *said], stderr=subprocess.PIPE) as command:
+        eventually(lambda: output.is_dir() and any(output.rglob("*.png")), "the first frame")
+        command.terminate()
+        _, errors = command.communicate(timeout=DEADLINE_S)
+    assert (command.returncode, list(output.iterdir())) == (143, [])
+    assert b"Traceback" not in errors
 
 
 def test_cameras_of_a_file(fields: Path, tmp_path: Path) -> None:
