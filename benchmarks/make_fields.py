@@ -1,11 +1,14 @@
 """Fit the benchmark's fields: furnished scenes and their library objects, each in a frame of its own scale.
 
-    python -m benchmarks.make_fields MESHES ROOMS OUT [--only SET ...]
+    python -m benchmarks.make_fields MESHES ROOMS OUT [--only SET ...] [--exact CELLS CELLS]
 
 MESHES holds the meshes (glb, meters, z up), ROOMS the layouts ac-room.json, atbl-room.json and mix-room.json; the
 held-out scenes are laid out in benchmarks/layouts. Writes a safe field a scene and an object, the scene's exact surface
 beside its field (NAME.surface.npz), and for each set a list of detections with their true transforms. What exists
 already is kept. On one core: main 20 minutes, held-out 15, under-trained 25, full-size 15.
+
+With --exact the fields are dense grids of exact distances in place of fits, with so many cells along the longest edge
+of a room and of an object.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.simple_meshes import box, together
+from regnf_core.editing.storing import write_field
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
 from regnf_core.schema.hash_grid_config import HashGridConfig
@@ -43,12 +47,15 @@ FULL_GRID = HashGridConfig.from_top_resolution(2048, levels=16, log2_table_size=
 
 @dataclass(frozen=True)
 class FieldSet:
-    """Scenes and objects fitted alike. suffix: of the fields' names · only: the one instance wanted, else all."""
+    """Scenes and objects made alike, by a fit or, of ``int`` cells along the longest edge, as a grid.
+
+    suffix: of the fields' names · only: the one instance wanted, else all.
+    """
 
     pairs: str
     layouts: Sequence[Path]
-    room_options: FitOptions = ROOM_OPTIONS
-    object_options: FitOptions = OBJECT_OPTIONS
+    room_options: FitOptions | int = ROOM_OPTIONS
+    object_options: FitOptions | int = OBJECT_OPTIONS
     suffix: str = ""
     only: str | None = None
 
@@ -107,7 +114,7 @@ def make(fields: FieldSet, meshes: Path, out: Path) -> None:
     (out / fields.pairs).write_text(json.dumps(pairs, indent=1) + "\n")
 
 
-def fit_room(meshes: Path, room: dict[str, Any], path: Path, options: FitOptions) -> None:
+def fit_room(meshes: Path, room: dict[str, Any], path: Path, options: FitOptions | int) -> None:
     """The furnished scene's field and, beside it, its exact surface."""
     target = demo.compose_room(meshes, room)
     if not path.with_suffix(".surface.npz").exists():
@@ -115,15 +122,23 @@ def fit_room(meshes: Path, room: dict[str, Any], path: Path, options: FitOptions
         np.savez_compressed(path.with_suffix(".surface.npz"), vertices=vertices.astype(np.float32), faces=faces)
     if not path.exists():
         names = sorted({Path(instance["mesh"]).stem for instance in room["instances"]})
-        demo.fit(target, path, options, path.stem, names, attribution(names))
+        write(target, path, options, names)
 
 
-def fit_object(mesh: MeshField, units: float, path: Path, options: FitOptions, instance: dict[str, Any]) -> None:
+def fit_object(mesh: MeshField, units: float, path: Path, options: FitOptions | int, instance: dict[str, Any]) -> None:
     """A library object's field, the mesh's middle at the origin."""
     if not path.exists():
         target = mesh.transformed(demo.object_from_mesh(mesh, units))
         source = Path(instance["mesh"]).stem
-        demo.fit(target, path, options, path.stem, [source], attribution([source]))
+        write(target, path, options, [source])
+
+
+def write(target: MeshField | UnionField, path: Path, options: FitOptions | int, names: Sequence[str]) -> None:
+    """The field of exact distances, fitted or as a grid. names: of the meshes."""
+    if isinstance(options, int):
+        write_field(target, path, options)
+    else:
+        demo.fit(target, path, options, path.stem, names, attribution(names))
 
 
 def surface(room: UnionField) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
@@ -144,9 +159,14 @@ def main() -> None:
     parser.add_argument("rooms", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", choices=sorted(field_sets(Path())), help="sets to make; all by default")
+    parser.add_argument("--exact", nargs=2, type=int, metavar="CELLS", help="grids of exact distances; of `main` alone")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for name, sets in field_sets(arguments.rooms).items():
+    chosen = field_sets(arguments.rooms)
+    if arguments.exact is not None:
+        room, thing = arguments.exact
+        chosen = {"main": [replace(one, room_options=room, object_options=thing) for one in chosen["main"]]}
+    for name, sets in chosen.items():
         if arguments.only is None or name in arguments.only:
             for fields in sets:
                 make(fields, arguments.meshes, arguments.out)
