@@ -20,7 +20,6 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.editing.scenes import Found, found, overview, pairs_of
-from benchmarks.make_fields import UNITS_PER_METER
 from regnf_core import Insertion, Removal, RenderOptions, SdfField, Substitution, compose, open_field
 from regnf_core.editing.measured_matter import without_unseen
 from regnf_core.fields.counting import CountingField
@@ -28,7 +27,7 @@ from regnf_core.fields.mesh import MeshField
 from regnf_core.rendering.camera import Camera
 from regnf_core.rendering.paths import Orbit
 from regnf_core.rendering.render import render, render_frames
-from regnf_data.worlds.exact import ExactScene
+from regnf_data.worlds.exact import ExactScene, ExactView
 from regnf_data.worlds.mesh import Mesh
 from scripts import make_demo_fields as demo
 
@@ -45,33 +44,49 @@ class Seen:
     iou: float
 
 
-def truth_of(one: Found, meshes: Path, rooms: Path) -> MeshField:
-    """The pair's mesh in the scene's frame, at its true pose."""
-    room = json.loads((rooms / f"{one.pair.room.split('-room')[0]}-room.json").read_text())
-    instance = next(value for value in room["instances"] if value["id"] == one.pair.instance)
-    mesh = demo.load_instance(meshes, instance)
-    placed = mesh.transformed(demo.object_from_mesh(mesh, UNITS_PER_METER[one.pair.instance]))
-    return placed.transformed(one.pair.truth.inverse().matrix().numpy())
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Meshes in the scene's frame: the pair's object alone, and all things of the room, the object first."""
+
+    alone: ExactScene
+    among: ExactScene
+
+    def depth(self, camera: Camera) -> Floats:
+        """(H, W) of the object alone, along the viewing axis, 0 where it is missed."""
+        return _view(self.alone, camera).depth
+
+    def shows(self, camera: Camera) -> NDArray[np.bool_]:
+        """(H, W): where no other thing hides the object. Floor and walls are not looked at."""
+        return _view(self.among, camera).thing == 0
 
 
-def cast(mesh: MeshField, camera: Camera) -> Floats:
-    """Depths (H, W) of the mesh along the viewing axis, 0 where it is missed."""
+def _view(scene: ExactScene, camera: Camera) -> ExactView:
     K = np.array([[camera.focal[0], 0, camera.middle[0]], [0, camera.focal[1], camera.middle[1]], [0, 0, 1.0]])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = camera.axes.numpy(), camera.position.numpy()
-    exact = ExactScene([Mesh(mesh.vertices, mesh.faces)])
-    return exact.view((camera.height, camera.width), K, pose).depth
+    return scene.view((camera.height, camera.width), K, pose)
 
 
-def seen(edited: SdfField, part: int, truth: MeshField, camera: Camera, diameter: float) -> Seen | None:
-    """The part of an edited scene that is an object, against its mesh; what hides it hides it in both.
+def truth_of(one: Found, meshes: Path, rooms: Path) -> Truth:
+    """The pair's mesh at its true pose, and the other things of its room."""
+    room = json.loads((rooms / f"{one.pair.room.split('-room')[0]}-room.json").read_text())
+    parts = [part for part in demo.compose_room(meshes, room).parts if isinstance(part, MeshField)]
+    things = {
+        instance["id"]: Mesh(part.vertices, part.faces) for instance, part in zip(room["instances"], parts, strict=True)
+    }
+    thing = things.pop(one.pair.instance)
+    return Truth(ExactScene([thing]), ExactScene([thing, *things.values()]))
+
+
+def seen(edited: SdfField, part: int, truth: Truth, camera: Camera, diameter: float) -> Seen | None:
+    """The part of an edited scene that is an object, against its mesh, behind what hides it in truth.
 
     None where walls and other things hide most of it.
     """
     frame = render(edited, camera, RenderOptions(cut_away=True))
-    depth = cast(truth, camera)
-    hidden = (frame.depth > 0) & (frame.part != part) & (frame.depth < depth - 0.02 * diameter)
-    mine, exact = frame.part == part, (depth > 0) & ~hidden
+    depth = truth.depth(camera)
+    behind_a_wall = (frame.part == 0) & (frame.depth > 0) & (frame.depth < depth - 0.02 * diameter)
+    mine, exact = frame.part == part, truth.shows(camera) & ~behind_a_wall
     if exact.sum() < _LEAST_VISIBLE * (depth > 0).sum():
         return None
     both = mine & exact
@@ -109,7 +124,7 @@ def unseen_back(fields: Path, meshes: Path, rooms: Path, views: int) -> Iterator
         rows: list[tuple[float, float]] = []
         options = RenderOptions(cut_away=True)
         for camera in Orbit(frames=views, elevation_deg=30.0).cameras(edited.places[0], SIZE):
-            depth = cast(truth, camera)
+            depth = truth.depth(camera)
             on = depth > 0
             errors = []
             for field in (measured, edited):

@@ -18,6 +18,8 @@ from regnf_core.geometry.box import OrientedBox
 
 _PLAIN = 0.8
 """Color of a part that has none, where another has."""
+_SAME_SURFACE = 0.004
+"""Of the box's diagonal: a surface of the scene that lies no farther from the object's counts as a part of it."""
 
 
 @dataclass
@@ -165,9 +167,11 @@ class EditedScene:
                 here, slope = thing.signed_distance_and_gradient(points[near])
             else:
                 here, slope = thing.signed_distance(points[near]), found.gradient[near]
-            nearer = here < found.distance[near]
-            parts = torch.full_like(near[nearer], number)
-            found.enter(near[nearer], _Found(here[nearer], slope[nearer], parts))
+            before = found.distance[near]
+            nearer = here < before
+            found.enter(near[nearer], _Found(here[nearer], slope[nearer], found.part[near[nearer]]))
+            # Where the scene kept a rim of its own copy, round what stands on the object, it is the object's surface.
+            found.part[near[here < before + _SAME_SURFACE * thing.box.diagonal]] = number
 
     @torch.no_grad()
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:

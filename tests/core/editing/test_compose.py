@@ -170,6 +170,19 @@ def test_parts_tell_whose_the_surface_is() -> None:
     assert edited.parts[1].name == "stool"
 
 
+def test_the_rim_round_what_stands_on_an_object_is_the_objects() -> None:
+    """A neighbor keeps a rim of the scene's copy, here one that lies a little higher than the object."""
+    T = turned()
+    lid = ([-0.2, -0.2, 0.3], [0.2, 0.2, 0.361])
+    edited = compose(room(*STOOL, lid, ([-0.05, -0.05, 0.361], [0.05, 0.05, 0.6])), [Substitution(stool(T), T)])
+    axis = torch.linspace(-0.19, 0.19, 77)
+    top = torch.cartesian_prod(axis, axis, torch.tensor([0.361]))
+    top = top[top[:, :2].abs().amax(1) > 0.056]
+    assert int((edited.signed_distance(top).abs() < 1e-4).sum()) > 20, "or no rim was kept"
+    assert set(edited.part_at(top).tolist()) == {1}
+    assert edited.part_at(torch.tensor([[0.05, 0.0, 0.5]])).tolist() == [SCENE_PART]
+
+
 def test_an_edited_scene_is_edited_again() -> None:
     T = turned()
     once = compose(room(*STOOL), [Removal(obj=stool(T), T_object_scene=T)])
