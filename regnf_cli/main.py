@@ -20,18 +20,29 @@ from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED,
 from regnf_cli.usage import usage_fault
 from regnf_core.errors import RegnfError
 
+_ONE_THREAD = {"register", "search", "render", "edit"}
 _UsageError = cast(type[Exception], typer.BadParameter.__mro__[1])
 """What typer raises for arguments that it cannot use; it does not export the name."""
 
 
 def main() -> None:
     """Entry point of the console script."""
-    # Busy waiting of idle threads makes two torch processes on one machine ten times slower. Read when torch loads.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    _set_threads()
     ended_by: list[int] = []
     _clean_up_when_terminated(ended_by)
     code = _run()
     sys.exit(EXIT_TERMINATED if ended_by and code == EXIT_INTERRUPTED else code)
+
+
+def _set_threads() -> None:
+    """How many threads torch starts, and how they wait; read when it loads. What the user set stays.
+
+    Busy waiting of idle threads makes two torch processes on one machine ten times slower. Waking them takes longer
+    than the small operations of most commands, which are faster with one thread (docs/capacity.md).
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    if set(sys.argv[1:2]) & _ONE_THREAD:
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def _clean_up_when_terminated(ended_by: list[int]) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -21,7 +19,6 @@ from regnf_core.rendering.options import RenderOptions, check_extent
 from regnf_core.rendering.samples import TileSamples
 from regnf_core.rendering.shading import Painter
 from regnf_core.rendering.surface_mode import surface_samples
-from regnf_core.rendering.tiles import in_turn, tiles_at_once
 from regnf_core.rendering.tracing import Region
 from regnf_core.rendering.volume_mode import CLEAR, volume_samples
 from regnf_core.surface.cameras import Rays
@@ -125,11 +122,8 @@ class Renderer:
 
     def tiles(self, camera: Camera) -> list[Tensor]:
         """The pixels of the frame in rectangles that fit the memory."""
-        count = tiles_at_once(self.field.device)
-        most = max(256, self.options.memory_mb * 1_000_000 // _BYTES_A_RAY[self.options.mode] // count)
+        most = max(256, self.options.memory_mb * 1_000_000 // _BYTES_A_RAY[self.options.mode])
         most = min(most, _MOST_RAYS.get(self.field.device.type, _MOST_RAYS_ELSEWHERE))
-        each = camera.width * (_TILE_STEP * math.ceil(camera.height / count / _TILE_STEP))
-        most = min(most, each)  # as many tiles as threads: a tile takes many steps, be it large or small
         wide = min(camera.width, max(_TILE_STEP, most // _TILE_STEP // _TILE_STEP * _TILE_STEP))
         high = max(_TILE_STEP, most // wide // _TILE_STEP * _TILE_STEP)
         pixels = torch.arange(camera.width * camera.height).view(camera.height, camera.width)
@@ -140,9 +134,9 @@ class Renderer:
         color, normal = torch.zeros(pixels, 3), torch.zeros(pixels, 3)
         opacity, depth = torch.zeros(pixels), torch.zeros(pixels)
         part = torch.full((pixels,), NOTHING, dtype=torch.int16)
-        look = partial(self._tile, camera)
-        for tile, seen in in_turn(look, self.tiles(camera), self.field.device, watch.before_tile):
-            color[tile], normal[tile], opacity[tile], depth[tile], part[tile] = seen
+        for tile in self.tiles(camera):
+            watch.before_tile()
+            color[tile], normal[tile], opacity[tile], depth[tile], part[tile] = self._tile(camera, tile)
             watch.after_tile()
         return _assembled(camera, (color, normal, opacity, depth, part))
 
