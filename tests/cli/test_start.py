@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -53,3 +54,29 @@ def test_help_loads_neither_torch_nor_http(command: str) -> None:
 def test_every_command_is_there_whatever_is_asked_for() -> None:
     assert [one.name for one in app_of().registered_commands] == list(COMMANDS)
     assert [one.name for one in app_of(["search"]).registered_commands] == ["search"]
+
+
+THREADS = """
+import sys
+sys.argv = ["regnf", *sys.argv[1:]]
+from regnf_cli.main import _set_threads
+_set_threads()
+import torch
+print(torch.get_num_threads())
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "said", "threads"), [("register", {}, 1), ("register", {"OMP_NUM_THREADS": "2"}, 2), ("edit", {}, 1)]
+)
+def test_commands_of_small_operations_use_one_thread(command: str, said: dict[str, str], threads: int) -> None:
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")} | said
+    done = subprocess.run(
+        [sys.executable, "-c", THREADS, command],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
+    assert int(done.stdout) == threads
