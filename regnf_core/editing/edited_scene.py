@@ -169,9 +169,11 @@ class EditedScene:
                 here, slope = thing.signed_distance(points[near]), found.gradient[near]
             before = found.distance[near]
             nearer = here < before
-            found.enter(near[nearer], _Found(here[nearer], slope[nearer], found.part[near[nearer]]))
+            parts = torch.full_like(near[nearer], number)
+            found.enter(near[nearer], _Found(here[nearer], slope[nearer], parts))
             # Where the scene kept a rim of its own copy, round what stands on the object, it is the object's surface.
-            found.part[near[here < before + _SAME_SURFACE * thing.box.diagonal]] = number
+            rim = (here < before + _SAME_SURFACE * thing.box.diagonal) & (found.part[near] == SCENE_PART)
+            found.part[near[rim]] = number
 
     @torch.no_grad()
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:

@@ -183,6 +183,16 @@ def test_the_rim_round_what_stands_on_an_object_is_the_objects() -> None:
     assert edited.part_at(torch.tensor([[0.05, 0.0, 0.5]])).tolist() == [SCENE_PART]
 
 
+@pytest.mark.parametrize("ball_first", [True, False])
+def test_objects_that_touch_keep_their_own_surfaces(ball_first: bool) -> None:
+    T, on_top = turned(), Sim3.from_matrix(torch.eye(4, dtype=torch.float64))
+    ball = sphere(0.05, center=(0.0, 0.0, 0.41), bounds=[[-0.1, -0.1, 0.3], [0.1, 0.1, 0.5]])
+    edits = [Insertion(ball, on_top), Insertion(stool(T), T)]
+    edited = compose(room(), edits if ball_first else edits[::-1])
+    low = torch.tensor([[0.0, -0.008, 0.3606], [0.0, 0.008, 0.3606]])  # on the ball, .0006 above the stool
+    assert set(edited.part_at(low).tolist()) == {1 if ball_first else 2}
+
+
 def test_an_edited_scene_is_edited_again() -> None:
     T = turned()
     once = compose(room(*STOOL), [Removal(obj=stool(T), T_object_scene=T)])
