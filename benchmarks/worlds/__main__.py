@@ -29,6 +29,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 from benchmarks.worlds import tables, training  # noqa: E402
 from benchmarks.worlds.evidence import evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
+from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES  # noqa: E402
 from benchmarks.worlds.running import Way, register_world  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
@@ -56,7 +57,9 @@ def _make(arguments: argparse.Namespace) -> None:
     )
     meshes = tuple(arguments.meshes)
     tasks = [
-        Task(seed, length, arguments.scene, meshes, arguments.folder) for seed in seeds for length in arguments.lengths
+        Task(seed, length, arguments.scene, meshes, arguments.folder, arguments.objects)
+        for seed in seeds
+        for length in arguments.lengths
     ]
     for line in _in_parallel(make, tasks, arguments.workers):
         _say(line)
@@ -144,6 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     making = commands.add_parser("make", help="make worlds")
     making.add_argument("--meshes", type=Path, nargs="+", required=True)
     making.add_argument("--count", type=int, default=10)
+    making.add_argument("--objects", choices=OBJECT_KINDS, help="make all objects' fields so; otherwise as drawn")
     making.add_argument("--start", type=int, default=0, help="leave out so many of the part's worlds")
     registering = commands.add_parser("register", help="register every object of the worlds in a folder")
     registering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")

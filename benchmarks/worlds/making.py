@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robust.library_objects import GIVEN
-from benchmarks.worlds.objects import ObjectMaker
+from benchmarks.worlds.objects import ObjectKind, ObjectMaker
 from benchmarks.worlds.observing import observation_of_walk
 from benchmarks.worlds.recipe import FROM_IMAGES, Scene, Seen, see
 from regnf_core.errors import RegnfError
@@ -45,13 +45,15 @@ _TRAINED = (0.03, 0.15)
 
 @dataclass(frozen=True)
 class Task:
-    """A world to make. meshes: folders of meshes · folder: where worlds are kept."""
+    """A world to make. meshes: folders of meshes · folder: where worlds are kept · objects: the kind of all objects'
+    fields; None: drawn."""
 
     seed: int
     length: Length
     scene: Scene
     meshes: tuple[Path, ...]
     folder: Path
+    objects: ObjectKind | None = None
 
     @property
     def home(self) -> Path:
@@ -84,7 +86,7 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
     _write_observation(seen, home)
     # As many scenes stay in their own frame as do not.
     T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
-    maker = ObjectMaker(world, seen, task.length, home)
+    maker = ObjectMaker(world, seen, home, task.objects)
     cases = []
     chosen = _chosen(world, seen, task.length, rng)
     for number in chosen:

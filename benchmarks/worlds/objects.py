@@ -24,9 +24,9 @@ from regnf_data.worlds.models import Model
 from regnf_data.worlds.rooms import World
 from regnf_data.worlds.sensors import draw_matter
 from regnf_data.worlds.symmetries import measure_symmetries
-from regnf_data.worlds.walks import Length
 
 ObjectKind = Literal["mesh", "orbit", "cut"]
+OBJECT_KINDS: tuple[ObjectKind, ...] = ("mesh", "orbit", "cut")
 _SHARES = (0.6, 0.28, 0.12)
 _FRAMES = 36
 _LEAST_SEEN = 0.6
@@ -36,10 +36,10 @@ _LARGEST_PART = 160
 
 
 class ObjectMaker:
-    """Makes the objects of one world."""
+    """Makes the objects of one world. wanted: all of one kind; None: of any, as a seed draws."""
 
-    def __init__(self, world: World, seen: Seen, length: Length, home: Path) -> None:
-        self._world, self._seen, self._length, self._home = world, seen, length, home
+    def __init__(self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None) -> None:
+        self._world, self._seen, self._home, self._wanted = world, seen, home, wanted
 
     def make(self, thing: int, case: int, rng: np.random.Generator) -> ObjectKind:
         """Write the field of a thing as case number ``case``, and its mesh. Returns which kind it came to be.
@@ -49,14 +49,14 @@ class ObjectMaker:
         placed = self._world.things[thing]
         assert placed.model is not None
         model = placed.model
-        drawn = int(rng.choice(3, p=_SHARES))
+        drawn = OBJECT_KINDS[int(rng.choice(3, p=_SHARES))] if self._wanted is None else self._wanted
         path = self._home / f"object-{case}.safetensors"
         kind: ObjectKind = "mesh"
         extra: dict[str, Array] = {}
-        if drawn == 1:
+        if drawn == "orbit":
             _fused_orbit(model, rng, path, self._seen.rendered)
             kind = "orbit"
-        elif drawn == 2:
+        elif drawn == "cut":
             bounds = self._cut(thing, path)
             if bounds is not None:
                 kind, extra = "cut", bounds

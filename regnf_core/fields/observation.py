@@ -17,7 +17,7 @@ from torch import Tensor
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import ColorFunction, has_color, inverse_deviation_of
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.observation_grid import UNSEEN, ObservationGrid
+from regnf_core.schema.observation_grid import SURFACE, UNSEEN, ObservationGrid
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,18 @@ class Observation:
         within = ((cells >= 0) & (cells < counts)).all(-1)
         x, y, z = cells.clamp_min(0).minimum(counts - 1).unbind(-1)
         return torch.where(within, self.states[x, y, z], UNSEEN)
+
+    def measured_extent(self) -> Tensor | None:
+        """(2, 3) float64: lowest and highest corner, in the points' frame, of a box that holds all voxels in which a
+        surface was measured; None where there are none."""
+        voxels = (self.states == SURFACE).nonzero()
+        if len(voxels) == 0:
+            return None
+        ends = torch.stack([voxels.amin(0), voxels.amax(0) + 1]).double() * self.voxel + self.low.double()
+        corners = torch.cartesian_prod(*ends.T)
+        if self.T_grid_frame is not None:
+            corners = self.T_grid_frame.inverse().apply(corners)
+        return torch.stack([corners.amin(0), corners.amax(0)])
 
     def stored(self) -> tuple[ObservationGrid, NDArray[np.int32]]:
         """The grid and the tensor that a file keeps, both of the grid's own frame."""

@@ -13,13 +13,19 @@ import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.points import diameter
 from regnf_core.robust.constants import SAMPLING
 from regnf_core.robust.samples import Samples
-from regnf_core.robust.working_frame import WorkingField, WorkingFrame
+from regnf_core.robust.working_frame import WorkingField, WorkingFrame, WorkingObservation
 from regnf_core.surface.projection import project_to_surface
-from regnf_core.surface.requirements import require_box_in_scene, require_object_surface, require_scene_surface
+from regnf_core.surface.requirements import (
+    MIN_POINTS,
+    require_box_in_scene,
+    require_object_surface,
+    require_scene_surface,
+)
 from regnf_core.surface.surface_cells import Cells, crop_to_surface, surface_cells
 
 
@@ -36,18 +42,28 @@ class SampledField:
 def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
     """At most ``limit`` samples of the object; the working frame has the surface's centroid at 0 and diameter 1.
 
+    Of an object that says what was observed of it, surface that nobody measured is left out, unless too little else is
+    there: a scan shows such surface where it ends, beneath the object and behind its walls.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     low, high = obj.bounds
     rough = _box_frame(low, high)
     field = WorkingField(obj, rough)
     low, high = rough.into(low).double(), rough.into(high).double()
+    known = observation_of(obj)
+    observation = None if known is None else WorkingObservation(known, rough)
+    measured = None if observation is None else observation.measured_extent()
+    if measured is not None:
+        low, high = torch.maximum(low, measured[0]), torch.minimum(high, measured[1])
     inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
     cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
     found = _samples_near(field, cells, limit, generator)
     found = found[space.faces_outside(found.points, found.normals)]
     inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
     found = found[inside]
+    if observation is not None:
+        on_surface = observation.on_surface(found.points)
+        found = found[on_surface] if int(on_surface.sum()) >= MIN_POINTS else found
     require_object_surface(len(found))
     surface = found.on_surface()
     size = diameter(surface)

@@ -64,6 +64,10 @@ class WorkingObservation:
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
         self._observation = observation.seen_in(frame.to_field())
 
+    def measured_extent(self) -> Tensor | None:
+        """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
+        return self._observation.measured_extent()
+
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
         return self._observation.at(points) == SURFACE

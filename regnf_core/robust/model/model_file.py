@@ -19,7 +19,7 @@ from regnf_core.robust.model.signature import SIGNATURE_LENGTH
 from regnf_core.robust.samples import Samples
 from regnf_core.robust.working_frame import WorkingFrame
 
-MODEL_VERSION = "1"
+MODEL_VERSION = "2"
 """Raised whenever models made by older code must be made again."""
 _SHAPES: dict[str, tuple[int | str, ...]] = {
     "center": (3,),

@@ -53,6 +53,23 @@ def test_states_by_place() -> None:
     assert observation.at(points).tolist() == [state, state, UNSEEN, UNSEEN]
 
 
+def test_the_extent_of_what_was_measured_in_any_frame() -> None:
+    states = torch.zeros(GRID.counts, dtype=torch.uint8)
+    low = torch.tensor(GRID.low, dtype=torch.float64)
+    assert Observation(states, low, GRID.voxel).measured_extent() is None
+    states[1, 0, 2] = states[2, 1, 2] = SURFACE
+    states[0, 0, 0] = FREE
+    observation = Observation(states, low, GRID.voxel)
+    # Voxels from (-0.5, -2, 1) to (0, -1.5, 1.5), and from (0, -1.5, 1) to (0.5, -1, 1.5).
+    expected = torch.tensor([[-0.5, -2.0, 1.0], [0.5, -1.0, 1.5]], dtype=torch.float64)
+    torch.testing.assert_close(observation.measured_extent(), expected)
+    # A quarter turn about z, (x, y) to (-y, x), twice the size, and a shift along x.
+    turn = torch.tensor([[0.0, -2.0, 0.0, 3.0], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    turned = observation.seen_in(Sim3.from_matrix(turn.double()).inverse())
+    expected = torch.tensor([[5.0, -1.0, 2.0], [7.0, 1.0, 3.0]], dtype=torch.float64)
+    torch.testing.assert_close(turned.measured_extent(), expected)
+
+
 def test_every_frame_sees_the_same() -> None:
     field = ObservedField(sphere(0.5), some_observation())
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 3.0 - 1.5

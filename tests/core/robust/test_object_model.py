@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.registration import WarmStart, register
-from regnf_core.robust.model.model_file import read_object_model, write_object_model
+from regnf_core.robust.model.model_file import MODEL_VERSION, read_object_model, write_object_model
 from regnf_core.robust.model.object_model import model_object
 from regnf_core.robust.model.signature import SIGNATURE_LENGTH, signature
 from tests.core.analytic import AnalyticField, boxes, chair, chair_pose, room, table
@@ -108,7 +108,7 @@ def test_a_faulty_model_file_is_refused(tmp_path: Path, fault: str) -> None:
     path = tmp_path / "chair.model"
     write_object_model(path, model_object(slab_table()))
     tensors = load_file(path)
-    metadata = {"regnf_object_model": "0" if fault == "version" else "1"}
+    metadata = {"regnf_object_model": "1" if fault == "version" else MODEL_VERSION}
     if fault == "name":
         tensors["other"] = tensors.pop("center")
     if fault == "shape":
