@@ -19,6 +19,7 @@ from regnf_cli.rendering_options import (
     Elevation,
     Folder,
     Frames,
+    Jobs,
     ModeChoice,
     Outputs,
     Request,
@@ -53,6 +54,7 @@ def edit(
     outputs: Outputs = None,
     antialias: Antialias = None,
     cut_away: CutAway = False,
+    jobs: Jobs = None,
     scene_config: SceneConfig = None,
     scene_description: SceneDescription = None,
     no_config: NoConfigs = False,
@@ -74,7 +76,7 @@ def edit(
     }
     wanted = request_of(request, said, _edits(edits), around)
     place = source_of(scene, scene_description, choice_of(scene_config, no_config), "scene")
-    render_here(place, wanted, output)
+    render_here(place, wanted, output, jobs)
 
 
 def _edits(file: Path) -> list[Any]:

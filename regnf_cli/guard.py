@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 
-from regnf_worker.kernel import die_with_parent
+from regnf_core.parent_process import die_with_parent
 
 
 def main(arguments: list[str], kernel_kills: bool = sys.platform.startswith("linux")) -> int:

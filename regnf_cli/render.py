@@ -18,6 +18,7 @@ from regnf_cli.rendering_options import (
     Every,
     Folder,
     Frames,
+    Jobs,
     ModeChoice,
     Outputs,
     Request,
@@ -45,6 +46,7 @@ def render(
     outputs: Outputs = None,
     antialias: Antialias = None,
     cut_away: CutAway = False,
+    jobs: Jobs = None,
     description: Description = None,
     config: Config = None,
     no_config: NoConfig = False,
@@ -67,4 +69,4 @@ def render(
     }
     poses = None if cameras is None else poses_of(cameras, every, size_of(size))
     wanted = request_of(request, said, around=around, poses=poses)
-    render_here(source_of(field, description, choice_of(config, no_config)), wanted, output)
+    render_here(source_of(field, description, choice_of(config, no_config)), wanted, output, jobs)

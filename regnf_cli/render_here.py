@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from regnf_core.field_source import FieldSource, find_source
 from regnf_core.rendering.request import RenderRequest
 
 
-def render_here(scene: FieldSource, request: RenderRequest, output: Path) -> None:
-    """Write the request's files into ``output``, each whole or not at all. An object's name is its file."""
+def render_here(scene: FieldSource, request: RenderRequest, output: Path, jobs: int | None) -> None:
+    """Write the request's files into ``output``, each whole or not at all. An object's name is its file.
+
+    jobs: processes; None: one a core.
+    """
     from regnf_core.fields.base import SdfField
     from regnf_core.loading import load_field
     from regnf_core.rendering.job import run_render
@@ -25,7 +29,11 @@ def render_here(scene: FieldSource, request: RenderRequest, output: Path) -> Non
         task = bar.add_task("loading", total=1.0)
         field = load_field(scene).field
         bar.update(task, description="rendering")
-        report = run_render(field, request, open_object, Path(folder), lambda share: bar.update(task, completed=share))
+
+        def tell(share: float) -> None:
+            bar.update(task, completed=share)
+
+        report = run_render(field, request, open_object, Path(folder), tell, processes=jobs or os.cpu_count() or 1)
         for artifact in report.artifacts:
             (Path(folder) / artifact.name).replace(output / artifact.name)
     for artifact in report.artifacts:

@@ -57,6 +57,9 @@ Outputs = Annotated[
     ),
 ]
 Antialias = Annotated[int | None, typer.Option(min=1, max=4, help="Rays along each side of a pixel.")]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", min=1, help="Processes that share the frames. By default one a core.")
+]
 CutAway = Annotated[
     bool, typer.Option("--cut-away", help="Cameras may stand in matter: what is before them is cut away.")
 ]

@@ -71,17 +71,18 @@ def run_render(
     directory: Path,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    processes: int = 1,
 ) -> RenderReport:
     """Write the request's files into the existing folder ``directory``.
 
-    open_object: the field of an object that an edit names. Files: frame-0000.png (color), frame-0000-depth.png (16 bit)
-    and .npy, frame-0000-normal.png, and so on; before-0000.png and so on without edits; animation.webp,
-    before-after.png, composite.glb, edited.safetensors, render.json.
+    open_object: the field of an object that an edit names · processes: see ``render_frames``. Files: frame-0000.png
+    (color), frame-0000-depth.png (16 bit) and .npy, frame-0000-normal.png, and so on; before-0000.png and so on without
+    edits; animation.webp, before-after.png, composite.glb, edited.safetensors, render.json.
     Raises what ``compose`` and ``render_frames`` raise, and CancelledError; what was written by then is the caller's to
     delete.
     """
     request.check()
-    work = _Work(request, directory, progress, cancelled)
+    work = _Work(request, directory, progress, cancelled, processes)
     with work.stage("composing"):
         scene = without_unseen(scene) if request.clear_unseen else scene
         edited = compose(scene, open_edits(request.edits, open_object), request.seed, work.tell)
@@ -118,9 +119,14 @@ class _Work:
     """The files as they come, and how far the work has come."""
 
     def __init__(
-        self, request: RenderRequest, directory: Path, progress: Progress | None, cancelled: Callable[[], bool] | None
+        self,
+        request: RenderRequest,
+        directory: Path,
+        progress: Progress | None,
+        cancelled: Callable[[], bool] | None,
+        processes: int,
     ) -> None:
-        self._request, self._directory = request, directory
+        self._request, self._directory, self._processes = request, directory, processes
         self._progress, self._cancelled = progress, cancelled
         self._done, self._share = 0.0, (0.0, 1.0)
         self._artifacts: list[RenderArtifact] = []
@@ -161,7 +167,8 @@ class _Work:
         wanted = {"strip": 1, "animation": len(cameras)}
         keep = max((wanted.get(output, 0) for output in self._request.outputs), default=0)
         kept = []
-        rendered = render_frames(scene, cameras, options or self._request.options, self.tell, self._cancelled)
+        chosen = options or self._request.options
+        rendered = render_frames(scene, cameras, chosen, self.tell, self._cancelled, self._processes)
         for number, frame in enumerate(rendered):
             self._write(frame, number, stem, unit)
             if number < keep:

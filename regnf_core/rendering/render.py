@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
 from regnf_core.fields.base import SdfField
+from regnf_core.processes import can_fork, in_processes
 from regnf_core.rendering.beams import free_start
 from regnf_core.rendering.camera import Camera
 from regnf_core.rendering.distance_grid import DistanceGrid
@@ -24,6 +28,8 @@ from regnf_core.rendering.volume_mode import CLEAR, volume_samples
 from regnf_core.surface.cameras import Rays
 from regnf_core.surface.sphere_tracing import finite_distance
 
+Part = NDArray[Any]
+"""(P, ...): one thing that is known of the pixels of a tile."""
 Progress = Callable[[float], None]
 """Called with the share done, 0..1, after each tile. May raise CancelledError to stop the work."""
 
@@ -31,6 +37,8 @@ _BYTES_A_RAY = {"surface": 1500, "volume": 4000}
 _MOST_RAYS = {"cpu": 1 << 16}
 """In a tile, so that progress and cancelling are heard of; other devices need more rays to be busy."""
 _MOST_RAYS_ELSEWHERE = 1 << 19
+_TILES_A_PROCESS = 2
+"""Of each frame, at least: processes that have done theirs help the others."""
 _TILE_STEP = 16
 """Pixels along a tile's side are a multiple of it: bundles of rays are not cut."""
 _TOLERANCE = 4e-4
@@ -56,37 +64,57 @@ def render_frames(
     options: RenderOptions | None = None,
     progress: Progress | None = None,
     cancelled: Callable[[], bool] | None = None,
+    processes: int = 1,
 ) -> Iterator[Frame]:
     """A frame a camera, one after the other, on the field's device. What rays share is prepared once.
 
-    ``cancelled`` is asked before each tile; CancelledError is raised once it says so.
-    Raises InvalidInputError: CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; and NoSurfaceError
-    (NO_SURFACE_IN_SCENE).
+    ``cancelled`` is asked before each tile; CancelledError is raised once it says so. processes: forked copies of this
+    process that share the tiles, where the system can and the field is on the CPU; the frames are the same.
+    Raises InvalidInputError: CAMERA_IN_MATTER, RENDER_TOO_LARGE, FIELD_NOT_FINITE, COLORS_MISSING; NoSurfaceError
+    (NO_SURFACE_IN_SCENE); ProcessLostError (WORKER_LOST).
     """
     chosen = options or RenderOptions()
     check_extent(len(cameras), max((camera.width * camera.height for camera in cameras), default=0))
     renderer = Renderer.of(field, chosen)
     for camera in cameras:  # before the work, which would be lost
         renderer.check(camera)
-    watch = _Watch(progress, cancelled, sum(len(renderer.tiles(camera)) for camera in cameras))
-    for camera in cameras:
-        yield renderer.frame(camera, watch)
+    if field.device.type != "cpu" or not can_fork():
+        processes = 1
+    tiles = [renderer.tiles(camera, processes) for camera in cameras]
+    tasks = [(number, tile) for number, of_frame in enumerate(tiles) for tile in range(len(of_frame))]
 
+    def work(task: tuple[int, int]) -> list[Part]:
+        number, tile = task
+        return [part.numpy() for part in renderer.tile(cameras[number], tiles[number][tile])]
 
-class _Watch:
-    """Tells how much is done, and hears when to stop."""
-
-    def __init__(self, progress: Progress | None, cancelled: Callable[[], bool] | None, tiles: int) -> None:
-        self._progress, self._cancelled, self._tiles, self._done = progress, cancelled, tiles, 0
-
-    def before_tile(self) -> None:
-        if self._cancelled is not None and self._cancelled():
+    def check() -> None:
+        if cancelled is not None and cancelled():
             raise CancelledError("the rendering was cancelled")
 
-    def after_tile(self) -> None:
-        self._done += 1
-        if self._progress is not None:
-            self._progress(self._done / self._tiles)
+    done = _watched(_done(work, tasks, processes, check), len(tasks), check, progress)
+    for camera, of_frame in zip(cameras, tiles, strict=True):
+        yield _frame(camera, of_frame, done)
+
+
+def _done(
+    work: Callable[[tuple[int, int]], list[Part]],
+    tasks: Sequence[tuple[int, int]],
+    processes: int,
+    check: Callable[[], None],
+) -> Iterator[list[Part]]:
+    return in_processes(work, tasks, processes, check) if processes > 1 else map(work, tasks)
+
+
+def _watched(
+    tiles: Iterator[list[Part]], count: int, check: Callable[[], None], progress: Progress | None
+) -> Iterator[list[Part]]:
+    """The same, with ``check`` before each, and ``progress`` told once it is there."""
+    for number in range(1, count + 1):
+        check()
+        tile = next(tiles)
+        if progress is not None:
+            progress(number / count)
+        yield tile
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,28 +148,19 @@ class Renderer:
             hint = "Move it into free space, or let what is before it be cut away: option cut_away."
             raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_IN_MATTER", hint=hint)
 
-    def tiles(self, camera: Camera) -> list[Tensor]:
-        """The pixels of the frame in rectangles that fit the memory."""
-        most = max(256, self.options.memory_mb * 1_000_000 // _BYTES_A_RAY[self.options.mode])
+    def tiles(self, camera: Camera, processes: int) -> list[Tensor]:
+        """The pixels of the frame in rectangles that fit the memory, and are enough for the processes."""
+        most = max(256, self.options.memory_mb * 1_000_000 // processes // _BYTES_A_RAY[self.options.mode])
         most = min(most, _MOST_RAYS.get(self.field.device.type, _MOST_RAYS_ELSEWHERE))
+        if processes > 1:
+            most = min(most, -(-camera.width * camera.height // (_TILES_A_PROCESS * processes)))
         wide = min(camera.width, max(_TILE_STEP, most // _TILE_STEP // _TILE_STEP * _TILE_STEP))
         high = max(_TILE_STEP, most // wide // _TILE_STEP * _TILE_STEP)
         pixels = torch.arange(camera.width * camera.height).view(camera.height, camera.width)
         return [tile.flatten() for row in torch.split(pixels, high) for tile in torch.split(row, wide, dim=1)]
 
-    def frame(self, camera: Camera, watch: _Watch) -> Frame:
-        pixels = camera.width * camera.height
-        color, normal = torch.zeros(pixels, 3), torch.zeros(pixels, 3)
-        opacity, depth = torch.zeros(pixels), torch.zeros(pixels)
-        part = torch.full((pixels,), NOTHING, dtype=torch.int16)
-        for tile in self.tiles(camera):
-            watch.before_tile()
-            color[tile], normal[tile], opacity[tile], depth[tile], part[tile] = self._tile(camera, tile)
-            watch.after_tile()
-        return _assembled(camera, (color, normal, opacity, depth, part))
-
     @torch.no_grad()
-    def _tile(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, ...]:
+    def tile(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, ...]:
         """What is seen in pixels (P,), means over their parts: as ``_rays_through``; depth and part of the middle."""
         fine = self.options.antialias
         places = [((place % fine + 0.5) / fine, (place // fine + 0.5) / fine) for place in range(fine * fine)]
@@ -183,14 +202,20 @@ def _main_part(samples: TileSamples, parts: Tensor, rays: int, count: int) -> Te
     return shares.view(rays, count).argmax(dim=-1)
 
 
-def _assembled(camera: Camera, parts: tuple[Tensor, ...]) -> Frame:
-    color, normal, opacity, depth, part = parts
+def _frame(camera: Camera, tiles: Sequence[Tensor], done: Iterator[list[Part]]) -> Frame:
+    pixels = camera.width * camera.height
+    color, normal = np.zeros((pixels, 3), np.float32), np.zeros((pixels, 3), np.float32)
+    opacity, depth = np.zeros(pixels, np.float32), np.zeros(pixels, np.float32)
+    part = np.full(pixels, NOTHING, np.int16)
+    for tile in tiles:
+        at = tile.numpy()
+        color[at], normal[at], opacity[at], depth[at], part[at] = next(done)
     shape = camera.height, camera.width
     return Frame(
         camera,
-        depth.view(shape).numpy(),
-        torch.nn.functional.normalize(normal, dim=-1).view(*shape, 3).numpy(),
-        (color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).view(*shape, 3).numpy(),
-        np.minimum(opacity.view(shape).numpy(), 1.0),
-        part.view(shape).numpy(),
+        depth.reshape(shape),
+        normalize(torch.from_numpy(normal), dim=-1).view(*shape, 3).numpy(),
+        (color.clip(0.0, 1.0) * 255.0).round().astype(np.uint8).reshape(*shape, 3),
+        np.minimum(opacity, 1.0).reshape(shape),
+        part.reshape(shape),
     )

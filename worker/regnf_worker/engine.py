@@ -202,6 +202,8 @@ class CoreEngine:
         report: Report,
         folder: Path,
     ) -> list[str]:
+        import torch
+
         from regnf_core.fields.build import open_field
         from regnf_core.rendering.job import phase_of, run_render
         from regnf_worker.rendering_result import write_result
@@ -212,6 +214,7 @@ class CoreEngine:
             lambda name: open_field(objects[name](), self.device),
             folder,
             lambda share: report(phase_of(share), share),
+            processes=torch.get_num_threads(),
         )
         return write_result(folder, request, made, self.describe())
 

@@ -20,6 +20,7 @@ from itertools import groupby
 from redis import Redis
 from redis.exceptions import RedisError
 
+from regnf_core.parent_process import die_with_parent
 from regnf_state.ownership import owner_of
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.settings import Settings
@@ -113,7 +114,7 @@ class FieldDrawer:
         try:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            kernel.die_with_parent(parent)
+            die_with_parent(parent)
             kernel.prefer_as_oom_victim()
             kernel.give_way(self._niceness)
             self._limits.hold_here()

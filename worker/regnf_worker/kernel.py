@@ -1,38 +1,24 @@
-"""What the worker asks of the operating system: to end with its parent, to share cores, to give way.
+"""What the worker asks of the operating system: to share cores, to give way.
 
 It also reports kills for memory.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
-import signal
-import sys
 import time
 from collections.abc import Callable, MutableMapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-_PR_SET_PDEATHSIG = 1
+from regnf_core.parent_process import die_with_parent
+
 _OOM_SCORE = "500"
 _EXIT_POLL_S = 0.005
 _COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
-
-
-def die_with_parent(parent_pid: int) -> None:
-    """Have the kernel kill this process when its parent ends, however it ends (Linux; nothing elsewhere).
-
-    Call it in a fresh child that the parent's main thread forked: the kernel watches that thread.
-    """
-    if not sys.platform.startswith("linux"):
-        return
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent_pid:  # the parent died before this call
-        os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Exit(NamedTuple):

@@ -28,6 +28,7 @@ from rq.utils import now
 from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.fair_clock import LONGEST
+from regnf_core.parent_process import die_with_parent
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis import payload
@@ -203,7 +204,7 @@ class RegnfWorker(ResilientWorker):
         child = os.fork()
         if child == 0:
             os.setpgrp()
-            kernel.die_with_parent(parent)
+            die_with_parent(parent)
             kernel.prefer_as_oom_victim()
             kernel.give_way(self._niceness)
             os.close(ended)

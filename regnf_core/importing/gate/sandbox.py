@@ -15,8 +15,9 @@ from pathlib import Path
 from regnf_core.importing.gate.landlock import restrict_files
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.system_calls import refuse_system_calls
+from regnf_core.parent_process import die_with_parent
 
-_PR_SET_PDEATHSIG, _PR_GET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_NO_NEW_PRIVS = 1, 2, 4, 38
+_PR_GET_PDEATHSIG, _PR_SET_DUMPABLE, _PR_SET_NO_NEW_PRIVS = 2, 4, 38
 _CLONE_NEWUSER, _CLONE_NEWNET, _CLONE_NEWIPC = 0x10000000, 0x40000000, 0x08000000
 _CAPABILITY_VERSION = 0x20080522
 _OPEN_FILES = 64
@@ -38,9 +39,7 @@ def confine(
     forbid the first and allow the second. threads: allow new ones; whoever started this process counts them.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent_pid:  # the parent died before the line above
-        os._exit(1)
+    die_with_parent(parent_pid)
     _be_first_to_go()
     _limit_resources(limits, threads)
     libc.prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)

@@ -11,6 +11,7 @@ import torch
 from regnf_core import Camera, RegnfError, RenderOptions, render
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.processes import can_fork
 from regnf_core.rendering.frame import NOTHING
 from regnf_core.rendering.paths import Orbit
 from regnf_core.rendering.render import render_frames
@@ -134,6 +135,24 @@ def test_threads_change_nothing_that_is_seen(mode: str) -> None:
     one, three = frames
     assert (np.abs(one.depth - three.depth) > 1e-3).mean() < 0.002
     assert (np.abs(one.color.astype(int) - three.color) > 4).mean() < 0.002
+
+
+@pytest.mark.skipif(not can_fork(), reason="this system cannot copy a process")
+@pytest.mark.parametrize("mode", MODES)
+def test_processes_change_nothing_that_is_seen(mode: str) -> None:
+    field, options = boxes([([-0.3, -0.2, -0.25], [0.25, 0.3, 0.2])]), RenderOptions(mode=mode, memory_mb=16)
+    cameras = Orbit(frames=2).cameras(OrientedBox.from_corners([-0.3] * 3, [0.3] * 3), (72, 50))
+    told: list[float] = []
+    for one, two in zip(
+        render_frames(field, cameras, options),
+        render_frames(field, cameras, options, told.append, processes=2),
+        strict=True,
+    ):
+        assert (np.abs(one.depth - two.depth) > 1e-3).mean() < 0.002
+        assert (np.abs(one.color.astype(int) - two.color) > 4).mean() < 0.002
+        assert np.array_equal(one.part, two.part)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
 
 
 def test_progress_and_cancelling() -> None:
