@@ -11,16 +11,16 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from benchmarks.editing.scenes import Found, found, overview, pairs_of
-from regnf_core import Insertion, Removal, RenderOptions, SdfField, Substitution, compose, open_field
+from benchmarks.robust.cases import Pair
+from regnf_core import Insertion, Removal, RenderOptions, SdfField, Sim3, Substitution, compose, open_field
 from regnf_core.editing.measured_matter import without_unseen
 from regnf_core.fields.counting import CountingField
 from regnf_core.fields.mesh import MeshField
@@ -179,23 +179,39 @@ def _even(scene: SdfField, camera: Camera, count: int) -> NDArray[np.float32]:
 
 
 def registered_again(fields: Path) -> Iterator[str]:
-    """One object moved within a room by edits, and registered against the edited field."""
+    """Objects of a room, registered against it as it is and as edits left it."""
     room = "mix-room"
     scene = open_field(fields / f"{room}.safetensors")
-    for pair in pairs_of(fields, "pairs.json", room):
-        obj = open_field(fields / f"{pair.object}.safetensors")
-        for name, edited in (("as trained", scene), ("edited", _moved_there(scene, obj, pair))):
-            one = found(pair, edited, obj)
-            off = (one.T_object_scene @ pair.truth.inverse()).matrix() - torch.eye(4)
-            size = pair.diameter
-            shift = float(off[:3, 3].norm()) / size + float(off[:3, :3].norm()) / 2
-            yield f"| {pair.object} | {name} | {one.verdict} | {100 * shift:.2f} % |"
+    pairs = pairs_of(fields, "pairs.json", room)
+    objects = {pair.object: open_field(fields / f"{pair.object}.safetensors") for pair in pairs}
+    for number, pair in enumerate(pairs):
+        obj, other = objects[pair.object], pairs[(number + 1) % len(pairs)]
+        moved = _moved_to(pair, other)
+        known = Substitution(objects[other.object], other.truth)
+        cases = {
+            "as trained": (pair, scene),
+            "taken away and put back": (pair, _put(scene, pair, obj, pair)),
+            f"{other.object} substituted": (pair, compose(scene, [known])),
+            f"in the place of {other.object}": (moved, _put(scene, other, objects[other.object], moved, obj)),
+        }
+        for name, (wanted, field) in cases.items():
+            one = found(wanted, field, obj)
+            off = (one.T_object_scene @ wanted.truth.inverse()).matrix() - torch.eye(4)
+            error = float(off[:3, 3].norm()) / wanted.diameter + float(off[:3, :3].norm()) / 2
+            yield f"| {pair.object} | {name} | {one.verdict} | {100 * error:.2f} % |"
 
 
-def _moved_there(scene: SdfField, obj: SdfField, pair: Any) -> SdfField:
-    """The scene without what it shows there, and with the object put where the truth says."""
-    empty = compose(scene, [Removal(obj=obj, T_object_scene=pair.truth)])
-    return compose(empty, [Insertion(obj, pair.truth)])
+def _put(scene: SdfField, there: Pair, known: SdfField, pair: Pair, obj: SdfField | None = None) -> SdfField:
+    """The scene without the known object of the pair ``there``, and with the object of ``pair`` put at its pose."""
+    empty = compose(scene, [Removal(obj=known, T_object_scene=there.truth)])
+    return compose(empty, [Insertion(known if obj is None else obj, pair.truth)])
+
+
+def _moved_to(pair: Pair, place: Pair) -> Pair:
+    """The pair with its object where another one stands, on the same ground."""
+    low, to = (box.center - torch.tensor([0.0, 0.0, 0.5]) * box.size for box in (pair.detection, place.detection))
+    detection = replace(pair.detection, center=pair.detection.center + to - low)
+    return replace(pair, detection=detection, truth=pair.truth @ Sim3.from_translation(low - to))
 
 
 def table(title: str, head: Sequence[str], rows: Iterator[str]) -> str:

@@ -145,6 +145,7 @@ class CoreEngine:
         from regnf_core.registration import WarmStart, register, with_late_clouds
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
+        _one_thread()
         start, truth = request.initial_transform, request.ground_truth
         fields = open_field(scene, self.device), open_field(object_, self.device)
         box, options = OrientedBox.from_quaternion(**asdict(request.detection)), request.options
@@ -174,6 +175,8 @@ class CoreEngine:
         from regnf_core.library import LibraryObject, search_library
         from regnf_core.viewing import ranking_document
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
+
+        _one_thread()
 
         def opener(one: Candidate) -> Callable[[], Any]:
             return lambda: open_field(one.open(), self.device)
@@ -231,6 +234,13 @@ class CoreEngine:
 
     def symmetry(self, model: Model) -> dict[str, Any]:
         return asdict(model.symmetry.group())
+
+
+def _one_thread() -> None:
+    """Of torch for this job: to wake a second one takes longer than its operations (docs/capacity.md)."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def _fields(notes: Notes, obj: str | None) -> dict[str, FieldNotes]:
