@@ -1,6 +1,6 @@
 """Fit the benchmark's fields: furnished scenes and their library objects, each in a frame of its own scale.
 
-    python -m benchmarks.make_fields MESHES ROOMS OUT [--only SET ...] [--exact CELLS CELLS]
+    python -m benchmarks.make_fields MESHES ROOMS OUT [--only SET ...] [--layouts NAME ...] [--exact CELLS CELLS]
 
 MESHES holds the meshes (glb, meters, z up), ROOMS the layouts ac-room.json, atbl-room.json and mix-room.json; the
 held-out scenes are laid out in benchmarks/layouts. Writes a safe field a scene and an object, the scene's exact surface
@@ -159,6 +159,7 @@ def main() -> None:
     parser.add_argument("rooms", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", choices=sorted(field_sets(Path())), help="sets to make; all by default")
+    parser.add_argument("--layouts", nargs="+", help="rooms to make and to list, by the name of the layout; all by default")
     parser.add_argument("--exact", nargs=2, type=int, metavar="CELLS", help="grids of exact distances; of `main` alone")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -169,7 +170,9 @@ def main() -> None:
     for name, sets in chosen.items():
         if arguments.only is None or name in arguments.only:
             for fields in sets:
-                make(fields, arguments.meshes, arguments.out)
+                layouts = [one for one in fields.layouts if arguments.layouts is None or one.stem in arguments.layouts]
+                if layouts:
+                    make(replace(fields, layouts=layouts), arguments.meshes, arguments.out)
 
 
 if __name__ == "__main__":

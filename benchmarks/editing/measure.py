@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 
 from benchmarks.editing.scenes import Found, found, overview, pairs_of
 from benchmarks.robust.cases import Pair
+from benchmarks.robust.symmetries import declared
 from regnf_core import Insertion, Removal, RenderOptions, SdfField, Sim3, Substitution, compose, open_field
 from regnf_core.editing.measured_matter import without_unseen
 from regnf_core.fields.counting import CountingField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.geometry.metrics import mssd
 from regnf_core.rendering.camera import Camera
 from regnf_core.rendering.paths import Orbit
 from regnf_core.rendering.render import render, render_frames
@@ -196,8 +198,7 @@ def registered_again(fields: Path) -> Iterator[str]:
         }
         for name, (wanted, field) in cases.items():
             one = found(wanted, field, obj)
-            off = (one.T_object_scene @ wanted.truth.inverse()).matrix() - torch.eye(4)
-            error = float(off[:3, 3].norm()) / wanted.diameter + float(off[:3, :3].norm()) / 2
+            error = mssd(one.T_object_scene, wanted.truth, one.points, declared(pair.instance)) / wanted.diameter
             yield f"| {pair.object} | {name} | {one.verdict} | {100 * error:.2f} % |"
 
 

@@ -3,14 +3,15 @@
     python -m benchmarks.editing.pictures FIELDS [--output docs/images/editing] [--only NAME ...] [--size 480x360]
 
 FIELDS is the folder of benchmarks.make_image_fields or benchmarks.make_fields (pairs.json, pairs-short.json,
-pairs-after-1-percent.json; what is missing is left out). Poses are those of ``register``, not the true ones. Each
-picture is before above after, or before beside after; 10 minutes on one idle core.
+pairs-after-1-percent.json, pairs-after-3-percent.json; what is missing is left out). Poses are those of ``register``,
+not the true ones. Each picture is before above after, or before beside after; 10 minutes on one idle core.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import torch
 from PIL import Image
 
 from benchmarks.editing.scenes import TINTS, Found, found, overview, pairs_of
+from benchmarks.robust.cases import Pair
 from regnf_core import (
     Insertion,
     OrientedBox,
@@ -42,9 +44,23 @@ _GAP = 6
 Size = tuple[int, int]
 
 
-def substitution(fields: Path, room: str, size: Size, list_name: str = "pairs.json") -> Image.Image | None:
+def substitution(fields: Path, room: str, size: Size) -> Image.Image | None:
     """The room from above, and with its registered objects in color."""
-    pairs = pairs_of(fields, list_name, room)
+    return _substituted(fields, room, pairs_of(fields, "pairs.json", room), size)
+
+
+def under_trained(fields: Path, size: Size) -> Image.Image | None:
+    """The same of a room's field after 1 and 3 % of its training, beside each other; the objects are fully trained."""
+    pictures = []
+    for percent in (1, 3):
+        room = f"mix-room-after-{percent}-percent"
+        listed = pairs_of(fields, f"pairs-after-{percent}-percent.json", room)
+        pictures.append(_substituted(fields, room, [replace(pair, object=pair.instance) for pair in listed], size))
+    shown = [np.asarray(picture) for picture in pictures if picture is not None]
+    return Image.fromarray(strip(shown)) if shown else None
+
+
+def _substituted(fields: Path, room: str, pairs: Sequence[Pair], size: Size) -> Image.Image | None:
     if not pairs:
         return None
     scene = open_field(fields / f"{room}.safetensors")
@@ -144,7 +160,7 @@ def main() -> None:
         "replacement": lambda: replacement(fields, small),
         "completion": lambda: completion(fields, small),
         **{f"substitution-{room}": (lambda room=room: substitution(fields, room, size)) for room in ROOMS},
-        "under-trained": lambda: substitution(fields, "mix-room-after-1-percent", size, "pairs-after-1-percent.json"),
+        "under-trained": lambda: under_trained(fields, (width * 3 // 4, height * 3 // 4)),
     }
     arguments.output.mkdir(parents=True, exist_ok=True)
     for name, make in makers.items():

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from benchmarks.robust.cases import Pair, load_pairs
 from regnf_core import RegistrationResult, SdfField, Sim3, open_field, register
@@ -23,13 +24,15 @@ TINTS = (
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An object that was registered in a room. T_object_scene: as registered · residual: object units."""
+    """An object that was registered in a room. T_object_scene: as registered · residual: object units · points: (N, 3) of
+    its surface, object frame."""
 
     pair: Pair
     obj: SdfField
     T_object_scene: Sim3
     residual: float
     verdict: str
+    points: Tensor
 
 
 def pairs_of(fields: Path, name: str, room: str) -> list[Pair]:
@@ -42,7 +45,7 @@ def found(pair: Pair, scene: SdfField, obj: SdfField | None = None) -> Found:
     thing = obj if obj is not None else open_field(pair.folder / f"{pair.object}.safetensors")
     result: RegistrationResult = register(scene, thing, pair.detection, clouds=False)
     residual = result.metrics.get("residual_rms", 0.0) * pair.diameter
-    return Found(pair, thing, result.T_object_scene, residual, result.verdict)
+    return Found(pair, thing, result.T_object_scene, residual, result.verdict, result.object_samples.points)
 
 
 def overview(scene: SdfField, size: tuple[int, int]) -> Camera:
