@@ -159,7 +159,7 @@ def main() -> None:
     parser.add_argument("rooms", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--only", nargs="+", choices=sorted(field_sets(Path())), help="sets to make; all by default")
-    parser.add_argument("--layouts", nargs="+", help="rooms to make and to list, by the name of the layout; all by default")
+    parser.add_argument("--layouts", nargs="+", help="rooms to make and list, by the layout; all by default")
     parser.add_argument("--exact", nargs=2, type=int, metavar="CELLS", help="grids of exact distances; of `main` alone")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)

@@ -19,6 +19,7 @@ Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 _Ratio = Annotated[float, Gt(0), Le(1)]
+_Scale = Annotated[float, Ge(1e-6), Le(1e6)] | None
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,12 @@ class RobustOptions:
     box_tolerance: Annotated[float, Ge(0), Le(10)] = 1.0
     """How far the object may reach beyond each face of the detection box, as a share of the box's edge (of a fifth
     of its diagonal, where the edge is shorter). Increase it for boxes around a part of the object only."""
+    min_scale: _Scale = None
+    """Minimum scale factor of T_object_scene: object units for each scene unit. Give it, and ``max_scale``, where
+    something is known of the scale, for instance 0.97 and 1.03 where both fields are metric: more is found of what was
+    seen from one side only. null: unknown."""
+    max_scale: _Scale = None
+    """Maximum scale factor of T_object_scene; see ``min_scale``. Where both are the same number, the scale is fixed."""
     held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
     reliable and the pose less accurate."""
@@ -147,6 +154,10 @@ class RobustOptions:
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score. Increase it to list less exact symmetry equivalents too."""
+
+    def __post_init__(self) -> None:
+        if self.min_scale is not None and self.max_scale is not None and self.min_scale > self.max_scale:
+            raise ValueError(f"min_scale {self.min_scale:g} is larger than max_scale {self.max_scale:g}")
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,11 @@ def _row(name: str, option: dict[str, Any]) -> str:
 
 def _range(option: dict[str, Any]) -> str:
     if "anyOf" in option:
-        return ", ".join(json.dumps(value) for kind in option["anyOf"] for value in kind.get("enum", [None]))
+        return ", ".join(_range(kind) for kind in option["anyOf"])
+    if option.get("type") == "null":
+        return "null"
+    if "enum" in option:
+        return ", ".join(json.dumps(value) for value in option["enum"])
     low = f"{option['minimum']:g} to" if "minimum" in option else f"above {option['exclusiveMinimum']:g}, to"
     return f"{low} {option['maximum']:g}"
 

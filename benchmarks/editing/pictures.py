@@ -46,31 +46,42 @@ Size = tuple[int, int]
 
 def substitution(fields: Path, room: str, size: Size) -> Image.Image | None:
     """The room from above, and with its registered objects in color."""
-    return _substituted(fields, room, pairs_of(fields, "pairs.json", room), size)
+    shots = _substituted(fields, room, pairs_of(fields, "pairs.json", room), size)
+    return _stacked(shots) if shots else None
+
+
+def colors(fields: Path, size: Size) -> Image.Image | None:
+    """A room fitted to images as it is, and with its registered objects: all in their own colors."""
+    room = "mix-room"
+    shots = _substituted(fields, room, pairs_of(fields, "pairs.json", room), size, tinted=False)
+    return Image.fromarray(strip(_flat(shots))) if shots else None
 
 
 def under_trained(fields: Path, size: Size) -> Image.Image | None:
     """The same of a room's field after 1 and 3 % of its training, beside each other; the objects are fully trained."""
-    pictures = []
+    columns = []
     for percent in (1, 3):
         room = f"mix-room-after-{percent}-percent"
         listed = pairs_of(fields, f"pairs-after-{percent}-percent.json", room)
-        pictures.append(_substituted(fields, room, [replace(pair, object=pair.instance) for pair in listed], size))
-    shown = [np.asarray(picture) for picture in pictures if picture is not None]
-    return Image.fromarray(strip(shown)) if shown else None
+        columns.append(_substituted(fields, room, [replace(pair, object=pair.instance) for pair in listed], size))
+    rows = [_flat(list(row)) for row in zip(*columns, strict=True)]
+    return _stacked(rows) if rows else None
 
 
-def _substituted(fields: Path, room: str, pairs: Sequence[Pair], size: Size) -> Image.Image | None:
+def _substituted(
+    fields: Path, room: str, pairs: Sequence[Pair], size: Size, tinted: bool = True
+) -> list[list[np.ndarray]]:
+    """The room from above, before and after; nothing where the list of pairs is missing."""
     if not pairs:
-        return None
+        return []
     scene = open_field(fields / f"{room}.safetensors")
     things = [one for one in (found(pair, scene) for pair in pairs) if one.verdict != "rejected"]
     print(room, [(one.pair.object, one.verdict) for one in things], flush=True)
     edits = [
-        Substitution(one.obj, one.T_object_scene, one.residual, TINTS[number % len(TINTS)])
+        Substitution(one.obj, one.T_object_scene, one.residual, TINTS[number % len(TINTS)] if tinted else None)
         for number, one in enumerate(things)
     ]
-    return _stacked(_shots(scene, compose(scene, edits), [overview(scene, size)]))
+    return _shots(scene, compose(scene, edits), [overview(scene, size)])
 
 
 def completion(fields: Path, size: Size) -> Image.Image | None:
@@ -160,6 +171,7 @@ def main() -> None:
         "replacement": lambda: replacement(fields, small),
         "completion": lambda: completion(fields, small),
         **{f"substitution-{room}": (lambda room=room: substitution(fields, room, size)) for room in ROOMS},
+        "colors": lambda: colors(fields, size),
         "under-trained": lambda: under_trained(fields, (width * 3 // 4, height * 3 // 4)),
     }
     arguments.output.mkdir(parents=True, exist_ok=True)

@@ -24,8 +24,10 @@ TINTS = (
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An object that was registered in a room. T_object_scene: as registered · residual: object units · points: (N, 3) of
-    its surface, object frame."""
+    """An object that was registered in a room.
+
+    T_object_scene: as registered · residual: object units · points: (N, 3) of its surface, object frame.
+    """
 
     pair: Pair
     obj: SdfField

@@ -67,7 +67,8 @@ def _make(arguments: argparse.Namespace) -> None:
 
 def _register(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
-    way = Way(arguments.registration_seed, not arguments.without_observation, not arguments.quick)
+    observed, probe = not arguments.without_observation, not arguments.quick
+    way = Way(arguments.registration_seed, observed, probe, arguments.known_scale)
     done = 0
     with arguments.output.open("a") as file:
         for runs in _in_parallel(partial(register_world, way=way), homes, arguments.workers):
@@ -153,6 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     registering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
     registering.add_argument("--registration-seed", type=int, default=0)
     registering.add_argument("--without-observation", action="store_true")
+    registering.add_argument("--known-scale", type=float, metavar="SHARE", help="say the scale, give or take so much")
     registering.add_argument("--quick", action="store_true", help="do not look into the stages")
     gathering = commands.add_parser("evidence", help="poses with their evidence, for `train`")
     gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")

@@ -10,9 +10,10 @@ from typing import Any
 from benchmarks.robust.judging import SUCCESS, judge_error
 from benchmarks.worlds.cases import WorldCase, cases_of
 from benchmarks.worlds.stages import from_truth, recorded, stage_errors
-from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, register
+from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, Sim3, register
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.symmetry import Symmetries
+from regnf_core.options import RobustOptions
 
 Run = dict[str, Any]
 _POINTS = 600
@@ -21,11 +22,20 @@ _ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale
 
 @dataclass(frozen=True)
 class Way:
-    """How to register. observed: with what was seen of the scene · probe: look into the stages as well."""
+    """How to register. observed: with what was seen of the scene · probe: look into the stages as well ·
+    known_scale: the scale is said to lie within this share of the true one; None: nothing is said."""
 
     seed: int = 0
     observed: bool = True
     probe: bool = True
+    known_scale: float | None = None
+
+    def options(self, truth: Sim3) -> RegistrationOptions:
+        """What the registration of a case is asked with."""
+        if self.known_scale is None:
+            return RegistrationOptions(preset="robust")
+        low, high = (float(truth.scale) * (1.0 + side * self.known_scale) for side in (-1.0, 1.0))
+        return RegistrationOptions(preset="robust", robust=RobustOptions(min_scale=low, max_scale=high))
 
 
 def register_world(home: Path, way: Way) -> list[Run]:
@@ -36,8 +46,8 @@ def register_world(home: Path, way: Way) -> list[Run]:
 def _run(world_case: WorldCase, way: Way) -> Run:
     case = world_case.case
     assert case.truth is not None
-    options = RegistrationOptions(preset="robust")
-    facts: Run = {**world_case.facts, "observed": way.observed, "seed": way.seed}
+    options = way.options(case.truth)
+    facts: Run = {**world_case.facts, "observed": way.observed, "seed": way.seed, "known_scale": way.known_scale}
     with recorded() as kept:
         begun = time.process_time()
         try:

@@ -19,9 +19,8 @@ from regnf_core.robust.constants import LIBRARY
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.signature import signature
 from regnf_core.robust.pipeline import geometric_seeds, refine_poses, search_poses
-from regnf_core.robust.problem import RegistrationProblem, make_problem
+from regnf_core.robust.problem import RegistrationProblem, make_problem, pose_bound
 from regnf_core.robust.scene.scene_view import SceneView
-from regnf_core.robust.search.detection_bound import DetectionBound
 from regnf_core.robust.search.rotations import start_rotations
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
 
@@ -72,9 +71,8 @@ def match_coarsely(query: LibraryQuery, models: Sequence[ObjectModel], nearest: 
     found = []
     for number in nearest[: LIBRARY.shortlist]:
         generator = torch.Generator().manual_seed(query.seed)
-        seeds = geometric_seeds(query.view, models[number], rotations)
-        tolerance = query.options.robust.box_tolerance
-        bound = DetectionBound.of(query.view.detection, models[number].extremal_points, tolerance)
+        bound = pose_bound(query.view, models[number], query.options.robust)
+        seeds = geometric_seeds(query.view, models[number], rotations, bound.scale)
         candidates = search_poses(query.view, models[number], seeds, generator, bound, LIBRARY.stages)
         found.append(CoarseMatch(number, float(candidates.scores[0]), candidates.T))
     return sorted(found, key=lambda one: one.score)

@@ -28,9 +28,10 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.report import result_of
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
-from regnf_core.robust.search.detection_bound import DetectionBound
 from regnf_core.robust.search.features import feature_seeds
+from regnf_core.robust.search.pose_bound import PoseBound
 from regnf_core.robust.search.rotations import start_rotations
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 from regnf_core.robust.search.seeds import seed_poses, seed_poses_around
 from regnf_core.robust.stage import Stage
 from regnf_core.robust.verdict.evaluation import Evaluation, evaluate_candidates
@@ -93,17 +94,20 @@ def search_poses(
     model: ObjectModel,
     seeds: Sim3,
     generator: torch.Generator,
-    bound: DetectionBound,
+    bound: PoseBound,
     stages: Sequence[Stage] = SEARCH.stages,
 ) -> PoseCandidates:
     """The best poses that the seeds (H,) lead to, best first, from the samples alone: no field is evaluated.
 
-    bound: what the detection says of a pose.
+    bound: what is known of a pose.
     """
+    seeds = bound.scale.limited_poses(seeds)
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
     grids = SurfacePair(view.distance_grid, model.distance_grid, view.foreground, model.samples)
-    context = RefinementContext(model.extremal_points, generator, admits=bound.admits, penalty=bound.penalty)
+    context = RefinementContext(
+        model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
+    )
     return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
 
 
@@ -118,9 +122,10 @@ def refine_poses(
     points = problem.model.extremal_points
     bound, max_offset = problem.bound, problem.view.max_offset
     context = RefinementContext(
-        points, generator, max_offset=max_offset, on_step=on_step, admits=bound.admits, penalty=bound.penalty
+        points, generator, bound.scale, max_offset, on_step=on_step, admits=bound.admits, penalty=bound.penalty
     )
-    found = coarse_to_fine(problem.fit, PoseCandidates.start(T, with_offsets=True), REFINEMENT.stages, context)
+    start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
+    found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
     origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
     joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
@@ -136,7 +141,7 @@ def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim
     return equivalents[nearest > REFINEMENT.same_pose]
 
 
-def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor) -> Sim3:
+def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
     """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
     box = view.detection
     return seed_poses(
@@ -146,6 +151,7 @@ def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor) -> S
         box.size / box.diagonal,
         rotations,
         torch.tensor(SEARCH.scale_factors),
+        scale,
     )
 
 
@@ -189,7 +195,7 @@ def _starts(
     if T_start is not None:
         start = problem.in_working_frames(T_start)
         yield _Start(seed_poses_around(start, generator), start.expand(1))
-    seeds = geometric_seeds(view, model, start_rotations(options))
+    seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
     yield _Start(seeds, seeds[:0])
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)

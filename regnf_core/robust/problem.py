@@ -13,7 +13,8 @@ from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.samples import split
 from regnf_core.robust.scene.scene_view import SceneView
-from regnf_core.robust.search.detection_bound import DetectionBound
+from regnf_core.robust.search.pose_bound import PoseBound
+from regnf_core.robust.search.scale_bound import ScaleBound
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,14 +22,14 @@ class RegistrationProblem:
     """A detection and an object. Poses T (H,) map the scene's working frame to the object's.
 
     fit: what poses are refined on · held_out: the same fields with other samples, for the verdict alone · bound: what
-    the detection says of a pose.
+    is known of a pose.
     """
 
     view: SceneView
     model: ObjectModel
     fit: SurfacePair
     held_out: SurfacePair
-    bound: DetectionBound
+    bound: PoseBound
 
     def in_field_frames(self, T_work: Sim3) -> Sim3:
         """A single pose between the working frames as T_object_scene."""
@@ -53,5 +54,10 @@ def make_problem(
     scene_field, object_field = view.field(scene), model.field(obj)
     fit = SurfacePair(scene_field, object_field, A, B)
     held_out = SurfacePair(scene_field, object_field, A_held, B_held)
-    bound = DetectionBound.of(view.detection, model.extremal_points, options.box_tolerance)
-    return RegistrationProblem(view, model, fit, held_out, bound)
+    return RegistrationProblem(view, model, fit, held_out, pose_bound(view, model, options))
+
+
+def pose_bound(view: SceneView, model: ObjectModel, options: RobustOptions) -> PoseBound:
+    """What the detection and the options say of poses between the working frames."""
+    scale = ScaleBound.of(options, view.frame.length, model.frame.length)
+    return PoseBound.of(view.detection, model.extremal_points, options.box_tolerance, scale)

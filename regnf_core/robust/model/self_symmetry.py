@@ -18,6 +18,7 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import DistanceModel, SurfacePair, residuals
 from regnf_core.robust.samples import Samples, subsample
 from regnf_core.robust.search.rotations import turns_about
+from regnf_core.robust.search.scale_bound import SAME_SCALE
 
 _SCORE_WIDTH = MODEL.stages[-1].score_width
 
@@ -55,7 +56,7 @@ def propose_symmetries(
     """
     few = subsample(B, MODEL.points, generator)
     itself = SurfacePair(obj, obj, few, few)
-    context = RefinementContext(extremal_points, generator, fix_scale=True)
+    context = RefinementContext(extremal_points, generator, SAME_SCALE)
     found = coarse_to_fine(itself, PoseCandidates.start(_rigid(rotations)), MODEL.stages, context)
     max_score = _score_of_identity(itself) + MODEL.max_score_above_identity
     found = found[found.scores <= max_score]
@@ -77,7 +78,7 @@ def confirm_symmetries(
     if len(proposed.T) == 0:
         return proposed
     few = subsample(B, MODEL.confirming_points, generator)
-    settings = Settings(fix_scale=True)
+    settings = Settings(scale=SAME_SCALE)
     refined = minimize(SurfacePair(obj, obj, few, few), proposed.T, MODEL.confirming_widths, settings)
     deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1)
     kept = _distinct_symmetries(refined.T, deviation, extremal_points)

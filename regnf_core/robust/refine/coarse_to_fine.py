@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from regnf_core.robust.refine.levenberg_marquardt import Iteration, Settings, mi
 from regnf_core.robust.refine.loss import disagreement
 from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
 from regnf_core.robust.residuals import SurfacePair, residuals
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 from regnf_core.robust.stage import Stage
 
 
@@ -23,14 +24,14 @@ class RefinementContext:
     """What all stages share.
 
     extremal_points: (E, 3) of the object, by which two poses are compared · generator: draws each stage's samples ·
-    fix_scale: poses keep their scale · max_offset: of the surfaces, object diameters · on_step: called once an
+    scale: what it may be, and is at the start · max_offset: of the surfaces, object diameters · on_step: called once an
     iteration · admits: which poses (H,) may go on, (H,) bool; where it admits none, all may · penalty: (H,) what is
     added to the scores of poses (H,).
     """
 
     extremal_points: Tensor
     generator: torch.Generator
-    fix_scale: bool = False
+    scale: ScaleBound = ANY_SCALE
     max_offset: float = REFINEMENT.max_offset
     on_step: Callable[[], None] = lambda: None
     admits: Callable[[Sim3], Tensor] = lambda T: torch.ones_like(T.scale, dtype=torch.bool)
@@ -44,6 +45,7 @@ def coarse_to_fine(
     for stage in stages:
         if stage.copies:
             candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
+            candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
         few = surfaces.subsample(stage.points, context.generator)
         numbers = torch.arange(len(candidates))
         parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
@@ -70,7 +72,7 @@ def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context:
         history.append(Step(done.T, done.costs, size[:, :n].mean(1), size[:, n:].mean(1), done.width, stage.points))
         context.on_step()
 
-    settings = Settings(stage.widest, context.fix_scale, context.max_offset)
+    settings = Settings(stage.widest, context.scale, context.max_offset)
     refined = minimize(few, candidates.T, stage.widths, settings, candidates.offsets, record)
     scores = disagreement(refined.residuals, stage.score_width) + context.penalty(refined.T)
     return PoseCandidates(refined.T, scores, refined.residuals.offset, tuple(history))

@@ -12,6 +12,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.refine.loss import adaptive_width, normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 
 
 @dataclass(frozen=True)
@@ -19,12 +20,12 @@ class Settings:
     """What may move, and how the kernel widths are meant.
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
-    are · fix_scale: poses keep their scale · max_offset: of the surfaces, either way, object diameters; 0: the offset
-    stays as it is.
+    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters; 0: the
+    offset stays as it is.
     """
 
     widest: float = 0.0
-    fix_scale: bool = False
+    scale: ScaleBound = ANY_SCALE
     max_offset: float = REFINEMENT.max_offset
 
 
@@ -69,7 +70,7 @@ def minimize(
     width: Tensor | float = widths[-1]
     for lowest in widths:
         width = adaptive_width(now, lowest, settings.widest) if settings.widest else lowest
-        step = _step(now, width, damping, settings)
+        step = _step(now, width, damping, T.scale, settings)
         T_tried = T.perturb(step[:, :7])
         tried = residuals(surfaces, T_tried, _moved_offset(now, step, settings))
         better = robust_cost(tried, width) < robust_cost(now, width)
@@ -91,15 +92,26 @@ def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
     return torch.where(better, less, more).clamp(*REFINEMENT.damping_range)
 
 
-def _step(r: Residuals, width: Tensor | float, damping: Tensor, settings: Settings) -> Tensor:
+def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, settings: Settings) -> Tensor:
     """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset)."""
     H, b = normal_equations(r, width)
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest
-    fixed = torch.tensor([False] * 6 + [settings.fix_scale, settings.max_offset == 0.0])[: H.shape[-1]]
+    fixed = torch.tensor([False] * 7 + [settings.max_offset == 0.0])[: H.shape[-1]]
     extra = extra + REFINEMENT.fixed_damping * fixed.double()
-    step = -torch.linalg.solve(H + torch.diag_embed(extra), b)
+    step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings.scale)
     longest = step.abs().amax(-1, keepdim=True)
     limited: Tensor = step * (REFINEMENT.max_step / longest.clamp_min(REFINEMENT.max_step))
     return limited
+
+
+def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound) -> Tensor:
+    """(H, K) x with A x = b; where the scale (H,) would leave the bound, it goes up to it and the others follow."""
+    step: Tensor = torch.linalg.solve(A, b)
+    if bound.is_open:
+        return step
+    growth = bound.limited_growth(scale, step[:, 6])
+    held, known = A.clone(), b.clone()
+    held[:, 6], held[:, 6, 6], known[:, 6] = 0.0, 1.0, growth
+    return torch.where((growth != step[:, 6])[:, None], torch.linalg.solve(held, known), step)

@@ -12,27 +12,34 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 
 _POINTS_AT_ONCE = 4 * 2**20
 """Turned points: bounds memory, at about 200 MB. The default options stay far below."""
 
 
 def seed_poses(
-    scene_points: Tensor, object_points: Tensor, box_axes: Tensor, box_size: Tensor, rotations: Tensor, scales: Tensor
+    scene_points: Tensor,
+    object_points: Tensor,
+    box_axes: Tensor,
+    box_size: Tensor,
+    rotations: Tensor,
+    scales: Tensor,
+    bound: ScaleBound = ANY_SCALE,
 ) -> Sim3:
     """Poses T_object_scene (H,), working frames, float64: every rotation (K, 3, 3) with every way to scale and move.
 
     scene_points (N, 3): what may be the object, the box's center at 0 · box_axes (3, 3): columns, scene frame ·
-    box_size (3,): full edges · scales: factors (L,) tried about the ratio of the radii.
+    box_size (3,): full edges · scales: factors (L,) tried about the ratio of the radii · bound: of the scale.
     """
     scene_points, object_points = scene_points.double(), object_points.double()
-    by_moments = _from_moments(scene_points, object_points, rotations, scales)
+    by_moments = _from_moments(scene_points, object_points, rotations, scales, bound)
     local = scene_points @ box_axes
     lowest, highest = _extremes(local[None])
     low, high = _object_extents(object_points, rotations, box_axes)
     by_points = _from_extents(rotations, box_axes, (low, high), (lowest, highest))
     by_box = _from_extents(rotations, box_axes, (low, high), (-box_size[None] / 2, box_size[None] / 2))
-    return Sim3.cat([by_moments, by_points, by_box])
+    return Sim3.cat([by_moments, bound.limited_poses(by_points), bound.limited_poses(by_box)])
 
 
 def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:
@@ -46,11 +53,15 @@ def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:
     return T_start.expand(count + 1).perturb(steps)
 
 
-def _from_moments(scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor) -> Sim3:
+def _from_moments(
+    scene_points: Tensor, object_points: Tensor, rotations: Tensor, scales: Tensor, bound: ScaleBound
+) -> Sim3:
     scene_center, object_center = scene_points.mean(0), object_points.mean(0)
     ratio = _radius(object_points, object_center) / _radius(scene_points, scene_center)
-    s = (ratio * scales.double())[:, None].expand(-1, rotations.shape[0]).reshape(-1)
-    R = rotations.repeat(scales.shape[0], 1, 1)
+    tried = bound.limited(ratio * scales.double())
+    tried = tried if bound.is_open else torch.tensor(sorted(set(tried.tolist())), dtype=tried.dtype)
+    s = tried[:, None].expand(-1, rotations.shape[0]).reshape(-1)
+    R = rotations.repeat(len(tried), 1, 1)
     return Sim3(s, R, object_center - s[:, None] * (R @ scene_center))
 
 

@@ -9,6 +9,7 @@ such a function on the minimum: B K B^T with B = (J^T W' J)^-1 J^T W, averaged b
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -121,6 +122,19 @@ def _likely_variances(inliers: _Inliers) -> Tensor:
     likelihood: Tensor = -0.5 * (freedom * variance.log() + determinant)
     likely = torch.softmax(likelihood.flatten(), 0).reshape(variance.shape)
     return variance * likely
+
+
+def with_known_scale(cov: Tensor, log_width: float) -> Tensor:
+    """The covariance (7, 7) where the log scale is known to lie in an interval of this width; infinite: it is not.
+
+    What is known counts as a measurement with the interval's variance: exact for a fixed scale, and a wide interval
+    changes little.
+    """
+    if math.isinf(log_width):
+        return cov
+    column, variance = cov[:, 6:], (log_width / 2.0) ** 2 / 3.0 + _TINY**2
+    known: Tensor = cov - column @ column.mT / (column[6] + variance)
+    return known
 
 
 def in_object_units(cov: Tensor, T_work: Sim3, scene: WorkingFrame, obj: WorkingFrame) -> Tensor:

@@ -17,7 +17,7 @@ from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.considered import considered_poses
-from regnf_core.robust.verdict.covariance import covariance, in_object_units
+from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_known_scale
 from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
 from regnf_core.robust.verdict.evidence import gather_evidence
 from regnf_core.robust.verdict.lead import apart
@@ -135,4 +135,5 @@ def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Ten
     places = torch.cat([T.apply(A.points.double()), B.points.double()])
     last = REFINEMENT.last_stages[-1]
     cov = covariance(r, adaptive_width(r, last.widths[-1], last.widest), places)
+    cov = with_known_scale(cov, problem.bound.scale.log_width)
     return in_object_units(cov, T, problem.view.frame, problem.model.frame)

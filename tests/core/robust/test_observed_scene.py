@@ -47,7 +47,8 @@ def test_an_invented_part_hinders_only_those_who_believe_it() -> None:
     assert placement_error(result, chair_pose() @ T.inverse()) < 0.01
     assert 0.2 < result.metrics["occluded_share_object"] < 0.7
     assert believed.metrics["verdict_margin"] < 0.1
-    assert believed.metrics["probability"] < result.metrics["probability"]
+    assert believed.metrics["explained_share_scene"] < 0.6
+    assert result.metrics["explained_share_scene"] > 0.9
 
 
 def test_matter_that_was_seen_tells_a_look_alike() -> None:

@@ -3,6 +3,8 @@
 import { el } from './dom.js';
 
 const NUMBERS = [
+  ['min_scale', 'Least scale, object units for each scene unit, if known', null, 1e-6, 1e6],
+  ['max_scale', 'Largest scale, if known', null, 1e-6, 1e6],
   ['rotations', 'Rotations to start from', 600, 24, 20000],
   ['box_tolerance', 'How far the object may reach beyond the box, of its edge', 1, 0, 10],
   ['inlier_distance', 'Largest residual of an inlier, diameters', 0.015, 0.0001, 0.2],
@@ -19,7 +21,7 @@ export class OptionsForm {
     this.seed = el('input', { type: 'number', min: 0, max: 2 ** 32 - 1, step: 1, value: String(seed) });
     this.numbers = NUMBERS.map(([name, , usual, low, high]) => {
       const value = given.robust?.[name] ?? usual;
-      return [name, usual, el('input', { type: 'number', min: low, max: high, step: 'any', value: String(value) })];
+      return [name, usual, el('input', { type: 'number', min: low, max: high, step: 'any', value: String(value ?? '') })];
     });
     const rows = [['Preset', this.preset], ['The object', this.upright], ['Seed', this.seed]];
     const all = [...rows, ...this.numbers.map(([, , node], i) => [NUMBERS[i][1], node])];

@@ -1,8 +1,9 @@
-"""What a detection says of a pose: the object stands within the box, give or take, and is not far smaller than it."""
+"""What is known of a pose: the object stands within the box, give or take, is not far smaller than it, and its scale is
+within the caller's bounds."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,27 +12,32 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
 from regnf_core.robust.kernel import geman_mcclure_loss
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 
 
 @dataclass(frozen=True, eq=False)
-class DetectionBound:
-    """Bounds the extent of the posed object by the detection box. Working frames: the box's center is 0.
+class PoseBound:
+    """Bounds the extent of the posed object by the detection box, and its scale. Working frames: the box's center is 0.
 
     points: (E, 3) outermost points of the object · axes: (3, 3) the box's, columns, scene frame · edges: (3,) of the
     box · tolerance: how far the object may reach beyond each of the box's faces, as a share of the edge. The edges of
-    flat boxes count as SEARCH.min_face_distance there: a flat thing's field may be much thicker than its box.
+    flat boxes count as SEARCH.min_face_distance there: a flat thing's field may be much thicker than its box ·
+    scale: what the caller knows of it.
     """
 
     points: Tensor
     axes: Tensor
     edges: Tensor
     tolerance: float
+    scale: ScaleBound = ANY_SCALE
 
     @classmethod
-    def of(cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float) -> DetectionBound:
+    def of(
+        cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float, scale: ScaleBound = ANY_SCALE
+    ) -> PoseBound:
         """The bound for an object with these ``extremal_points`` (E, 3)."""
         edges = detection.size / detection.diagonal
-        return cls(extremal_points.double(), detection.rotation.double(), edges.double(), tolerance)
+        return cls(extremal_points.double(), detection.rotation.double(), edges.double(), tolerance, scale)
 
     def admits(self, T: Sim3) -> Tensor:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""
@@ -54,6 +60,6 @@ class DetectionBound:
         """(3,): what distances from the faces are compared with."""
         return self.edges.clamp_min(SEARCH.min_face_distance)
 
-    def loosened(self, factor: float) -> DetectionBound:
+    def loosened(self, factor: float) -> PoseBound:
         """The bound with ``factor`` times the tolerance."""
-        return DetectionBound(self.points, self.axes, self.edges, factor * self.tolerance)
+        return replace(self, tolerance=factor * self.tolerance)

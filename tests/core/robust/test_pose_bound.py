@@ -12,7 +12,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.robust.constants import SEARCH
-from regnf_core.robust.search.detection_bound import DetectionBound
+from regnf_core.robust.search.pose_bound import PoseBound
 from tests.core.robust.shapes import random_pose, reframed
 
 CORNERS = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)
@@ -20,10 +20,10 @@ EDGE = 1.0 / math.sqrt(3.0)
 """Of the box, in the scene's working frame."""
 
 
-def bound(tolerance: float, rotation: torch.Tensor | None = None) -> DetectionBound:
+def bound(tolerance: float, rotation: torch.Tensor | None = None) -> PoseBound:
     turn = torch.eye(3, dtype=torch.float64) if rotation is None else rotation
     box = OrientedBox(torch.tensor([5.0, 6.0, 7.0]), torch.tensor([2.0, 2.0, 2.0]), turn)
-    return DetectionBound.of(box, CORNERS, tolerance)
+    return PoseBound.of(box, CORNERS, tolerance)
 
 
 def placed(edge: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Sim3:
@@ -97,4 +97,4 @@ def test_a_flat_boxs_thickness_is_compared_with_more_than_itself() -> None:
         torch.tensor([math.hypot(1.0, 1.0, 0.02)]).double(), torch.eye(3)[None].double(), torch.zeros(1, 3).double()
     )
     twice = Sim3(true.scale / 2.2, true.rotation, true.translation)
-    assert DetectionBound.of(box, thick, 0.5).admits(Sim3.cat([true, twice])).tolist() == [True, False]
+    assert PoseBound.of(box, thick, 0.5).admits(Sim3.cat([true, twice])).tolist() == [True, False]
