@@ -225,8 +225,6 @@ class SearchConstants:
 
     scale_factors: tuple[float, ...] = (0.85, 1.0, 1.18)
     """Factors about the ratio of the radii: clutter and missing parts change it. About equal steps. [by hand]"""
-    known_scale: float = 0.05
-    """Scales that differ by less than this share count as one that is known. [derived: the error of a right pose]"""
     rotations_per_turn: int = 10
     """Rotations of the full search for each turn about a given up axis. [by hand]"""
     min_rotations: int = 24

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
-from regnf_core.robust.constants import SEARCH
 
 
 @dataclass(frozen=True)
@@ -31,11 +30,6 @@ class ScaleBound:
     def is_open(self) -> bool:
         """Whether every scale is allowed."""
         return self.low == 0.0 and self.high == math.inf
-
-    @property
-    def is_known(self) -> bool:
-        """Whether all scales that are allowed are the same, as far as poses are told apart."""
-        return self.high <= (1.0 + SEARCH.known_scale) * self.low
 
     @property
     def log_width(self) -> float:

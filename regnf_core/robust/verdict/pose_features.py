@@ -133,8 +133,7 @@ def _spread(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
 
 def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups) -> Tensor:
     """(H, 2): the two least root mean square residuals of the surfaces that agree when the object's surface moves by a
-    root mean square of 1, over all similarity motions, rigid ones where the scale is known. 0: the agreement leaves a
-    motion free."""
+    root mean square of 1, over all similarity motions. 0: the agreement leaves a motion free."""
     m = r.values.shape[1] - r.scene_count
     weights = torch.cat(
         [groups.scene_agrees / groups.near.sum(1, keepdim=True).clamp_min(1), groups.object_agrees / m], 1
@@ -144,9 +143,7 @@ def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Gro
     points = problem.held_out.object_samples.points.double()
     motion = torch.cat([_cross_matrix(points).mT, torch.eye(3).double().expand(m, 3, 3), points[..., None]], -1)
     G = (motion.mT @ motion).mean(0)
-    if problem.bound.scale.is_known:
-        H, G = H[:, :6, :6], G[:6, :6]
-    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(len(G)).double()))
+    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(7).double()))
     least: Tensor = torch.linalg.eigvalsh(inverse @ H @ inverse.mT)[:, :2]
     return least.clamp_min(0.0).sqrt()
 

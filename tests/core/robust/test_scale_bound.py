@@ -14,7 +14,7 @@ from regnf_core.registration import register
 from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.robust.search.scale_bound import ANY_SCALE, SAME_SCALE, ScaleBound
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
 from regnf_core.robust.search.seeds import seed_poses
 from regnf_core.robust.verdict.covariance import with_known_scale
 from tests.core.analytic import chair
@@ -36,21 +36,6 @@ def test_the_options_are_in_the_fields_units() -> None:
     assert ScaleBound.of(RobustOptions(), 3.0, 2.0) == ANY_SCALE
     assert ScaleBound.of(RobustOptions(min_scale=0.5), 3.0, 2.0) == ScaleBound(0.75, math.inf)
     assert ScaleBound.of(RobustOptions(max_scale=4.0), 3.0, 2.0) == ScaleBound(0.0, 6.0)
-
-
-@pytest.mark.parametrize(
-    ("bound", "is_open", "is_known"),
-    [
-        (ANY_SCALE, True, False),
-        (SAME_SCALE, False, True),
-        (ScaleBound(2.0, 2.09), False, True),
-        (ScaleBound(2.0, 2.11), False, False),
-        (ScaleBound(0.0, 2.0), False, False),
-        (ScaleBound(2.0, math.inf), False, False),
-    ],
-)
-def test_what_is_known(bound: ScaleBound, is_open: bool, is_known: bool) -> None:
-    assert (bound.is_open, bound.is_known) == (is_open, is_known)
 
 
 def test_changes_end_at_the_bound() -> None:
