@@ -121,6 +121,22 @@ def test_the_request_is_one_that_the_contract_takes(monkeypatch: pytest.MonkeyPa
     assert request["detection"]["size"] == [0.5, 0.6, 0.7]
 
 
+def test_objects_in_meters_bound_the_scale(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": np.eye(4)[:3].tolist(), "scale": 0.25}))
+    answers = Answers(result())
+    make_node(monkeypatch, answers, dataparser_transforms=str(file), scale_tolerance="0.03").answer(detections())
+    make_node(monkeypatch, answers, scale_tolerance="0").answer(detections())
+    quarter, metric = (request["options"]["robust"] for request in answers.requests)
+    assert quarter == pytest.approx({"min_scale": 3.88, "max_scale": 4.12}), (
+        "an object's meters for each of the field's units"
+    )
+    assert metric == {"min_scale": 1.0, "max_scale": 1.0}
+    for wrong in ("-0.1", "1", "nan", "little"):
+        with pytest.raises(ValueError, match=r"scale_tolerance|could not convert"):
+            make_node(monkeypatch, answers, scale_tolerance=wrong)
+
+
 def test_a_field_in_its_trainers_frame_gives_poses_in_meters(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     parser = {"transform": [[0.0, -1.0, 0.0, 0.3], [1.0, 0.0, 0.0, 0.1], [0.0, 0.0, 1.0, -0.2]], "scale": 0.25}
     file = tmp_path / "dataparser_transforms.json"

@@ -13,6 +13,7 @@ ARGUMENTS = {
     "objects": ("", "CLASS=SHA256 of each object, separated by blanks."),
     "map_frame": ("map", "The fixed frame that the room's field is in."),
     "dataparser_transforms": ("", "dataparser_transforms.json, if the room's field is in its trainer's frame."),
+    "scale_tolerance": ("", "The objects' fields are in meters, give or take this share: 0.03 for instance."),
     "up_axis": ("", "x, y or z: the vertical axis of room and objects, if it is known."),
 }
 

@@ -13,11 +13,11 @@ from rclpy.time import Time
 from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
-from regnf_ros.objects import Found, Registrar, objects_of
+from regnf_ros.objects import Found, Registrar, objects_of, options_of
 from regnf_ros.poses import Box, ObjectPose, field_from_map, quaternion_xyzw, rigid
 from regnf_ros.service import Service, ServiceError
 
-TEXTS = ("server", "token", "scene", "objects", "map_frame", "dataparser_transforms", "up_axis")
+TEXTS = ("server", "token", "scene", "objects", "map_frame", "dataparser_transforms", "up_axis", "scale_tolerance")
 DEFAULTS = {"server": "http://127.0.0.1:8080", "map_frame": "map"}
 WAITING = 16
 """Arrays of detections that may wait for the service; later ones are dropped, which is said in the log."""
@@ -30,12 +30,13 @@ class RegisterObjects(Node):
         super().__init__("regnf")
         said = {name: self.declare_parameter(name, DEFAULTS.get(name, "")).value for name in TEXTS}
         self.map_frame = said["map_frame"]
+        T_field_map = field_from_map(said["dataparser_transforms"])
         self.registrar = Registrar(
             Service(said["server"], said["token"]),
             said["scene"],
             objects_of(said["objects"]),
-            field_from_map(said["dataparser_transforms"]),
-            said["up_axis"],
+            T_field_map,
+            options_of(said["up_axis"], said["scale_tolerance"], T_field_map),
         )
         self.transforms = Buffer()
         self.listener = TransformListener(self.transforms, self)

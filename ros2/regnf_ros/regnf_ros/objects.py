@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from regnf_ros.poses import Box, Matrix, ObjectPose, object_pose
+from regnf_ros.poses import Box, Matrix, ObjectPose, object_pose, scale_of
 from regnf_ros.service import Request, Service
 
 
@@ -36,17 +36,30 @@ def objects_of(text: str) -> dict[str, str]:
     return table
 
 
+def options_of(up_axis: str, scale_tolerance: str, T_field_map: Matrix) -> dict[str, Any]:
+    """The options of every registration. scale_tolerance: by what share the objects' units may differ from meters; "":
+    they are not known. Raises ValueError for one that is no share."""
+    options: dict[str, Any] = {"up_axis": up_axis} if up_axis else {}
+    if scale_tolerance:
+        share = float(scale_tolerance)
+        if not 0.0 <= share < 1.0:
+            raise ValueError(f"scale_tolerance: {scale_tolerance!r} is not at least 0 and less than 1")
+        metric = 1.0 / scale_of(T_field_map)
+        options["robust"] = {"min_scale": (1.0 - share) * metric, "max_scale": (1.0 + share) * metric}
+    return options
+
+
 class Registrar:
     """Registers boxes of the map frame against one scene."""
 
     def __init__(
-        self, service: Service, scene: str, objects: dict[str, str], T_field_map: Matrix, up_axis: str
+        self, service: Service, scene: str, objects: dict[str, str], T_field_map: Matrix, options: dict[str, Any]
     ) -> None:
         self._service = service
         self._scene = scene
         self._objects = objects
         self._T_field_map = T_field_map
-        self._options = {"up_axis": up_axis} if up_axis else {}
+        self._options = options
 
     def knows(self, class_id: str) -> bool:
         return class_id in self._objects
