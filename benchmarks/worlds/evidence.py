@@ -1,7 +1,8 @@
 """Poses with what the held-out samples tell of them, and whether they are right: what the verdict's model learns from.
 
 For every case of a world: the poses that a registration chose among, the best pose that a refinement from the truth
-leads to, and, for another object registered in the same box, the poses that it chose among, which are all wrong.
+leads to, and, for two other objects registered in the same box, the poses that they chose among, which are all wrong:
+one of another world, and a look-alike of the right one.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from benchmarks.worlds.cases import WorldCase, cases_of
+from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.stages import NearestTruth, Recording, recorded
 from regnf_core import RegistrationOptions, RegnfError, Sim3, register
 from regnf_core.geometry.points import NearestNeighbors, diameter
@@ -48,6 +51,8 @@ def evidence_of_world(home: Path, known: Sequence[Path], observed: bool, limit: 
         other = _another(case, others, draw)
         if other is not None:
             rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
+        alike = look_alike(home, case, np.random.default_rng(draw.getrandbits(32)))
+        rows += [{**facts, "model": LOOK_ALIKE, **row} for row in _rows(case, alike)]
     return rows
 
 
@@ -71,7 +76,8 @@ def _rows(known: WorldCase, asked: WorldCase) -> Iterator[Row]:
             result = register(known.case.scene, asked.case.obj, known.case.detection, _OPTIONS, clouds=False)
         except RegnfError:
             return
-    if kept.problem is None or (asked is not known and _same_shape(known, asked, result.T_object_scene)):
+    other = asked is not known and asked.facts["object"] != LOOK_ALIKE
+    if kept.problem is None or (other and _same_shape(known, asked, result.T_object_scene)):
         return
     last = min(range(len(kept.evaluations)), key=lambda number: kept.evaluations[number].rank)
     for number, candidates in enumerate(kept.refined):

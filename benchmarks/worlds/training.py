@@ -4,6 +4,9 @@ Logistic regression on monotone ramps: each feature's range is cut at quantiles,
 is at least 0, so the sum is monotone in every feature. Worlds are left out in turn to see what the model says of rooms
 that it does not know; what it says of them is then made right on average (Platt's scaling on the left-out logits).
 
+Look-alikes are measured, not trained with: in a noisy map the right object cannot be told from one that differs by a
+part, so how probable it is would be a matter of how many such objects the training has.
+
 This is done twice: with the features of each pose alone, and with one more, the lead that these left-out log odds give
 a pose over the other answers among the same candidates.
 """
@@ -19,7 +22,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.robust.judging import SUCCESS
-from benchmarks.worlds.calibration import calibration_table
+from benchmarks.worlds.calibration import calibration_table, look_alike_line
+from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG
@@ -100,7 +104,8 @@ class Ramps:
 def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
     """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
     the probabilities hold in worlds that were left out."""
-    counts = np.array([not _told_apart_by_rivals(row) for row in rows])
+    alike = np.array([row["model"] == LOOK_ALIKE for row in rows])
+    counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
     evidence = Evidence(
         tuple(SPEAKS_FOR),
         np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows]),
@@ -112,6 +117,7 @@ def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
     found = np.array([row["found"] for row in rows])
     among, left_out = train(evidence.with_feature(LEAD, _leads(rows, odds), found))
     table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], left_out[counts])
+    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], left_out[alike])
     return {"alone": alone.to_dict(), "among": among.to_dict()}, table
 
 

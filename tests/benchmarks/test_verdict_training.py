@@ -10,6 +10,7 @@ import torch
 from scipy.stats import spearmanr
 
 from benchmarks.worlds.calibration import auroc, calibration_table
+from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.training import Evidence, train, trained
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
@@ -56,6 +57,7 @@ def test_ambiguity_is_no_error_of_the_probability() -> None:
     rows = [
         {
             "features": dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3)),
+            "model": "chair",
             "mssd": 0.01 if number % 3 else 0.6,
             "listed_mssd": 0.01,
             "winner": True,
@@ -82,6 +84,7 @@ def test_a_lead_over_other_answers_counts() -> None:
             rows.append(
                 {
                     "features": dict.fromkeys(NAMES, 0.5) | {"confirmed": confirmed},
+                    "model": "chair",
                     "mssd": 0.01 if ahead and step == 1 else 0.6,
                     "listed_mssd": 0.01 if ahead and step == 1 else 0.6,
                     "winner": step == 1,
@@ -94,6 +97,28 @@ def test_a_lead_over_other_answers_counts() -> None:
     assert LEAD in models["among"]["terms"]
     assert LEAD not in models["alone"]["terms"]
     assert float(table.split("AUROC ")[1].split(",")[0]) > 0.95
+
+
+def test_look_alikes_are_told_apart_in_the_table_alone() -> None:
+    rows = [
+        {
+            "features": dict.fromkeys(NAMES, 0.5) | {"confirmed": 0.9 if number % 2 else 0.2},
+            "model": "chair",
+            "mssd": 0.01 if number % 2 else 0.6,
+            "listed_mssd": 0.01 if number % 2 else 0.6,
+            "winner": True,
+            "found": True,
+            "others": [],
+            "world": f"tsdf-{number % 5}-long",
+        }
+        for number in range(100)
+    ]
+    alike = [{**row, "model": LOOK_ALIKE, "mssd": 9.0, "listed_mssd": 9.0} for row in rows[1::2]]
+    models, table = trained(rows)
+    with_alike, longer = trained([*rows, *alike])
+    assert with_alike == models
+    assert longer.startswith(table)
+    assert "accepted of 50: 50 at 0.8" in longer
 
 
 def test_the_table_counts_what_was_chosen() -> None:

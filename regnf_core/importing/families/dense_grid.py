@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, require_shape, tensor_error
+from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.voxel_maps import filled_nodes, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
@@ -53,8 +54,12 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     }
     nodes = " x ".join(map(str, values.shape))
     why: tuple[str, ...] = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
+    if weights is not None:
+        tensors["values"] = bounded = np.array(values, np.float32)
+        if bound_by_surface(bounded[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing):
+            why = (*why, PROJECTIVE)
     if weights is not None and not weights.all():
-        tensors["values"] = filled_nodes(values, weights > 0, spacing, overrides.sign or 1)
+        tensors["values"] = filled_nodes(bounded, weights > 0, spacing, overrides.sign or 1)
         why = (*why, f"{100.0 * float((weights > 0).mean()):.3g} % of the nodes were seen, the rest is free space")
     return ConvertedField(FAMILY, why, description, tensors, sign_is_open=True)
 

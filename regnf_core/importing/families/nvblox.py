@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
+from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface
 from regnf_core.importing.containers.sqlite_source import TableSource
 from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray, fill_unseen, seen_extent, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
@@ -36,6 +37,7 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
     voxel_size = _block_size(tables, layer) / _EDGE
     blocks, values, weights = _read(tables, layer, tensor_bytes)
     seen: BoolArray = weights > 0
+    projective = bound_by_surface(values, seen, blocks, voxel_size)
     fill_unseen(values, seen, voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks, seen)
     middle = voxel_size / 2.0
@@ -46,10 +48,12 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
         "voxel_size": voxel_size,
         "source": {"family": FAMILY},
     }
-    why = (
+    why: tuple[str, ...] = (
         f"tables {layer}{_DATA} and {layer}{_SETTINGS}: {len(blocks)} blocks of {_EDGE}^3 voxels",
         "values belong to the voxels' middles, in meters",
     )
+    if projective:
+        why = (*why, PROJECTIVE)
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.astype(np.int32)}
     tensors["weights"] = stored_weights(weights)
     return ConvertedField(FAMILY, why, description, tensors)

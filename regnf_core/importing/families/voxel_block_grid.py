@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, tensor_error
+from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.truncation import USUAL, truncation_evidence
 from regnf_core.importing.containers.voxel_maps import (
@@ -61,6 +62,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     truncation, why, warnings = _truncation(blocks, overrides)
     values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
     seen = blocks.weights > 0
+    projective = bound_by_surface(values, seen, blocks.keys, blocks.voxel_size)
     fill_unseen(values, seen, blocks.voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks.keys, seen)
     description = {
@@ -72,7 +74,8 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     told = f"arrays key, block_resolution and attr_name_tsdf: {len(blocks.keys)} blocks of {values.shape[1]}^3 voxels"
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.keys.astype(np.int32)}
     tensors["weights"] = stored_weights(blocks.weights)
-    converted = ConvertedField(FAMILY, (told, why), description, tensors, warnings)
+    reasons = (told, why, PROJECTIVE) if projective else (told, why)
+    converted = ConvertedField(FAMILY, reasons, description, tensors, warnings)
     if "attr_name_color" not in arrays or overrides.color.keep is False:
         return converted
     return with_values(converted, lambda: _colors(arrays, blocks))

@@ -1,0 +1,155 @@
+"""Distances to the surface in place of projective ones, for maps fused from depth images.
+
+A fused map measures along the cameras' axes. At a surface that was seen at an angle its values are larger than the
+distance, by 1 / cos of the angle: twice as large in the median of rooms that a camera walked through. Noise makes them
+larger too. No distance is larger than the one to the surface which the values themselves cross zero at, so that is the
+bound that they are cut to. The surface stays where it is, and values within the bound stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from regnf_core.importing.arrays import Float32Array
+from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray
+
+Float64Array = npt.NDArray[np.float64]
+_T = TypeVar("_T", bound=np.generic)
+
+PROJECTIVE = "the values are larger than the distance to the surface, as along a camera's axis: cut to that distance"
+"""Said of a file whose values were changed."""
+_NEIGHBORS = 12
+"""Crossings that a plane is laid through."""
+_APART = 0.7
+"""Voxels: no place of a surface is farther from the nearest crossing along it, but for noise."""
+_AT_ONCE = 1 << 20
+_FEWEST = 4
+_TRIED, _LARGER, _SHARE = 20_000, 1.1, 0.05
+"""Values of which so large a share is larger than their bound by so much are no distances. Exact ones in a grid are
+off by less."""
+
+
+def bound_by_surface(
+    values: Float32Array, seen: BoolArray, blocks: IntArray, spacing: float | npt.NDArray[np.float64]
+) -> bool:
+    """Cut the values (B, X, Y, Z) that were seen to their distance from where they cross zero; changed in place.
+
+    blocks: (B, 3), of as many nodes each: node (X, Y, Z) b + i is number i of block b · spacing: from node to node, of
+    all axes or (3,) of each. Returns whether the values were larger: true distances stay to the last digit, and so do
+    all values where fewer than four crossings are.
+    """
+    step = np.broadcast_to(np.asarray(spacing, np.float64), (3,))
+    surface = _Surface.of(crossings(values, seen, blocks) * step, _APART * float(step.max()))
+    if surface is None:
+        return False
+    seen_nodes = np.flatnonzero(seen)
+    few = np.random.default_rng(0).choice(seen_nodes, min(_TRIED, len(seen_nodes)), replace=False)
+    size, bound = _bounds(surface, values, blocks, few, step)
+    if (size > _LARGER * bound).mean() <= _SHARE:
+        return False
+    flat = values.reshape(-1)
+    for start in range(0, len(seen_nodes), _AT_ONCE):
+        part = seen_nodes[start : start + _AT_ONCE]
+        _, bound = _bounds(surface, values, blocks, part, step)
+        flat[part] = np.clip(flat[part], -bound, bound)
+    return True
+
+
+def _bounds(
+    surface: _Surface, values: Float32Array, blocks: IntArray, chosen: IntArray, step: Float64Array
+) -> tuple[Float32Array, Float32Array]:
+    """The sizes of the values number ``chosen`` (M,), and their distances from the surface."""
+    at = np.unravel_index(chosen, values.shape)
+    nodes = (np.array(values.shape[1:]) * blocks[at[0]] + np.stack(at[1:], axis=1)) * step
+    size = np.abs(values[at])
+    return size, surface.distance(nodes, float(size.max())).astype(np.float32)
+
+
+def crossings(values: Float32Array, seen: BoolArray, blocks: IntArray) -> Float64Array:
+    """Where the values change their sign between neighboring nodes that were seen (N, 3), in nodes."""
+    rows, shape = _Rows(blocks), np.array(values.shape[1:])
+    found: list[Float64Array] = []
+    for axis in range(3):
+        beside, there = rows.of(blocks + np.eye(3, dtype=np.int64)[axis])
+        beyond, both = _next(values, axis, beside), _next(seen, axis, beside)
+        both[:, *_at(axis, -1)] &= there[:, None, None]
+        both &= seen
+        crossing = np.argwhere(both & ((values < 0) != (beyond < 0)))
+        at = tuple(crossing.T)
+        places = (shape * blocks[crossing[:, 0]] + crossing[:, 1:]).astype(np.float64)
+        places[:, axis] += values[at] / (values[at] - beyond[at])
+        found.append(places)
+    return np.concatenate(found)
+
+
+def _next(voxels: npt.NDArray[_T], axis: int, beside: IntArray) -> npt.NDArray[_T]:
+    """Of voxels (B, X, Y, Z) those that follow along an axis; the last ones' are in the blocks ``beside`` (B,)."""
+    following = np.empty_like(voxels)
+    following[:, *_at(axis, slice(None, -1))] = voxels[:, *_at(axis, slice(1, None))]
+    following[:, *_at(axis, -1)] = voxels[:, *_at(axis, 0)][beside]
+    return following
+
+
+def _at(axis: int, where: int | slice) -> tuple[int | slice, ...]:
+    return tuple(where if number == axis else slice(None) for number in range(3))
+
+
+class _Rows:
+    """Finds blocks by their indices."""
+
+    def __init__(self, blocks: IntArray) -> None:
+        self._low = blocks.min(axis=0)
+        self._extent = blocks.max(axis=0) - self._low + 2
+        numbers = self._numbers(blocks)
+        self._order = np.argsort(numbers)
+        self._sorted = numbers[self._order]
+
+    def of(self, blocks: IntArray) -> tuple[IntArray, BoolArray]:
+        """The rows (B,) of blocks (B, 3), at most one beyond the highest ones, and whether each is there."""
+        numbers = self._numbers(blocks)
+        at = np.searchsorted(self._sorted, numbers).clip(max=len(self._sorted) - 1)
+        return self._order[at], self._sorted[at] == numbers
+
+    def _numbers(self, blocks: IntArray) -> IntArray:
+        x, y, z = (blocks - self._low).T
+        numbers: IntArray = (x * self._extent[1] + y) * self._extent[2] + z
+        return numbers
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Places (N, 3) of a surface, and normals of planes through those near each. apart: no place of the surface is
+    farther from the nearest of them, but for noise."""
+
+    places: Float64Array
+    normals: Float64Array
+    tree: cKDTree
+    apart: float
+
+    @classmethod
+    def of(cls, places: Float64Array, apart: float) -> _Surface | None:
+        """Of so many places; None of too few."""
+        if len(places) < _FEWEST:
+            return None
+        tree, count = cKDTree(places), min(_NEIGHBORS, len(places))
+        normals = np.empty_like(places)
+        for start in range(0, len(places), _AT_ONCE // _NEIGHBORS):
+            part = slice(start, start + _AT_ONCE // _NEIGHBORS)
+            about = places[tree.query(places[part], k=count)[1]]
+            about -= about.mean(axis=1, keepdims=True)
+            normals[part] = np.linalg.eigh(about.transpose(0, 2, 1) @ about)[1][:, :, 0]
+        return cls(places, normals, tree, apart)
+
+    def distance(self, nodes: Float64Array, most: float) -> Float64Array:
+        """(M,) of nodes (M, 3): from the plane of the nearest place, if it can be; infinite beyond ``most``."""
+        straight, nearest = self.tree.query(nodes, distance_upper_bound=most + self.apart)
+        away = np.isinf(straight)
+        nearest[away] = 0
+        along = np.abs(np.einsum("ni,ni->n", nodes - self.places[nearest], self.normals[nearest]))
+        least = np.sqrt(np.maximum(np.square(straight) - self.apart**2, 0.0, where=~away, out=np.zeros_like(straight)))
+        return np.where(away, np.inf, np.clip(along, least, straight))

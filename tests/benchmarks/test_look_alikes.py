@@ -1,0 +1,67 @@
+"""Look-alikes differ from the right object by a part, and by nothing else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.robust.cases import Case
+from benchmarks.worlds.cases import WorldCase
+from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
+from benchmarks.worlds.making import WORLD
+from regnf_core import OrientedBox, Sim3
+from regnf_core.fields.mesh import MeshField
+from regnf_core.geometry.symmetry import Symmetries
+from regnf_data.worlds.mesh import Mesh, block, together
+
+T_OBJECT_MODEL = np.diag([2.0, 2.0, 2.0, 1.0])
+SEAT, CUSHION = block([0.0, 0.0, 0.2], [0.5, 0.5, 0.4]), block([0.0, 0.0, 0.55], [0.3, 0.2, 0.2])
+
+
+def known(folder: Path, mesh: Mesh) -> WorldCase:
+    np.savez(folder / "object-0.npz", vertices=mesh.vertices, faces=mesh.faces)
+    (folder / WORLD).write_text(json.dumps({"cases": [{"T_object_model": T_OBJECT_MODEL.tolist()}]}))
+    field = MeshField(mesh.vertices, mesh.faces).transformed(T_OBJECT_MODEL)
+    box = OrientedBox(torch.zeros(3).double(), torch.ones(3).double(), torch.eye(3).double())
+    case = Case("a seat", field, field, box, Sim3.identity())
+    return WorldCase(case, {"case": 0, "object": "seat"}, torch.zeros(0, 3), Symmetries())
+
+
+def differing(one: WorldCase, other: WorldCase) -> torch.Tensor:
+    """(N, 3) points about both, object frame, where one is matter and the other is not."""
+    axis = torch.linspace(-2.013, 1.987, 41)  # no point lies on a face
+    points = torch.cartesian_prod(axis, axis, axis)
+    inside = [case.case.obj.signed_distance(points) < 0.0 for case in (one, other)]
+    return points[inside[0] != inside[1]]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_part_is_missing_or_a_block_is_added(tmp_path: Path, seed: int) -> None:
+    right = known(tmp_path, together(SEAT, CUSHION))
+    other = look_alike(tmp_path, right, np.random.default_rng(seed))
+    assert other.facts["object"] == LOOK_ALIKE
+    assert right.facts["object"] == "seat"
+    where = differing(right, other)
+    assert len(where) > 0
+    extent = where.amax(0) - where.amin(0)
+    assert float(extent.max()) < 0.45 * 2.0 * float(np.linalg.norm([0.5, 0.5, 0.65]))
+    assert float(other.case.obj.signed_distance(other.points.float()).abs().max()) < 1e-3
+
+
+def test_what_is_missing_is_a_whole_part(tmp_path: Path) -> None:
+    """The seat is too much of the surface to be left out; only the cushion can be."""
+    right = known(tmp_path, together(SEAT, CUSHION))
+    missing = [
+        where
+        for seed in range(12)
+        if float((where := differing(right, look_alike(tmp_path, right, np.random.default_rng(seed))))[:, 2].min())
+        > 0.85
+        and bool((right.case.obj.signed_distance(where) < 0.0).all())
+    ]
+    assert missing
+    for where in missing:
+        torch.testing.assert_close(where.abs().amax(0)[:2], torch.tensor([0.3, 0.2]), rtol=0, atol=0.11)
