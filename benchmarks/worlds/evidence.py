@@ -79,10 +79,8 @@ def _rows(known: WorldCase, asked: WorldCase) -> Iterator[Row]:
     other = asked is not known and asked.facts["object"] != LOOK_ALIKE
     if kept.problem is None or (other and _same_shape(known, asked, result.T_object_scene)):
         return
-    last = min(range(len(kept.evaluations)), key=lambda number: kept.evaluations[number].rank)
-    for number, candidates in enumerate(kept.refined):
-        winner = kept.evaluations[number].winner if number == last else None
-        yield from _described(kept.problem, candidates, known if asked is known else None, winner)
+    last = kept.evaluations[-1]
+    yield from _described(kept.problem, last.candidates, known if asked is known else None, last.winner)
     if asked is known:
         yield from ({**row, "found": False} for row in _described(kept.problem, _from_truth(kept, known), known, None))
 
@@ -108,7 +106,7 @@ def _described(
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, _OPTIONS.robust)
     errors = _errors(problem, candidates.T, known)
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    ranking = Ranking(evidence.scores.double(), pose_odds().log_odds(features, elsewhere)[0])
+    ranking = Ranking(evidence.scores.double(), pose_odds().alone.logit(features))
     rivals = rival_numbers(problem, candidates, ranking, _OPTIONS.robust.rival_margin)
     for number in range(len(candidates)):
         yield {

@@ -13,7 +13,7 @@ from regnf_fit.images.observing import observe
 
 _CARVING = 36
 """Images that free space is carved with; measured surface comes from all."""
-_VOXELS = 128
+_VOXELS = 192
 
 
 def observation_of_walk(taken: Capture, bounds: Array) -> Observation:

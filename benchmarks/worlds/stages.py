@@ -89,7 +89,7 @@ def from_truth(kept: Recording, truth: Sim3, points: Tensor, symmetries: Symmetr
     generator = torch.Generator().manual_seed(0)
     refined = pipeline.refine_poses(problem, problem.in_working_frames(truth)[None], generator)
     evaluation = evaluate_candidates(problem, refined, RegistrationOptions(preset="robust"))
-    chosen = min(kept.evaluations, key=lambda one: one.rank)
+    chosen = kept.evaluations[-1]
     T = problem.in_working_frames(evaluation.T)
     return {
         "truth_mssd": float(nearest.errors(T[None])[0]),

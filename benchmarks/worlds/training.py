@@ -122,9 +122,10 @@ def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
 
 
 def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:
-    """(N,) as :func:`regnf_core.robust.verdict.lead.leads` has them, from each row's ``others``."""
-    best = [max((odds[number + step] for step in row["others"]), default=-np.inf) for number, row in enumerate(rows)]
-    return np.clip(odds - np.array(best), -VERDICT.most_lead, VERDICT.most_lead)
+    """(N,) as :func:`regnf_core.robust.verdict.lead.leads` has them, from each row's score and ``others``."""
+    merits = odds - VERDICT.log_odds_per_score * np.array([row["score"] for row in rows])
+    best = [max((merits[number + step] for step in row["others"]), default=-np.inf) for number, row in enumerate(rows)]
+    return np.clip(merits - np.array(best), -VERDICT.most_lead, VERDICT.most_lead)
 
 
 def _told_apart_by_rivals(row: dict[str, Any]) -> bool:

@@ -176,7 +176,13 @@ class SupportPlaneConstants:
 
 @dataclass(frozen=True)
 class OcclusionConstants:
-    """Occlusion boundaries of a scene seen from one point (scene/occlusion_boundary.py)."""
+    """What the cameras cannot have seen: where an observation says so (working_frame.py), and the occlusion boundaries
+    of a scene seen from one point (scene/occlusion_boundary.py)."""
+
+    front_voxels: tuple[float, float] = (1.0, 2.0)
+    """Voxels of the observation in front of a surface element. One of both places was seen to be free, or nobody saw
+    the element from its front. [derived: the first lies beyond the surface's own voxel; next to a measured surface, a
+    voxel may count as unobserved although it was seen]"""
 
     guesses: int = 3000
     """Viewpoints tried: where the tangent planes of three random samples meet. [by hand]"""
@@ -432,6 +438,9 @@ class VerdictConstants:
     [derived]"""
     most_lead: float = 6.0
     """Log odds. Larger leads are not told apart. [by hand]"""
+    log_odds_per_score: float = 30.0
+    """Log odds that a difference of 1 in the score counts as when candidates are compared: odds of poses that fit alike
+    differ by chance. From 20 to 50 the choice is right as often. [random worlds]"""
     rivals_min_distance: float = 0.1
     """Diameters. Poses closer together are one answer with its uncertainty. [by hand]"""
     rival_log_odds: float = 3.0

@@ -164,13 +164,12 @@ def _best_attempt(
     T_start: Sim3 | None,
 ) -> Evaluation:
     """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
-    others fail."""
-    found: list[Evaluation] = []
-    for start in _starts(problem, options, seed, generator, T_start):
-        found.append(_attempt(problem, start, options, run, generator))
-        if found[-1].verdict != "rejected":
-            break
-    return min(found, key=lambda one: one.rank)
+    others fail. What earlier attempts found stays among the candidates: a pose is compared with all of them."""
+    starts = _starts(problem, options, seed, generator, T_start)
+    best = _attempt(problem, next(starts), [], options, run, generator)
+    while best.verdict == "rejected" and (start := next(starts, None)) is not None:
+        best = _attempt(problem, start, [best.candidates], options, run, generator)
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +204,7 @@ def _starts(
 def _attempt(
     problem: RegistrationProblem,
     start: _Start,
+    earlier: Sequence[PoseCandidates],
     options: RegistrationOptions,
     run: Run,
     generator: torch.Generator,
@@ -214,7 +214,7 @@ def _attempt(
     with run.phase("optimizing"):
         refined = refine_poses(problem, Sim3.cat([candidates.T, start.given]), generator, _progress_of_steps(run))
     with run.phase("verifying"):
-        return evaluate_candidates(problem, refined, options)
+        return evaluate_candidates(problem, PoseCandidates.cat([*earlier, refined]), options)
 
 
 def _progress_of_steps(run: Run) -> Callable[[], None]:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.samples import Samples, UnobservedTest, subsample
 
 
@@ -53,7 +54,8 @@ class Residuals:
     tensor, seen from the other side.
 
     cosines: (H, N + M), between a sample's normal and the other field's gradient where the pose carries the sample ·
-    unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed; None: all of it was ·
+    unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed, or that face such
+    space while the scene's own surface there does not face the same way; None: all of it was observed ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
     the values.
     """
@@ -136,8 +138,12 @@ def _object_to_scene(
     scaled = s * value
     J = _jacobian(arm, -turned, scaled - _dot(turned, arm))
     r2 = scaled - B.values
-    where = None if unobserved is None else unobserved(_as_points(w), r2.reshape(-1)).reshape(r2.shape)
-    return r2, J, _cosine(turned, B.normals.T), where
+    cosines = _cosine(turned, B.normals.T)
+    if unobserved is None:
+        return r2, J, cosines, None
+    places, fronts = _as_points(w), _as_points(R.mT @ B.normals.T)
+    hidden = unobserved.faces_unobserved(places, fronts).reshape(r2.shape) & (cosines < EVIDENCE.min_inlier_cosine)
+    return r2, J, cosines, hidden | unobserved.unobserved(places, r2.reshape(-1)).reshape(r2.shape)
 
 
 def _query(model: DistanceModel, places: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,10 +10,16 @@ from torch import Tensor
 
 
 class UnobservedTest(Protocol):
-    """Tells which places were not observed: (M,) bool for points (M, 3) of the samples' frame and the signed distances
-    (M,) there."""
+    """Tells what was not observed of a scene, in the samples' frame."""
 
-    def __call__(self, points: Tensor, values: Tensor, /) -> Tensor: ...
+    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
+        """(M,) bool: which of the points (M, 3), with these signed distances (M,), were not observed."""
+        ...
+
+    def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(M,) bool: which surface elements at points (M, 3) with unit normals (M, 3) nobody can have seen, because the
+        space in front of them was not seen to be free."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

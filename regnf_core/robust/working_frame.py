@@ -12,7 +12,8 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.schema.observation_grid import SURFACE, UNSEEN
+from regnf_core.robust.constants import OCCLUSION
+from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,14 @@ class WorkingObservation:
 
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
         self._observation = observation.seen_in(frame.to_field())
+        T_grid_frame = self._observation.T_grid_frame
+        assert T_grid_frame is not None
+        to_cells = T_grid_frame.scale / observation.voxel
+        self._voxel = float(1.0 / to_cells)
+        self._turn = (to_cells * T_grid_frame.rotation).float().T.contiguous()
+        self._shift = ((T_grid_frame.translation - observation.low) / observation.voxel).float()
+        self._counts = torch.tensor(observation.states.shape)
+        self._states = observation.states.reshape(-1)
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
@@ -70,11 +79,25 @@ class WorkingObservation:
 
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
-        return self._observation.at(points) == SURFACE
+        return self._at(points) == SURFACE
 
-    def unobserved(self, points: Tensor, _values: Tensor) -> Tensor:
-        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
-        return self._observation.at(points) == UNSEEN
+    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
+        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through. values: not needed."""
+        del values
+        return self._at(points) == UNSEEN
+
+    def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(M,) bool: no line of sight passed in front of these surface elements, whose unit normals are (M, 3)."""
+        near, far = (points + step * self._voxel * normals for step in OCCLUSION.front_voxels)
+        return (self._at(near) != FREE) & (self._at(far) != FREE)
+
+    def _at(self, points: Tensor) -> Tensor:
+        """The states (M,) at points (M, 3); UNSEEN beyond the grid."""
+        cells = torch.addmm(self._shift, points, self._turn).floor_().long()
+        within = ((cells >= 0) & (cells < self._counts)).all(-1)
+        x, y, z = torch.minimum(cells.clamp_min_(0), self._counts - 1).unbind(-1)
+        index = x.mul(self._counts[1]).add_(y).mul_(self._counts[2]).add_(z)
+        return torch.where(within, self._states[index], UNSEEN)
 
 
 def _finite(values: Tensor) -> Tensor:

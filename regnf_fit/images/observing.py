@@ -27,6 +27,8 @@ _SPREADS = 3.0
 """The same in standard deviations of a depth, where the images contradict each other by more."""
 _PIXELS = 1.2
 """Widths of a pixel that a voxel is across at least: narrower ones would fall between the pixels' rays."""
+_AT_ONCE = 1 << 17
+"""Voxels that are looked up in an image at once: what is in use stays in the processor's cache."""
 _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
 """So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
 
@@ -47,12 +49,13 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
     states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
     axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
     centers = torch.cartesian_prod(*axes).float()
-    left = torch.arange(len(centers))
+    left = list(torch.arange(len(centers)).split(_AT_ONCE))
     for image in range(len(images)):
         margins = np.maximum(_SPREADS * spread.at(images.depths[image]), np.float32(_MARGIN * voxel))
-        free = _looked_through(centers[left], images, image, torch.from_numpy(margins))
-        states[left[free]] = FREE
-        left = left[~free]
+        for number, part in enumerate(left):
+            free = _looked_through(centers[part], images, image, torch.from_numpy(margins))
+            states[part[free]] = FREE
+            left[number] = part[~free]
     ends = torch.cat([_ends(images, image) for image in range(len(images))])
     cells = ((ends - low) / voxel).floor().long()
     x, y, z = cells[((cells >= 0) & (cells < torch.tensor(counts))).all(-1)].unbind(-1)
@@ -70,11 +73,11 @@ def _pixel_width(images: PosedImages) -> float:
 def _looked_through(centers: Tensor, images: PosedImages, image: int, margins: Tensor) -> Tensor:
     """(N,) bool: which centers (N, 3) lie before what one image shows, by margins (H, W) along the camera's axis."""
     assert images.depths is not None
-    T = torch.from_numpy(np.linalg.inv(images.T_world_camera[image])).float()
-    local = centers @ T[:3, :3].T + T[:3, 3]
-    z = local[:, 2]
-    pixel = local @ torch.from_numpy(images.intrinsics[image]).float().T
-    column, row = (pixel[:, :2] / z.clamp_min(1e-6)[:, None]).floor().unbind(-1)
+    T_camera_world = np.linalg.inv(images.T_world_camera[image])
+    projection = torch.from_numpy(images.intrinsics[image] @ T_camera_world[:3]).float()
+    x, y, z = torch.addmm(projection[:, 3:], projection[:, :3], centers.T)
+    depth = z.clamp_min(1e-6)
+    column, row = x.div_(depth).floor_(), y.div_(depth).floor_()
     height, width = images.size
     shown = (z > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = shown.nonzero()[:, 0]
@@ -97,7 +100,7 @@ def _ends(images: PosedImages, image: int) -> Tensor:
     return torch.from_numpy((rays * z[:, None]) @ T[:3, :3].T + T[:3, 3])
 
 
-def attach_observation(path: Path, images: PosedImages, voxels: int = 160) -> Observation:
+def attach_observation(path: Path, images: PosedImages, voxels: int = 192) -> Observation:
     """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
 
     Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the

@@ -77,7 +77,7 @@ class ReconstructionOptions(NetworkOptions):
     """Learning rate of the corrections, in the deviations that are expected of the poses."""
     poses_from: float = 0.15
     """The share of the iterations from which on poses are corrected: before it, the shape is too coarse."""
-    observation_voxels: int = 160
+    observation_voxels: int = 192
     """Voxels along the longest side of the grid of what was observed, where there are depths; 0: none is kept."""
 
     def learning_levels(self, iteration: int) -> int:

@@ -63,6 +63,7 @@ def test_ambiguity_is_no_error_of_the_probability() -> None:
             "winner": True,
             "found": True,
             "others": [],
+            "score": 0.3,
             "world": f"tsdf-{number % 4}-long",
         }
         for number in range(30)
@@ -90,6 +91,7 @@ def test_a_lead_over_other_answers_counts() -> None:
                     "winner": step == 1,
                     "found": True,
                     "others": [step],
+                    "score": 0.3,
                     "world": f"tsdf-{number % 5}-long",
                 }
             )
@@ -109,6 +111,7 @@ def test_look_alikes_are_told_apart_in_the_table_alone() -> None:
             "winner": True,
             "found": True,
             "others": [],
+            "score": 0.3,
             "world": f"tsdf-{number % 5}-long",
         }
         for number in range(100)

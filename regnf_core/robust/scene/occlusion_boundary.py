@@ -8,6 +8,8 @@ that was observed from all sides has no such point: some of its faces point away
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -15,19 +17,31 @@ from regnf_core.robust.constants import OCCLUSION
 from regnf_core.robust.samples import Samples
 
 
-def occlusion_boundary(samples: Samples, generator: torch.Generator) -> Tensor:
-    """(N,) bool: which samples lie on an occlusion boundary; none unless all were observed from one point."""
+@dataclass(frozen=True, eq=False)
+class SingleView:
+    """A scene that was observed from one point, ``viewpoint`` (3,): it is unobserved behind its surface."""
+
+    viewpoint: Tensor
+
+    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
+        """(M,) bool, where the signed distances (M,) are those of matter. points: not needed."""
+        del points
+        return values < 0.0
+
+    def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(M,) bool: which surface elements at points (M, 3) with unit normals (M, 3) face away from the viewpoint."""
+        return ((self.viewpoint.to(points) - points) * normals).sum(-1) < 0.0
+
+
+def occlusion_boundary(samples: Samples, generator: torch.Generator) -> tuple[Tensor, SingleView | None]:
+    """(N,) bool: which samples lie on an occlusion boundary; and from where the scene was observed. None of both unless
+    all was observed from one point."""
     points, normals = samples.on_surface().double(), samples.normals.double()
     viewpoint = _viewpoint(points, normals, generator)
     if viewpoint is None:
-        return torch.zeros(len(samples), dtype=torch.bool)
+        return torch.zeros(len(samples), dtype=torch.bool), None
     edge_on: Tensor = _cosines(points, normals, viewpoint[None])[0].abs() < OCCLUSION.boundary_cosine
-    return edge_on
-
-
-def behind_surfaces(_points: Tensor, values: Tensor) -> Tensor:
-    """(M,) bool: a scene observed from one side is unobserved behind its surface. values: signed distances (M,)."""
-    return values < 0.0
+    return edge_on, SingleView(viewpoint) if bool(edge_on.any()) else None
 
 
 def _viewpoint(points: Tensor, normals: Tensor, generator: torch.Generator) -> Tensor | None:

@@ -16,7 +16,7 @@ from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import REFINEMENT, SCENE
 from regnf_core.robust.samples import Samples, UnobservedTest
 from regnf_core.robust.sampling import SampledField, sample_scene_surface
-from regnf_core.robust.scene.occlusion_boundary import behind_surfaces, occlusion_boundary
+from regnf_core.robust.scene.occlusion_boundary import occlusion_boundary
 from regnf_core.robust.scene.smoothing import smooth
 from regnf_core.robust.scene.support_planes import support_planes
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
@@ -95,9 +95,8 @@ def _unobserved_surface(
     else by its occlusion boundaries."""
     observed = _observation(scene, sampled)
     if observed is not None:
-        return ~observed.on_surface(sampled.samples.points), observed.unobserved
-    boundary = occlusion_boundary(sampled.samples, generator)
-    return boundary, behind_surfaces if bool(boundary.any()) else None
+        return ~observed.on_surface(sampled.samples.points), observed
+    return occlusion_boundary(sampled.samples, generator)
 
 
 def _within(samples: Samples, detection: OrientedBox) -> Tensor:

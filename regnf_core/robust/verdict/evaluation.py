@@ -20,7 +20,7 @@ from regnf_core.robust.verdict.considered import considered_poses
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_known_scale
 from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
 from regnf_core.robust.verdict.evidence import gather_evidence
-from regnf_core.robust.verdict.lead import apart
+from regnf_core.robust.verdict.lead import apart, merits
 from regnf_core.robust.verdict.pose_features import pose_features
 from regnf_core.robust.verdict.probability import pose_odds
 from regnf_core.robust.verdict.relation import relation
@@ -54,7 +54,7 @@ def evaluate_candidates(
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust)
     features = pose_features(problem, candidates.T, candidates.offsets)
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    alone, among = pose_odds().log_odds(features, elsewhere)
+    alone, among = pose_odds().log_odds(features, evidence.scores, elsewhere)
     ranking = Ranking(evidence.scores.double(), alone)
     winner = ranking.winner
     rivals = rival_numbers(problem, candidates, ranking, options.robust.rival_margin)
@@ -92,8 +92,8 @@ class Ranking:
 
     @property
     def demerits(self) -> Tensor:
-        """(H,), smaller is better: by the odds, which are the same for all that fits well; there, by the score."""
-        return self.scores - self.log_odds
+        """(H,), smaller is better: see :func:`regnf_core.robust.verdict.lead.merits`."""
+        return -merits(self.log_odds, self.scores)
 
     @property
     def winner(self) -> int:

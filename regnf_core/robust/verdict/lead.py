@@ -1,5 +1,6 @@
-"""By how much a pose is likelier than the next one that is another answer.
+"""By how much a pose is better than the next one that is another answer.
 
+Poses are compared by their merits: the log odds say which of them fit at all, the score says which of these fits best.
 A pose that is right stands out among all that a search found. Where an object is not in the box, or the right pose was
 lost, several poses are about as likely.
 """
@@ -15,11 +16,17 @@ from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.search.rotations import turns_about
 
 
-def leads(log_odds: Tensor, apart: Tensor) -> Tensor:
-    """(H,): each pose's log odds (H,) above those of the likeliest of the poses that are ``apart`` (H, H) from it, at
-    most VERDICT.most_lead, which is also the lead of a pose without any."""
-    others = torch.where(apart, log_odds, -torch.inf).amax(1)
-    return (log_odds - others).clamp(-VERDICT.most_lead, VERDICT.most_lead)
+def merits(log_odds: Tensor, scores: Tensor) -> Tensor:
+    """(H,) in log odds, larger is better: what poses with these log odds (H,) of being right, each alone, and scores
+    (H,), 0..1, smaller is better, are compared by."""
+    return log_odds - VERDICT.log_odds_per_score * scores.to(log_odds)
+
+
+def leads(merits: Tensor, apart: Tensor) -> Tensor:
+    """(H,): each pose's merit (H,) above that of the best of the poses that are ``apart`` (H, H) from it, at most
+    VERDICT.most_lead, which is also the lead of a pose without any."""
+    others = torch.where(apart, merits, -torch.inf).amax(1)
+    return (merits - others).clamp(-VERDICT.most_lead, VERDICT.most_lead)
 
 
 def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:

@@ -69,7 +69,7 @@ def _groups(r: Residuals) -> _Groups:
     near = r1.abs() <= EVIDENCE.near
     observed = torch.ones_like(r2, dtype=torch.bool) if r.unobserved is None else ~r.unobserved[:, n:]
     agrees = r2.abs() <= EVIDENCE.agreement
-    visible = agrees | (observed & (r2 > 0))
+    visible = observed & (agrees | (r2 > 0))
     return _Groups(near, near & (r1.abs() <= EVIDENCE.agreement), visible, observed, agrees & observed)
 
 

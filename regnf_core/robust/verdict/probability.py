@@ -3,7 +3,8 @@
     logit P(right) = b + sum_k f_k(x_k),    f_k piecewise linear, increasing or decreasing as SPEAKS_FOR says
 
 There are two such sums. One knows the pose ``alone``. The other knows the candidates ``among`` which it is: its further
-feature is the pose's lead, how far its log odds alone lie above those of the next other answer (:mod:`.lead`).
+feature is the pose's lead, how far its log odds alone, less the score's share, lie above those of the next other answer
+(:mod:`.lead`).
 
 "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make equal.
 The functions are data: ``probability.json``, made by ``python -m benchmarks.worlds train`` from random worlds
@@ -21,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from regnf_core.robust.verdict.lead import leads
+from regnf_core.robust.verdict.lead import leads, merits
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 
 LEAD = "lead"
@@ -87,13 +88,14 @@ class PoseOdds:
     alone: ProbabilityModel
     among: ProbabilityModel
 
-    def log_odds(self, features: dict[str, Tensor], apart: Tensor) -> tuple[Tensor, Tensor]:
+    def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> tuple[Tensor, Tensor]:
         """(H,) and (H,): log odds of the candidates alone, and among each other.
 
-        features: each (H,) · apart: (H, H) bool, which candidates are other answers than which.
+        features: each (H,) · scores: (H,), smaller is better · apart: (H, H) bool, which candidates are other answers
+        than which.
         """
         alone = self.alone.logit(features)
-        return alone, self.among.logit({**features, LEAD: leads(alone, apart)})
+        return alone, self.among.logit({**features, LEAD: leads(merits(alone, scores), apart)})
 
 
 @cache

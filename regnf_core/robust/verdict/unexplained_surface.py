@@ -44,4 +44,4 @@ def _covered(held_out: SurfacePair, T: Sim3, points: Tensor) -> Tensor:
     value, _ = held_out.scene.value_and_gradient(points)
     covered: Tensor = T.scale * value < -EVIDENCE.close
     unobserved = held_out.scene_samples.unobserved
-    return covered if unobserved is None else covered | unobserved(points, value)
+    return covered if unobserved is None else covered | unobserved.unobserved(points, value)

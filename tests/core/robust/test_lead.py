@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.search.rotations import turns_about
-from regnf_core.robust.verdict.lead import apart, leads
+from regnf_core.robust.verdict.lead import apart, leads, merits
 
 POINTS = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -73,3 +73,9 @@ def test_leads_by_hand() -> None:
 
 def test_a_single_answer_has_the_largest_lead() -> None:
     assert leads(torch.tensor([-3.0]), torch.tensor([[False]])).tolist() == [6.0]
+
+
+def test_of_poses_that_are_about_as_likely_the_better_score_has_the_merit() -> None:
+    found = merits(torch.tensor([1.0, 0.5, -3.0]).double(), torch.tensor([0.40, 0.35, 0.35]))
+    assert found.argmax() == 1
+    assert found[1] - found[2] == pytest.approx(3.5), "the odds count where the scores are alike"

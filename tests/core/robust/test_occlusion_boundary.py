@@ -39,7 +39,7 @@ def test_edge_on_surface_is_told_from_surface_that_faces_the_viewpoint() -> None
         torch.zeros(300 + int(facing.sum())),
         torch.cat([edge_on.normals, normals[facing]]),
     )
-    found = occlusion_boundary(both, generator)
+    found = occlusion_boundary(both, generator)[0]
     assert found[:300].float().mean() > 0.98
     assert found[300:].float().mean() < 0.02
 
@@ -47,7 +47,7 @@ def test_edge_on_surface_is_told_from_surface_that_faces_the_viewpoint() -> None
 def test_what_was_observed_from_all_sides_has_no_occlusion_boundary() -> None:
     generator = torch.Generator().manual_seed(0)
     normals = unit(torch.randn(800, 3, generator=generator))
-    assert not occlusion_boundary(Samples(0.4 * normals, torch.zeros(800), normals), generator).any()
+    assert not occlusion_boundary(Samples(0.4 * normals, torch.zeros(800), normals), generator)[0].any()
 
 
 def test_the_cost_of_unobserved_samples_and_its_slope() -> None:

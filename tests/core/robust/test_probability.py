@@ -10,6 +10,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, PoseOdds, ProbabilityModel, pose_odds
 
@@ -55,22 +56,28 @@ def test_a_file_whose_terms_are_not_monotone_is_refused(broken: dict[str, Any]) 
         ProbabilityModel.from_dict({"bias": 0.0, "terms": broken})
 
 
-def test_the_lead_is_taken_from_the_odds_alone() -> None:
-    """Three candidates; the first two are one answer, so the lead of each is over the third."""
+def test_the_lead_is_taken_from_the_odds_alone_and_the_scores() -> None:
+    """Three candidates; the first two are one answer, so the lead of each is over the third. The third's score is worse
+    by what 1.5 log odds weigh."""
     alone = ProbabilityModel.from_dict(STORED)
     among = ProbabilityModel.from_dict({"bias": 1.0, "terms": {LEAD: {"knots": [-1.0, 3.0], "values": [-4.0, 0.0]}}})
     elsewhere = torch.tensor([[False, False, True], [False, False, True], [True, True, False]])
     told = {"confirmed": torch.tensor([0.9, 0.7, 0.6]), "free": torch.zeros(3)}
-    of_each, of_all = PoseOdds(alone, among).log_odds(told, elsewhere)
+    scores = torch.tensor([0.3, 0.3, 0.3]).double()
+    of_each, of_all = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
     assert of_each.tolist() == pytest.approx([2.0, 1.5, 1.0])
     assert of_all.tolist() == pytest.approx([1.0 - 2.0, 1.0 - 2.5, 1.0 - 4.0])  # leads 1, .5 and -1
+    scores[2] += 1.5 / VERDICT.log_odds_per_score
+    of_each, of_all = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
+    assert of_each.tolist() == pytest.approx([2.0, 1.5, 1.0])
+    assert of_all.tolist() == pytest.approx([1.0 - 0.5, 1.0 - 1.0, 1.0 - 4.0], abs=1e-6)  # leads 2.5, 2 and -2.5
 
 
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
 def test_the_shipped_models_are_monotone(name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
     changed = others | {name: torch.tensor([low, low + step], dtype=torch.float64)}
-    for logits in pose_odds().log_odds(changed, torch.zeros(2, 2, dtype=torch.bool)):
+    for logits in pose_odds().log_odds(changed, torch.full((2,), 0.3), torch.zeros(2, 2, dtype=torch.bool)):
         less, more = logits.tolist()
         assert more >= less if SPEAKS_FOR[name] else more <= less
 
@@ -81,10 +88,11 @@ def test_the_shipped_models_use_what_they_must() -> None:
     best = {name: torch.tensor([1e3 if better else -1e3] * 2).double() for name, better in SPEAKS_FOR.items()}
     worst = {name: -values for name, values in best.items()}
     single, several = torch.zeros(2, 2, dtype=torch.bool), ~torch.eye(2, dtype=torch.bool)
-    likely = [float(one[0].sigmoid()) for one in pose_odds().log_odds(best, single)]
+    alike = torch.full((2,), 0.3)
+    likely = [float(one[0].sigmoid()) for one in pose_odds().log_odds(best, alike, single)]
     assert likely[1] > 0.98, "among the others: what results tell"
-    assert max(float(one[0].sigmoid()) for one in pose_odds().log_odds(worst, single)) < 1e-4
-    assert float(pose_odds().log_odds(best, several)[1][0].sigmoid()) < likely[1]
+    assert max(float(one[0].sigmoid()) for one in pose_odds().log_odds(worst, alike, single)) < 1e-4
+    assert float(pose_odds().log_odds(best, alike, several)[1][0].sigmoid()) < likely[1]
 
 
 @pytest.mark.xfail(
@@ -92,5 +100,4 @@ def test_the_shipped_models_use_what_they_must() -> None:
 )
 def test_a_perfect_pose_alone_is_as_likely() -> None:
     best = {name: torch.tensor([1e3 if better else -1e3]).double() for name, better in SPEAKS_FOR.items()}
-    alone, _ = pose_odds().log_odds(best, torch.zeros(1, 1, dtype=torch.bool))
-    assert float(alone[0].sigmoid()) > 0.98
+    assert float(pose_odds().alone.logit(best)[0].sigmoid()) > 0.98

@@ -1,0 +1,103 @@
+"""Surface that nobody can have seen: the space in front of it was not seen to be free."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from regnf_core.fields.observation import Observation
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.residuals import SurfacePair, residuals
+from regnf_core.robust.samples import Samples
+from regnf_core.robust.scene.occlusion_boundary import SingleView
+from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation
+from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+
+COUNT, VOXEL = 20, 0.1
+MIDDLE = COUNT // 2
+
+
+def wall_seen_from_above(margin: int = 0) -> Observation:
+    """Free above z = .1, a surface measured in the layer below it, nothing seen farther down; ``margin``: so many layers
+    above the surface count as unobserved. Field frame, the grid's middle at 0."""
+    states = torch.full((COUNT, COUNT, COUNT), UNSEEN, dtype=torch.uint8)
+    states[:, :, MIDDLE] = SURFACE
+    states[:, :, MIDDLE + 1 + margin :] = FREE
+    return Observation(states, torch.full((3,), -MIDDLE * VOXEL, dtype=torch.float64), VOXEL)
+
+
+def in_frame(observation: Observation, T_frame_new: Sim3) -> WorkingObservation:
+    """Of the observation in a frame that ``T_frame_new`` carries to the grid's, with a working frame half as large."""
+    moved = observation.seen_in(T_frame_new)
+    center = T_frame_new.inverse().apply(torch.zeros(1, 3, dtype=torch.float64))[0]
+    return WorkingObservation(moved, WorkingFrame(center, 2.0))
+
+
+def turned(T: Sim3, vectors: Tensor) -> Tensor:
+    """Directions (N, 3) of the grid in the new frame."""
+    return (vectors.double() @ T.rotation).float()
+
+
+def placed(T: Sim3, points: Tensor) -> Tensor:
+    """Points (N, 3) of the grid in the working frame."""
+    center = T.inverse().apply(torch.zeros(1, 3, dtype=torch.float64))
+    return ((T.inverse().apply(points.double()) - center) / 2.0).float()
+
+
+POSES = {
+    "the grid's own frame": Sim3.identity(),
+    "another frame": Sim3.identity().perturb(torch.tensor([0.4, -0.9, 0.3, 0.5, -0.2, 0.7, 0.8], dtype=torch.float64)),
+}
+
+
+@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("margin", [0, 1])
+def test_what_faces_free_space_may_have_been_seen(name: str, margin: int) -> None:
+    T = POSES[name]
+    seen = in_frame(wall_seen_from_above(margin), T)
+    points = placed(T, torch.tensor([[0.03, -0.21, 0.05], [0.5, 0.3, 0.05], [0.03, -0.21, 0.05]]))
+    normals = turned(T, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [0.6, 0.0, -0.8]]))
+    assert seen.faces_unobserved(points, normals).tolist() == [False, True, True]
+    assert not seen.unobserved(points, torch.zeros(3)).any(), "a surface was measured there"
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_states_in_a_working_frame_are_those_of_the_observation(name: str) -> None:
+    T = POSES[name]
+    observation = wall_seen_from_above()
+    seen = in_frame(observation, T)
+    generator = torch.Generator().manual_seed(0)
+    cells = torch.randint(-2, COUNT + 2, (500, 3), generator=generator)
+    points = (cells + 0.2 + 0.6 * torch.rand(500, 3, generator=generator) - MIDDLE) * VOXEL
+    states = observation.at(points)
+    assert (seen.on_surface(placed(T, points)) == (states == SURFACE)).all()
+    assert (seen.unobserved(placed(T, points), torch.zeros(500)) == (states == UNSEEN)).all()
+    assert 0 < int((states == SURFACE).sum()) < int((states == UNSEEN).sum())
+
+
+def test_a_single_view_sees_what_faces_it() -> None:
+    view = SingleView(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])
+    normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.1]])
+    assert view.faces_unobserved(points, normals).tolist() == [False, True, True]
+    assert view.unobserved(points, torch.tensor([0.1, -0.1, 0.0])).tolist() == [False, True, False]
+
+
+class Slab:
+    """Matter below z = 0."""
+
+    def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """z and its gradient."""
+        return points[:, 2], torch.tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
+
+
+def test_the_far_side_of_a_sheet_is_unobserved_and_its_near_side_is_not() -> None:
+    """A sheet that coincides with what was measured: the scene's surface has the normal of one of its sides."""
+    view = SingleView(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
+    points, up = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    sheet = Samples(points, torch.zeros(2), torch.cat([up, -up]))
+    scene = Samples(points, torch.zeros(2), up.expand(2, 3), unobserved=view)
+    found = residuals(SurfacePair(Slab(), Slab(), scene, sheet), Sim3.identity().expand(1))
+    assert found.unobserved is not None
+    assert found.unobserved[0].tolist() == [False, False, False, True]
