@@ -380,11 +380,6 @@ class EvidenceConstants:
     """Diameters. Smallest core of residuals that the tail is compared with: exact fields have a core of 0. [by hand]"""
     min_slope: float = 1e-3
     """Length of the gradient. A shorter one has no direction. [derived]"""
-    step_damping: float = 0.003
-    """Squared residual per squared motion. Motions that change the residuals by less than a twentieth of themselves
-    are held. [by hand]"""
-    min_step: float = 1e-4
-    """Diameters. Shorter steps are not told apart. [by hand]"""
     facing_cosine: float = -0.25
     """Cosine between the normals below which surface faces the object's own: 104 degrees. [early fits]"""
 

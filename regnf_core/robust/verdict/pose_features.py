@@ -13,7 +13,6 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.kernel import geman_mcclure_weight
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.residuals import Residuals, residuals
 from regnf_core.robust.verdict.unexplained_surface import unexplained_samples
@@ -36,7 +35,6 @@ SPEAKS_FOR = {
     "hidden": False,
     "noise": False,
     "tail": False,
-    "directions_apart": False,
 }
 """The features by name: whether more of it makes the pose more likely (True) or less (False)."""
 
@@ -61,10 +59,8 @@ def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dic
     r = residuals(problem.held_out, T, offsets)
     groups = _groups(r)
     found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _normals(r, groups) | _spread(r, groups)
-    J = _by_motion(problem, T, r)
-    stiffness = _stiffness(J, groups)
+    stiffness = _stiffness(problem, T, r, groups)
     found |= {"stiffness": stiffness[:, 0], "second_stiffness": stiffness[:, 1]}
-    found["directions_apart"] = _directions_apart(J, r, groups)
     return {name: found[name].double() for name in SPEAKS_FOR}
 
 
@@ -135,43 +131,21 @@ def _spread(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
     }
 
 
-def _by_motion(problem: RegistrationProblem, T: Sim3, r: Residuals) -> Tensor:
-    """(H, N + M, 7) float64: the residuals' derivatives by seven similarity motions that each move the object's surface
-    by a root mean square of 1, at right angles to each other in that measure."""
-    J = _about_origin(r.jacobian.double(), T.translation.double()[:, None])
-    points = problem.held_out.object_samples.points.double()
-    m = len(points)
-    motion = torch.cat([_cross_matrix(points).mT, torch.eye(3).double().expand(m, 3, 3), points[..., None]], -1)
-    G = (motion.mT @ motion).mean(0)
-    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(7).double()))
-    return J @ inverse.mT
-
-
-def _stiffness(J: Tensor, groups: _Groups) -> Tensor:
+def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Groups) -> Tensor:
     """(H, 2): the two least root mean square residuals of the surfaces that agree when the object's surface moves by a
     root mean square of 1, over all similarity motions. 0: the agreement leaves a motion free."""
-    m = groups.object_agrees.shape[1]
+    m = r.values.shape[1] - r.scene_count
     weights = torch.cat(
         [groups.scene_agrees / groups.near.sum(1, keepdim=True).clamp_min(1), groups.object_agrees / m], 1
     )
+    J = _about_origin(r.jacobian.double(), T.translation.double()[:, None])
     H = 0.5 * (J * weights.double()[..., None]).mT @ J
-    least: Tensor = torch.linalg.eigvalsh(H)[:, :2]
+    points = problem.held_out.object_samples.points.double()
+    motion = torch.cat([_cross_matrix(points).mT, torch.eye(3).double().expand(m, 3, 3), points[..., None]], -1)
+    G = (motion.mT @ motion).mean(0)
+    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(7).double()))
+    least: Tensor = torch.linalg.eigvalsh(inverse @ H @ inverse.mT)[:, :2]
     return least.clamp_min(0.0).sqrt()
-
-
-def _directions_apart(J: Tensor, r: Residuals, groups: _Groups) -> Tensor:
-    """(H,): how far apart the poses are that each direction's samples alone ask for, by one damped Newton step: the
-    logarithm of the root mean square over the object's surface. Errors of a map act on both directions alike; of a
-    surface that is only similar, each direction sees other parts."""
-    n = r.scene_count
-    weights = geman_mcclure_weight(r.values, EVIDENCE.agreement) * torch.cat([groups.near, groups.observed], 1)
-    steps = []
-    for part in (slice(None, n), slice(n, None)):
-        weighted = J[:, part] * (weights[:, part].double() / J[:, part].shape[1])[..., None]
-        H = weighted.mT @ J[:, part]
-        b = weighted.mT @ r.values[:, part, None].double()
-        steps.append(torch.linalg.solve(H + EVIDENCE.step_damping * torch.eye(7).double(), b)[..., 0])
-    return (steps[0] - steps[1]).norm(dim=-1).clamp(EVIDENCE.min_step, 1.0).log()
 
 
 def _about_origin(J: Tensor, t: Tensor) -> Tensor:

@@ -107,32 +107,3 @@ def test_a_pose_of_extreme_scale_far_away_has_features_too(problem: Registration
     for scale, distance in ((1e-6, 1e-6), (1e6, 1e8), (1.0, 1e8)):
         found = features_at(problem, replace(T, scale=T.scale * scale, translation=T.translation + distance))
         assert all(value == value for value in found.values())
-
-
-def test_directions_apart_by_finite_differences(problem: RegistrationProblem) -> None:
-    """Both damped Newton steps from numerical derivatives, in the group's own coordinates."""
-    T = truth(problem).perturb(torch.tensor([0.01, -0.02, 0.0, 0.004, 0.006, -0.003, 0.01], dtype=torch.float64))
-    r = residuals(problem.held_out, T[None], NO_OFFSET)
-    n, values = r.scene_count, r.values[0].double()
-    points = problem.held_out.object_samples.points.double()
-    back = T.inverse().apply(points)
-    h = 1e-4
-
-    def changes(motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        ends = [T.perturb(side * h * motion) for side in (1.0, -1.0)]
-        of_residuals = [residuals(problem.held_out, end[None], NO_OFFSET).values[0].double() for end in ends]
-        of_points = [end.apply(back) for end in ends]
-        return (of_residuals[0] - of_residuals[1]) / (2 * h), (of_points[0] - of_points[1]).reshape(-1) / (2 * h)
-
-    columns = [changes(motion) for motion in torch.eye(7, dtype=torch.float64)]
-    J, moved = torch.stack([one for one, _ in columns], 1), torch.stack([one for _, one in columns], 1)
-    G = moved.T @ moved / len(points)
-    weights = (1 + values.square() / 0.03**2) ** -2.0
-    weights[:n] *= values[:n].abs() <= 0.1
-    steps = []
-    for part in (slice(None, n), slice(n, None)):
-        w = (weights[part] / len(values[part]))[:, None]
-        steps.append(torch.linalg.solve(J[part].T @ (w * J[part]) + 0.003 * G, J[part].T @ (w[:, 0] * values[part])))
-    apart = steps[0] - steps[1]
-    assert features_at(problem, T)["directions_apart"] == pytest.approx(float((apart @ G @ apart).sqrt().log()), abs=0.05)
-    assert features_at(problem, truth(problem))["directions_apart"] < features_at(problem, T)["directions_apart"]
