@@ -144,7 +144,7 @@ class RobustOptions:
     max_free_space_violations: _Ratio = 0.2
     """Maximum share (0..1) of the object's surface in the scene's free space; above it: FREE_SPACE_VIOLATED. Accurate
     fields are allowed less. Increase it where the scene's field lacks parts of the object."""
-    max_occluded_share: _Ratio = 0.75
+    max_occluded_share: _Ratio = 0.85
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only."""
     min_probability: Annotated[float, Gt(0), Le(1)] = 0.9
