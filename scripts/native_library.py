@@ -22,13 +22,12 @@ FOLDER = Path("regnf_core/fields/native")
 NAME = "libregnf_evaluator.so"
 OPTIONS = ("-std=gnu11", "-O3", "-fPIC", "-fvisibility=hidden", "-fno-math-errno", "-fno-trapping-math")
 """None of them lets the compiler change the order of sums, or take NaN for a number."""
+PLAIN: dict[str, tuple[str, ...]] = {"plain": ()}
+_WIDE = tuple(f"-mavx512{part}" for part in ("f", "dq", "bw", "vl"))
 VARIANTS = {
-    "x86_64": {
-        "avx2": ("-mavx2", "-mfma"),
-        "avx512": (*("-mavx2", "-mfma", "-mprefer-vector-width=512"), *(f"-mavx512{x}" for x in ("f", "dq", "bw", "vl"))),
-    }
+    "x86_64": PLAIN | {"avx2": ("-mavx2", "-mfma"), "avx512": ("-mavx2", "-mfma", *_WIDE, "-mprefer-vector-width=512")}
 }
-"""Options for each set of instructions, by processor; any other has one, of what all processors of its kind have."""
+"""Options for each set of instructions, by processor. ``plain`` is what all processors of a kind have."""
 
 
 class NotBuiltError(Exception):
@@ -42,19 +41,21 @@ def sources_digest(folder: Path) -> str:
 
 
 def build(folder: Path, target: Path) -> None:
-    """Make ``target`` of the C files in ``folder``, unless it is made of these already. Raises NotBuiltError."""
+    """Make ``target`` of the C files in ``folder``, unless it is made of these already. Raises NotBuiltError; a library
+    of other files is gone then."""
+    digest = sources_digest(folder)
+    if target.exists() and digest.encode() in target.read_bytes():
+        return
+    target.unlink(missing_ok=True)
     if os.environ.get("REGNF_NATIVE") == "0":
         raise NotBuiltError("REGNF_NATIVE is 0")
     if sys.platform != "linux" or sys.maxsize < 2**32:
         raise NotBuiltError("only built for 64-bit Linux")
-    digest = sources_digest(folder)
-    if target.exists() and digest.encode() in target.read_bytes():
-        return
     compiler = shlex.split(os.environ.get("CC", "")) or [_found_compiler()]
     with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
         made = Path(scratch) / NAME
         _compile(compiler, folder, digest, made)
-        os.replace(made, target)  # a process that has the old one loaded keeps it
+        os.replace(made, target)  # whole or not at all
 
 
 def _found_compiler() -> str:
@@ -66,7 +67,7 @@ def _found_compiler() -> str:
 
 def _compile(compiler: list[str], folder: Path, digest: str, made: Path) -> None:
     objects = []
-    for name, options in VARIANTS.get(platform.machine(), {"plain": ()}).items():
+    for name, options in VARIANTS.get(platform.machine(), PLAIN).items():
         objects.append(made.with_name(f"{name}.o"))
         _run([*compiler, *OPTIONS, *options, f"-DREGNF_SET={name}", "-c", folder / "evaluate.c", "-o", objects[-1]])
     objects.append(made.with_name("library.o"))
@@ -88,7 +89,6 @@ def main() -> None:
     try:
         build(folder, folder / NAME)
     except NotBuiltError as error:
-        (folder / NAME).unlink(missing_ok=True)  # what is there was built from other sources
         print(f"No native evaluator ({error}): fields are evaluated with torch, which takes longer.", file=sys.stderr)
 
 

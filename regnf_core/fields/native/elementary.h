@@ -34,7 +34,7 @@ INLINE float exp_of(float x) {
     y = y * r + 0.49999991059303284f;
     y = y * r + 1.0f;
     y = y * r + 1.0f;
-    return float_of((int32_t)((uint32_t)bits_of(y) + ((uint32_t)bits_of(shifted) << 23)));
+    return y * float_of((int32_t)(((uint32_t)bits_of(shifted) << 23) + 0x3f800000u)); /* the product keeps NaN */
 }
 
 /* log(1 + x) for x in [0, 1]; relative error 3e-8. */

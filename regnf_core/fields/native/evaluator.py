@@ -90,7 +90,8 @@ def _described(function: NeusFactoFunction) -> tuple[_Field, list[Any]]:
     widths = (ctypes.c_int32 * (count + 1))(mlp.weights[0].shape[1], *(weight.shape[0] for weight in mlp.weights))
     weights, biases = ((ctypes.c_void_p * count)(*map(Tensor.data_ptr, some)) for some in (mlp.weights, mlp.biases))
     field = _Field(layers=count, contraction=_CONTRACTIONS[function.contraction], radius=function.grid_radius)
-    field.widths, field.weights, field.biases = map(ctypes.addressof, (widths, weights, biases))
+    field.widths = ctypes.addressof(widths)
+    field.weights, field.biases = ctypes.addressof(weights), ctypes.addressof(biases)
     kept = [function, widths, weights, biases]
     if waves is not None:
         along, frequencies = _waves(waves)

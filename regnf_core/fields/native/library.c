@@ -12,13 +12,14 @@ typedef struct {
     int runs; /* on this processor */
 } variant;
 
-#define MAX_VARIANTS 2
+regnf_evaluate_function regnf_evaluate_plain;
+regnf_elementary_function regnf_elementary_plain;
 
 #if defined(__x86_64__)
+#define VARIANTS 3
 regnf_evaluate_function regnf_evaluate_avx2, regnf_evaluate_avx512;
 regnf_elementary_function regnf_elementary_avx2, regnf_elementary_avx512;
 
-/* A processor without AVX2 has none: there torch is faster. */
 static void list_variants(variant *all) {
     __builtin_cpu_init();
     const int narrow = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
@@ -26,10 +27,10 @@ static void list_variants(variant *all) {
                      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
     all[0] = (variant){"avx512", regnf_evaluate_avx512, regnf_elementary_avx512, narrow && wide};
     all[1] = (variant){"avx2", regnf_evaluate_avx2, regnf_elementary_avx2, narrow};
+    all[2] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, 1};
 }
 #else
-regnf_evaluate_function regnf_evaluate_plain;
-regnf_elementary_function regnf_elementary_plain;
+#define VARIANTS 1
 
 static void list_variants(variant *all) {
     all[0] = (variant){"plain", regnf_evaluate_plain, regnf_elementary_plain, 1};
@@ -38,9 +39,9 @@ static void list_variants(variant *all) {
 
 /* The number-th that this processor runs, fastest first. Returns 0 where there is none. */
 static int find(int number, variant *found) {
-    variant all[MAX_VARIANTS] = {{NULL, NULL, NULL, 0}};
+    variant all[VARIANTS];
     list_variants(all);
-    for (int i = 0; i < MAX_VARIANTS; i++) {
+    for (int i = 0; i < VARIANTS; i++) {
         if (!all[i].runs || number-- != 0) continue;
         *found = all[i];
         return 1;

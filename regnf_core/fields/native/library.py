@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -15,6 +16,9 @@ from pathlib import Path
 
 LIBRARY = Path(__file__).with_name("libregnf_evaluator.so")
 SWITCH = "REGNF_NATIVE"
+NOT_BUILT = "was not built"
+_PLAIN = "plain"
+"""The variant for what all processors of a kind have."""
 _LAYOUT = 1
 """Of the structure in field.h."""
 
@@ -43,21 +47,25 @@ class Library:
     sources: str = ""
     """A digest of the files that it was made of."""
 
+    @property
+    def fastest(self) -> Variant | None:
+        """The first variant, where it is faster than torch."""
+        return self.variants[0] if self.variants and self.fault is None else None
+
 
 def variant() -> Variant | None:
     """What evaluates here; None: torch does."""
     if os.environ.get(SWITCH) == "0":
         return None
-    found = load().variants
-    return found[0] if found else None
+    return load().fastest
 
 
 @cache
 def load(path: Path = LIBRARY) -> Library:
     """The library in a file, whatever REGNF_NATIVE says."""
-    if not path.exists():
-        return Library(fault="not built: there was no C compiler when regnf was installed")
     try:
+        if not path.exists():
+            return Library(fault=NOT_BUILT)
         return _described(ctypes.CDLL(str(path)))
     except (OSError, AttributeError) as error:  # of another system, or not this library
         return Library(fault=f"does not load: {error}")
@@ -71,9 +79,9 @@ def _described(code: ctypes.CDLL) -> Library:
     code.regnf_variant.restype = ctypes.c_char_p
     while (name := code.regnf_variant(len(names))) is not None:
         names.append(name.decode())
-    if not names:
-        return Library(fault="has no code for this processor (AVX2 and FMA are needed)", sources=sources)
-    return Library(tuple(_variant(code, number, name) for number, name in enumerate(names)), sources=sources)
+    slow = names[0] == _PLAIN and platform.machine() == "x86_64"
+    fault = "is slower than torch on this processor, which has no AVX2" if slow else None
+    return Library(tuple(_variant(code, number, name) for number, name in enumerate(names)), fault, sources)
 
 
 def _text(function: ctypes._NamedFuncPointer) -> str:

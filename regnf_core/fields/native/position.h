@@ -31,27 +31,29 @@ static void pull_back_contraction(const plane *x, plane *g) {
         const float slope = most < 1.0f ? 0.0f : (2.0f / m - 2.0f) / (m * m);
         const float along = slope * (x[0][p] * g[0][p] + x[1][p] * g[1][p] + x[2][p] * g[2][p]);
         const float factor = (2.0f - 1.0f / m) / m;
-        g[0][p] = g[0][p] * factor + (first ? copysignf(along, x[0][p]) * copysignf(1.0f, along) : 0.0f);
-        g[1][p] = g[1][p] * factor + (second ? copysignf(along, x[1][p]) * copysignf(1.0f, along) : 0.0f);
-        g[2][p] = g[2][p] * factor + (first || second ? 0.0f : copysignf(along, x[2][p]) * copysignf(1.0f, along));
+        const float on_x = x[0][p] < 0.0f ? -along : along, on_y = x[1][p] < 0.0f ? -along : along;
+        const float on_z = x[2][p] < 0.0f ? -along : along;
+        g[0][p] = g[0][p] * factor + (first ? on_x : 0.0f);
+        g[1][p] = g[1][p] * factor + (second ? on_y : 0.0f);
+        g[2][p] = g[2][p] * factor + (first || second ? 0.0f : on_z);
     }
 }
 
-/* Angles of one length and frequency, their sines and cosines. */
+/* Sine and cosine of a length times a frequency. The C library takes the angles that are too large, and NaN. */
 static void wave(const float *length, float frequency, float *sine, float *cosine) {
-    float angles[BLOCK];
     int large = 0;
     for (int p = 0; p < BLOCK; p++) {
-        angles[p] = length[p] * frequency;
-        large |= !(fabsf(angles[p]) <= LARGEST_ANGLE);
+        const float angle = length[p] * frequency;
+        const int is_large = !(fabsf(angle) <= LARGEST_ANGLE);
+        sin_cos(is_large ? 0.0f : angle, &sine[p], &cosine[p]);
+        large |= is_large;
     }
-    for (int p = 0; p < BLOCK; p++) sin_cos(angles[p], &sine[p], &cosine[p]);
-    if (!large) return;
-    for (int p = 0; p < BLOCK; p++)
-        if (!(fabsf(angles[p]) <= LARGEST_ANGLE)) {
-            sine[p] = sinf(angles[p]);
-            cosine[p] = cosf(angles[p]);
-        }
+    for (int p = 0; large && p < BLOCK; p++) {
+        const float angle = length[p] * frequency;
+        if (fabsf(angle) <= LARGEST_ANGLE) continue;
+        sine[p] = sinf(angle);
+        cosine[p] = cosf(angle);
+    }
 }
 
 static void length_along(const regnf_field *f, int direction, const plane *z, float *length) {
