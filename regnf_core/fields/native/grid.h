@@ -8,6 +8,8 @@ typedef struct {
     plane slopes[3];         /* of the weights by the point in the unit cube */
 } cells;
 
+#define LARGEST_SCALE 1e9f /* the numbers of corners in the cube have 31 bits then */
+
 /* The lower 32 bits of a whole number in float32, as they are in 64 bits; 0 where it has no 64 bits. */
 INLINE uint32_t wrapped(float whole) {
     return fabsf(whole) < 9.2e18f ? (uint32_t)(int64_t)whole : 0u;
@@ -26,10 +28,12 @@ INLINE void locate_axis(float scale, int smooth, int inside, const float *unit, 
     for (int p = 0; p < BLOCK; p++) corner[p] = wrapped(floorf(unit[p] * scale + 0.5f));
 }
 
-/* Whether the sum of a corner within the cube passes a dense level's entries once at most. */
+/* Whether the sum of a corner within the cube passes a dense level's entries once at most. In double precision, since a
+ * file may describe any scale. */
 INLINE int passes_once(const regnf_field *f, int level) {
-    const uint64_t last = (uint64_t)(f->scales[level] + 0.5f) + 1, row = f->strides[f->levels + level];
-    return last * (f->strides[level] + row + f->strides[2 * f->levels + level]) < 2 * (uint64_t)f->entries[level];
+    const double last = floor((double)f->scales[level] + 0.5) + 1.0;
+    const double steps = (double)f->strides[level] + f->strides[f->levels + level] + f->strides[2 * f->levels + level];
+    return last * steps < 2.0 * f->entries[level];
 }
 
 /* Rows from what the lower corner adds along each axis, and one step more. once: of a dense level, whose sum passes its
@@ -54,8 +58,9 @@ INLINE void corner_rows(const regnf_field *f, int level, int dense, int once, ui
 
 static void locate(const regnf_field *f, int level, int inside, const plane *unit, cells *found) {
     uint32_t lower[3][BLOCK];
+    const float scale = f->scales[level];
+    inside &= scale < LARGEST_SCALE;
     for (int axis = 0; axis < 3; axis++) {
-        const float scale = f->scales[level];
         const uint32_t stride = f->strides[axis * f->levels + level];
         float *weights = found->weights[axis], *slopes = found->slopes[axis];
         if (!inside) locate_axis(scale, f->smoothstep, 0, unit[axis], lower[axis], weights, slopes);

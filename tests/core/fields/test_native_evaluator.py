@@ -183,6 +183,19 @@ def test_far_points_read_nothing_beyond_the_table(compiled: Any) -> None:
     torch.testing.assert_close(compiled(one).value(far), expected, rtol=1e-3, atol=0)
 
 
+def test_a_file_may_describe_any_scale(compiled: Any) -> None:
+    """Levels with few nodes by their table and many cells by their scale; strides that wrap around 32 bits."""
+    sizes: dict[str, Any] = {"resolutions": (4,) * 20, "strides": (1 << 16, 1 << 24) * 10, "log2_table_size": 8}
+    config = HashGridConfig(levels=20, base_resolution=1024, per_level_scale=8.0, **sizes)
+    grid = HashEncoding(config, torch.rand(config.entries, 2))
+    mlp = GeometryMlp([torch.rand(4, 43), torch.rand(1, 4)], [torch.rand(4), torch.rand(1)], None)
+    one = NeusFactoFunction(mlp, None, grid)
+    corners = torch.cartesian_prod(*[torch.tensor([-2.0, 0.0, 1.0, 2.0])] * 3)  # exact at every scale
+    with torch.no_grad():
+        expected = one.value(corners)
+    torch.testing.assert_close(compiled(one).value(corners), expected, rtol=1e-5, atol=0)
+
+
 def test_large_angles_are_those_of_the_c_library(compiled: Any) -> None:
     waves = PositionalEncoding(24, 6.2831855)
     weights = [torch.rand(5, 3 + waves.width) - 0.5, torch.rand(1, 5)]
