@@ -47,6 +47,7 @@ def test_what_is_built_loads_and_is_not_built_twice(built: Path) -> None:
 def test_a_library_of_older_sources_goes(built: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     built.write_bytes(built.read_bytes().replace(sources_digest(SOURCES).encode(), b"0" * 64))
     monkeypatch.setenv("CC", "no-such-compiler")
+    monkeypatch.delenv("REGNF_NATIVE", raising=False)
     with pytest.raises(NotBuiltError, match="no-such-compiler"):
         build(SOURCES, built)
     assert not built.exists()
@@ -60,6 +61,7 @@ def test_without_a_compiler_there_is_a_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, value: str, said: str
 ) -> None:
     monkeypatch.delenv("CC", raising=False)
+    monkeypatch.delenv("REGNF_NATIVE", raising=False)
     monkeypatch.setenv(name, value)
     with pytest.raises(NotBuiltError, match=said):
         build(SOURCES, tmp_path / NAME)
