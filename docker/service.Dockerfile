@@ -3,8 +3,13 @@
 # BASE is any Debian 12 with Python 3.11, its venv module and `python` in the path.
 ARG BASE=python:3.11-slim-bookworm
 
-# The project as a wheel: what the images hold is what `pip install regnf` would bring.
+# The project as a wheel: what the images hold is what `pip install regnf` would bring. The compiler makes the native
+# evaluator, and stays in this stage. Versions come with the pinned release of the base image.
 FROM ${BASE} AS wheel
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends gcc libc6-dev \
+    && rm -rf /var/lib/apt/lists/*
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/build
 WORKDIR /source

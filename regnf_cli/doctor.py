@@ -13,6 +13,7 @@ from rich.table import Table
 from regnf_cli.checks.finding import Finding
 from regnf_cli.checks.gpu import check_gpu
 from regnf_cli.checks.libraries import check_libraries
+from regnf_cli.checks.native import check_native
 from regnf_cli.console import EXIT_UNAVAILABLE, out
 from regnf_cli.extras import require
 from regnf_core.errors import InvalidInputError, MissingExtraError
@@ -42,6 +43,7 @@ def doctor(
 def check_all() -> Iterator[Finding]:
     """Everything, in the order in which a user needs it."""
     yield from check_libraries()
+    yield from check_native()
     yield check_gpu()
     try:
         require("service")

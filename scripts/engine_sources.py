@@ -24,6 +24,7 @@ from regnf_core.registration import register
 
 ENTRIES = tuple(function.__module__ for function in (open_field, register, register_batch, search_library))
 """Where a registration starts, and where the fields that it evaluates come from."""
+_C_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _LAYOUT_FIELDS = frozenset({"ctx", "kind", "type_comment", "type_ignores", "type_params"})
 """Members of syntax trees that say nothing here, or that not every version of Python has."""
 
@@ -60,9 +61,16 @@ def source_digest(root: Path, entries: Sequence[str] = ENTRIES) -> str:
 
 
 def _data_beside(root: Path, names: Iterable[str]) -> list[str]:
-    """Digests of the JSON files in the modules' folders: the engine may read them."""
+    """Digests of the JSON files in the modules' folders, which the engine may read, and of the C files there."""
     folders = {root.joinpath(*name.split(".")[:-1]) for name in names}
-    return sorted(_digest(json.loads(path.read_text("utf-8"))) for folder in folders for path in folder.glob("*.json"))
+    data = [json.loads(path.read_text("utf-8")) for folder in folders for path in folder.glob("*.json")]
+    code = [_c_tokens(path.read_text("utf-8")) for folder in folders for path in folder.glob("*.[ch]")]
+    return sorted(map(_digest, data + code))
+
+
+def _c_tokens(text: str) -> list[str]:
+    """A C file without comments and layout."""
+    return _C_COMMENT.sub(" ", text).split()
 
 
 def engine_modules(root: Path, entries: Sequence[str] = ENTRIES) -> dict[str, Module]:

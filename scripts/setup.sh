@@ -13,6 +13,7 @@ scripts/system-packages.sh runtime
 stamp=.venv/.regnf-setup
 state=$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum)
 if [[ -f $stamp && $(cat "$stamp") == "$state" ]]; then
+    .venv/bin/python scripts/native_library.py # its C files may have changed
     exit 0
 fi
 

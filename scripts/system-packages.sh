@@ -1,15 +1,16 @@
 #!/usr/bin/env bash
 # System libraries that Python packages need and cannot bring along.
-#   scripts/system-packages.sh runtime   what open3d loads
+#   scripts/system-packages.sh runtime   what open3d loads, and a C compiler for the native evaluator
 #   scripts/system-packages.sh test      the same, a browser for the page's tests, and a Redis beside the packaged Valkey
 #   scripts/system-packages.sh images    what scripts/images.sh builds and runs images with
 # As root on Debian or Ubuntu it installs what is missing; otherwise it names it.
 set -euo pipefail
 
 runtime=(libgl1 libegl1 libx11-6 libusb-1.0-0 libidn2-0 libudev1 libgomp1)
+compiler=(gcc libc6-dev) # without it regnf works, and takes longer
 case "${1:-runtime}" in
-    runtime) wanted=("${runtime[@]}") ;;
-    test) wanted=("${runtime[@]}" chromium redis-tools) ;;
+    runtime) wanted=("${runtime[@]}" "${compiler[@]}") ;;
+    test) wanted=("${runtime[@]}" "${compiler[@]}" chromium redis-tools) ;;
     images) wanted=(buildah debootstrap iproute2) ;;
     *) echo "usage: $0 runtime|test|images" >&2; exit 2 ;;
 esac

@@ -76,6 +76,9 @@ def tree_of(commit: str, folder: Path) -> Iterator[Path]:
     git = ["git", "-C", str(ROOT), "worktree"]
     subprocess.run([*git, "add", "--quiet", "--detach", str(folder), commit], check=True)
     try:
+        native = folder / "scripts" / "native_library.py"
+        if native.exists():  # an older commit has none
+            subprocess.run([sys.executable, str(native)], check=True)
         yield folder
     finally:
         subprocess.run([*git, "remove", "--force", str(folder)], check=True)

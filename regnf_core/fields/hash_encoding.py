@@ -8,6 +8,7 @@ long rows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -52,6 +53,18 @@ class _Cells:
     corners: Tensor  # (8 A N,) int64, corner-major (x slowest), then level, then point
     weights: Tensor  # (3, A, N) interpolation weight towards the upper corner along x, y, z
     slopes: Tensor  # (3, A, N) derivative of the weights with respect to the point
+
+
+@dataclass(frozen=True, eq=False)
+class GridLayout:
+    """Where levels lie in the table, for compiled code. scales: (A,) float32 · strides: (3, A), entries, offsets: (A,),
+    all the lower 32 bits · rows: that the table must have."""
+
+    scales: Tensor
+    strides: Tensor
+    entries: Tensor
+    offsets: Tensor
+    rows: int
 
 
 class HashEncoding:
@@ -115,6 +128,15 @@ class HashEncoding:
         """Cells along an edge of the cube, of each active level (A,)."""
         return self._scales.flatten()
 
+    @cached_property
+    def layout(self) -> GridLayout:
+        """What the class says of its levels, on the CPU."""
+        strides, entries, offsets = (
+            lower_32_bits(t.cpu().squeeze(-1)) for t in (self.strides, self.entries, self.offsets)
+        )
+        rows = int(self.offsets[-1] + self.entries[-1])
+        return GridLayout(self.scales.cpu().contiguous(), strides, entries, offsets, rows)
+
     def by_level(self, values: Tensor) -> Tensor:
         """Sums (A, N, 3) over the features of each level, of values (3, N, width)."""
         levels = values.view(3, values.shape[1], self.active_levels, self.config.features_per_level)
@@ -169,3 +191,9 @@ class HashEncoding:
 
     def _column(self, values: Tensor) -> Tensor:
         return values.to(self.table.device).unsqueeze(-1)
+
+
+def lower_32_bits(numbers: Tensor) -> Tensor:
+    """int64 as int32 with the same lower 32 bits."""
+    lower = numbers & _UINT32
+    return torch.where(lower > _UINT32 >> 1, lower - (1 << 32), lower).int().contiguous()

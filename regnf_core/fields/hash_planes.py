@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.fields.hash_encoding import HashEncoding
+from regnf_core.fields.hash_encoding import HashEncoding, lower_32_bits
 
 _SIGN = 31
 """The bit that tells negative 32-bit numbers."""
@@ -41,7 +41,7 @@ class HashPlanes:
         width = encoding.config.features_per_level
         self._encoding = encoding
         # Rows become places in the flat table: all numbers are multiplied by the features of a row, before they wrap.
-        self._strides = _wrapped(encoding.strides * width)
+        self._strides = lower_32_bits(encoding.strides * width)
         self._entries = (encoding.entries * width).int()
         self._offsets = (encoding.offsets * width).int()
 
@@ -111,9 +111,3 @@ def sum_of_planes(planes: Tensor) -> Tensor:
     for number in range(1, planes.shape[1]):
         total.add_(planes[:, number])
     return total
-
-
-def _wrapped(numbers: Tensor) -> Tensor:
-    """int64 as int32 with the same lower 32 bits."""
-    lower = numbers & 0xFFFFFFFF
-    return torch.where(lower >= 2**_SIGN, lower - 2**32, lower).int()

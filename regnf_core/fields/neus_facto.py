@@ -14,6 +14,7 @@ from regnf_core.fields.color_head import ColorHead
 from regnf_core.fields.function_field import Evaluator, FunctionField
 from regnf_core.fields.geometry_mlp import GeometryMlp
 from regnf_core.fields.hash_encoding import HashEncoding
+from regnf_core.fields.native.evaluator import native_evaluator
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_core.fields.neus_facto_planes import prepared
 from regnf_core.fields.positional_encoding import PositionalEncoding
@@ -24,7 +25,7 @@ class NeusFactoField(FunctionField[NeusFactoFunction]):
     """A :class:`NeusFactoFunction` as an SdfField."""
 
     def _evaluator(self) -> Evaluator:
-        return prepared(self.function)
+        return native_evaluator(self.function) or prepared(self.function)
 
 
 def build_neus_facto(

@@ -53,8 +53,8 @@ class PositionalEncoding:
 
     def encode_planes(self, points: Tensor) -> Tensor:
         """Features (6 degree, N) at points (3, N), in the order of :meth:`encode`, to the last digit the same."""
-        lengths = self._directions(points) @ points if self.off_axis else points
-        angles = (lengths.unsqueeze(1) * self._frequencies(points).unsqueeze(-1)).flatten(0, 1)
+        lengths = self.directions(points) @ points if self.off_axis else points
+        angles = (lengths.unsqueeze(1) * self.frequencies(points).unsqueeze(-1)).flatten(0, 1)
         return torch.cat((angles.sin(), angles.cos()))
 
     def pull_back(self, encoded: Tensor, gradient: Tensor) -> Tensor:
@@ -63,28 +63,30 @@ class PositionalEncoding:
         by_sine, by_cosine = gradient.chunk(2, dim=-1)
         by_angle = by_sine * cosines - by_cosine * sines  # (N, 3 degree)
         by_axis = by_angle.reshape(*by_angle.shape[:-1], by_angle.shape[-1] // self.degree, self.degree)
-        by_length = (by_axis * self._frequencies(encoded)).sum(dim=-1)
-        return by_length @ self._directions(encoded) if self.off_axis else by_length
+        by_length = (by_axis * self.frequencies(encoded)).sum(dim=-1)
+        return by_length @ self.directions(encoded) if self.off_axis else by_length
 
     def pull_back_planes(self, encoded: Tensor, gradient: Tensor) -> Tensor:
         """Gradient (3, N) with respect to the points, from ``encoded`` and the gradient by it (both (6 degree, N))."""
         sines, cosines = encoded.chunk(2)
-        frequencies = self._frequencies(encoded).tolist()
+        frequencies = self.frequencies(encoded).tolist()
         by_sine, by_cosine = gradient.chunk(2)
         by_angle = torch.addcmul(by_sine * cosines, by_cosine, sines, value=-1.0)
         by_angle = by_angle.reshape(len(by_angle) // self.degree, self.degree, by_angle.shape[1])
         by_length: Tensor = by_angle[:, 0] * frequencies[0]
         for k in range(1, self.degree):
             by_length.add_(by_angle[:, k], alpha=frequencies[k])
-        return self._directions(encoded).T @ by_length if self.off_axis else by_length
+        return self.directions(encoded).T @ by_length if self.off_axis else by_length
 
     def _angles(self, points: Tensor) -> Tensor:
-        lengths = points @ self._directions(points).T if self.off_axis else points
-        return (lengths.unsqueeze(-1) * self._frequencies(points)).flatten(start_dim=1)
+        lengths = points @ self.directions(points).T if self.off_axis else points
+        return (lengths.unsqueeze(-1) * self.frequencies(points)).flatten(start_dim=1)
 
     @staticmethod
-    def _directions(like: Tensor) -> Tensor:
+    def directions(like: Tensor) -> Tensor:
+        """Those of ``off_axis`` (21, 3), of the type and on the device of ``like``."""
         return torch.tensor(_ICOSAHEDRON, dtype=like.dtype, device=like.device)
 
-    def _frequencies(self, like: Tensor) -> Tensor:
+    def frequencies(self, like: Tensor) -> Tensor:
+        """What the coordinates are multiplied by (degree,), of the type and on the device of ``like``."""
         return self.base_frequency * 2.0 ** torch.arange(self.degree, dtype=like.dtype, device=like.device)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import socket
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-from regnf_cli.checks import libraries, machine, stores
+from regnf_cli.checks import libraries, machine, native, stores
 from regnf_cli.checks.finding import Finding
+from regnf_core.fields.native import library
 from regnf_state.settings import Settings
 from tests.cli.conftest import Run
 
@@ -42,6 +44,18 @@ def test_a_redis_that_does_not_answer(quick: None, run: Run, monkeypatch: pytest
     assert (code, found["redis"]["state"]) == (3, "error")
     assert "REGNF_REDIS_URL" in found["redis"]["hint"]
     assert "secret" not in str(found)
+
+
+def test_how_fields_are_evaluated(monkeypatch: pytest.MonkeyPatch) -> None:
+    load = library.load
+    monkeypatch.delenv(library.SWITCH, raising=False)
+    for path, said in ((Path("none.so"), "compiled code was not built"), (library.LIBRARY, "compiled code")):
+        monkeypatch.setattr(library, "load", partial(load, path))
+        (found,) = native.check_native()
+        assert (found.state, said in found.found) == ("ok", True)
+    monkeypatch.setenv(library.SWITCH, "0")
+    (found,) = native.check_native()
+    assert found.found == "torch: compiled code is off, REGNF_NATIVE is 0"
 
 
 def test_a_faulty_setting(quick: None, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

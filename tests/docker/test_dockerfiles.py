@@ -67,10 +67,10 @@ def admitted() -> list[str]:
 
 
 def sent_files() -> list[Path]:
-    """Every file that is sent to the builder, but what Python compiles."""
+    """Every file that is sent to the builder, but what is compiled here."""
     places = [place for pattern in admitted() for place in ROOT.glob(pattern)]
     files = [path for place in places for path in (place, *place.rglob("*")) if path.is_file()]
-    return [path.relative_to(ROOT) for path in files if path.suffix != ".pyc"]
+    return [path.relative_to(ROOT) for path in files if path.suffix not in (".pyc", ".so")]
 
 
 @every_image

@@ -90,6 +90,16 @@ def test_code_counts_wherever_it_is(tmp_path: Path, before: str, module: str, ol
     assert source_digest(after, ENTRY) != before
 
 
+def test_c_files_beside_a_module_count_but_for_their_comments(tmp_path: Path, before: str) -> None:
+    first, second, third = (tree(tmp_path / name) for name in ("first", "second", "third"))
+    (first / "core/parts/shape.c").write_text("/* one */ int sides = 4;\n", encoding="utf-8")
+    (second / "core/parts/shape.c").write_text("int  sides = 4; /* another,\n of two lines */\n", encoding="utf-8")
+    (third / "core/parts/shape.c").write_text("int sides = 5;\n", encoding="utf-8")
+    digests = [source_digest(root, ENTRY) for root in (first, second, third)]
+    assert digests[0] == digests[1]
+    assert len({before, *digests}) == 3
+
+
 def test_a_module_may_be_moved(tmp_path: Path, before: str) -> None:
     after = tree(tmp_path / "after", core__start=START.replace("core.parts.shape", "core.geometry"))
     (after / "core/parts/shape.py").rename(after / "core/geometry.py")

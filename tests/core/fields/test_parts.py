@@ -42,7 +42,7 @@ def test_the_directions_off_the_axes_are_those_of_an_icosahedron() -> None:
     pairs = torch.combinations(torch.arange(12))
     edges = corners[pairs][(corners[pairs].diff(dim=1).norm(dim=-1) - 2).abs()[:, 0] < 1e-6].mean(dim=1)
     expected = torch.nn.functional.normalize(torch.cat((corners, edges)), dim=-1)  # (42, 3)
-    directions = PositionalEncoding._directions(expected)
+    directions = PositionalEncoding.directions(expected)
     both = torch.cat((directions, -directions))
     distance = torch.cdist(expected, both, compute_mode="donot_use_mm_for_euclid_dist").min(dim=1)
     assert float(distance.values.max()) < 1e-6

@@ -1,0 +1,1 @@
+"""The evaluator of neus-facto fields in C, and what loads and calls it."""
