@@ -34,14 +34,18 @@ class Observation:
     T_grid_frame: Sim3 | None = None
 
     def at(self, points: Tensor) -> Tensor:
-        """The states (N,) at points (N, 3) on the CPU; UNSEEN beyond the grid."""
+        """The states (N,) at points (N, 3) on the observation's device; UNSEEN beyond the grid."""
         if self.T_grid_frame is not None:
             points = self.T_grid_frame.apply(points.double())
         cells = ((points - self.low.to(points)) / self.voxel).floor().long()
-        counts = torch.tensor(self.states.shape)
-        within = ((cells >= 0) & (cells < counts)).all(-1)
-        x, y, z = cells.clamp_min(0).minimum(counts - 1).unbind(-1)
+        x, y, z = (cells[..., k].clamp(0, count - 1) for k, count in enumerate(self.states.shape))
+        within = (x == cells[..., 0]) & (y == cells[..., 1]) & (z == cells[..., 2])
         return torch.where(within, self.states[x, y, z], UNSEEN)
+
+    def to(self, device: torch.device | str) -> Observation:
+        """The same on another device, for points there."""
+        T = None if self.T_grid_frame is None else self.T_grid_frame.on(device)
+        return Observation(self.states.to(device), self.low.to(device), self.voxel, T)
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner, in the points' frame, of a box that holds all voxels in which a

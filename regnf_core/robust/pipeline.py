@@ -66,6 +66,7 @@ def register_robust(
     """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
 
     ``scene_view`` saves making one; it must be of this scene, box, options and seed.
+    The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
     """
@@ -127,7 +128,8 @@ def refine_poses(
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
     found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
-    origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
+    origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
+    origins = origins.where(origins < len(found), 0)
     joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
     return coarse_to_fine(problem.fit, joined, REFINEMENT.last_stages, context)
 
@@ -143,14 +145,14 @@ def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim
 
 def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
     """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
-    box = view.detection
+    box, device = view.detection, view.foreground.points.device
     return seed_poses(
         view.foreground.on_surface(),
         model.samples.on_surface(),
-        box.rotation,
-        box.size / box.diagonal,
-        rotations,
-        torch.tensor(SEARCH.scale_factors),
+        box.rotation.to(device),
+        (box.size / box.diagonal).to(device),
+        rotations.to(device),
+        torch.tensor(SEARCH.scale_factors, device=device),
         scale,
     )
 
@@ -191,15 +193,15 @@ def _starts(
     T_start: Sim3 | None,
 ) -> Iterator[_Start]:
     """One attempt after another, each made when its turn comes."""
-    view, model = problem.view, problem.model
+    view, model, device = problem.view, problem.model, problem.view.foreground.points.device
     if T_start is not None:
-        start = problem.in_working_frames(T_start)
+        start = problem.in_working_frames(T_start).on(device)
         yield _Start(seed_poses_around(start, generator), start.expand(1))
     seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
     yield _Start(seeds, seeds[:0])
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        yield _Start(Sim3.cat([seeds, matched]), seeds[:0], SEARCH.thorough_stages)
+        yield _Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
 
 
 def _attempt(

@@ -14,7 +14,7 @@ offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -29,6 +29,13 @@ class DistanceModel(Protocol):
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
+@runtime_checkable
+class CheckedLater(Protocol):
+    """A distance model whose values are checked when asked for: see :class:`WorkingField`."""
+
+    def require_finite(self) -> None: ...
+
+
 @dataclass(frozen=True, eq=False)
 class SurfacePair:
     """The scene's and the object's surface: a distance model and samples of each, in their working frames."""
@@ -37,6 +44,16 @@ class SurfacePair:
     obj: DistanceModel
     scene_samples: Samples
     object_samples: Samples
+
+    def to(self, device: torch.device | str) -> SurfacePair:
+        """The same with the samples on another device."""
+        return SurfacePair(self.scene, self.obj, self.scene_samples.to(device), self.object_samples.to(device))
+
+    def require_finite(self) -> None:
+        """Raises InvalidInputError (FIELD_NOT_FINITE) for what a field said where nobody could read it."""
+        for model in (self.scene, self.obj):
+            if isinstance(model, CheckedLater):
+                model.require_finite()
 
     def subsample(self, limit: int, generator: torch.Generator) -> SurfacePair:
         """The pair with at most ``limit`` samples of each surface, at random."""
@@ -83,6 +100,12 @@ class Residuals:
         column[..., : self.scene_count] = -1.0
         return torch.cat([self.jacobian.mT, column.to(self.jacobian)], 1).mT
 
+    def to(self, device: torch.device | str) -> Residuals:
+        """The same on another device."""
+        values, J, cosines = (part.to(device) for part in (self.values, self.jacobian, self.cosines))
+        unobserved, offset = (None if part is None else part.to(device) for part in (self.unobserved, self.offset))
+        return Residuals(values, J, cosines, self.scene_count, unobserved, offset)
+
     @classmethod
     def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
         """Those of ``first`` for the poses where ``mask`` (H,) is set, those of ``second`` for the others."""
@@ -119,17 +142,17 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, Tensor, Tensor]:
     s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
-    arm = (s[..., None] * R) @ A.points.T  # y - t, (H, 3, N)
+    arm = (s[..., None] * R) @ A.points.mT  # y - t, (H, 3, N)
     value, g = _query(obj, arm + t)
     own = s * A.values
-    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.T)
+    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.mT)
 
 
 def _object_to_scene(
     scene: DistanceModel, B: Samples, T: Sim3, unobserved: UnobservedTest | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
-    arm = B.points.T - t  # z - t, (H, 3, M)
+    arm = B.points.mT - t  # z - t, (H, 3, M)
     w = (R.mT / s[..., None]) @ arm
     value, g = _query(scene, w)
     turned = R @ g  # R g_a
@@ -137,7 +160,7 @@ def _object_to_scene(
     J = _jacobian(arm, -turned, scaled - _dot(turned, arm))
     r2 = scaled - B.values
     where = None if unobserved is None else unobserved(_as_points(w), r2.reshape(-1)).reshape(r2.shape)
-    return r2, J, _cosine(turned, B.normals.T), where
+    return r2, J, _cosine(turned, B.normals.mT), where
 
 
 def _query(model: DistanceModel, places: Tensor) -> tuple[Tensor, Tensor]:

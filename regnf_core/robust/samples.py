@@ -18,7 +18,7 @@ class UnobservedTest(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
 
     unobserved: where the field shows something that was not observed; None: everything was observed.
     """
@@ -34,20 +34,26 @@ class Samples:
     def __getitem__(self, index: Tensor) -> Samples:
         return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved)
 
+    def to(self, device: torch.device | str) -> Samples:
+        """The same samples on another device. The test stays: it works where its points are."""
+        points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
+        return Samples(points, values, normals, self.unobserved)
+
     def on_surface(self) -> Tensor:
         """The points (N, 3) moved onto the surface along their normals."""
         return self.points - self.values.unsqueeze(-1) * self.normals
 
 
 def subsample(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
-    """At most ``limit`` of the samples, at random."""
+    """At most ``limit`` of the samples, at random: drawn on the CPU, so that a seed means the same on every device."""
     if len(samples) <= limit:
         return samples
-    return samples[torch.randperm(len(samples), generator=generator)[:limit]]
+    drawn = torch.randperm(len(samples), generator=generator)[:limit]
+    return samples[drawn.to(samples.points.device)]
 
 
 def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
     """Two disjoint random parts; the second, a share ``held_out`` (0..1), is for the verdict alone."""
-    order = torch.randperm(len(samples), generator=generator)
+    order = torch.randperm(len(samples), generator=generator).to(samples.points.device)
     cut = len(samples) - int(held_out * len(samples))
     return samples[order[:cut]], samples[order[cut:]]

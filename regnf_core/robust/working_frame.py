@@ -12,6 +12,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.devices import on_host
 from regnf_core.schema.observation_grid import SURFACE, UNSEEN
 
 
@@ -38,31 +39,57 @@ class WorkingFrame:
 
 
 class WorkingField:
-    """A field in its working frame: value and gradient at (M, 3) float32 points on the CPU, results on the CPU."""
+    """A field in its working frame: value and gradient at (M, 3) float32 points, results on the points' device.
+
+    Points on the field's device are not copied. On the CPU, values are checked at once; elsewhere it would take a copy
+    to ask, so what is not finite is remembered there until ``require_finite``.
+    """
 
     def __init__(self, field: SdfField, frame: WorkingFrame) -> None:
         self.field = field
         self.frame = frame
+        self._centers: dict[torch.device, Tensor] = {}
+        self._not_finite: Tensor | None = None
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (M,), working units. Raises InvalidInputError (FIELD_NOT_FINITE)."""
-        distance = self.field.signed_distance(self._own(points)).cpu() / self.frame.length
-        return _finite(distance.float())
+        distance = self.field.signed_distance(self._own(points)).to(points.device) / self.frame.length
+        return self._finite(distance.float())
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (M,), working units, and its gradient (M, 3). Raises InvalidInputError (FIELD_NOT_FINITE)."""
         distance, gradient = self.field.signed_distance_and_gradient(self._own(points))
-        return _finite(distance.cpu().float() / self.frame.length), _finite(gradient.cpu().float())
+        distance, gradient = distance.to(points.device), gradient.to(points.device)
+        return self._finite(distance.float() / self.frame.length), self._finite(gradient.float())
+
+    def require_finite(self) -> None:
+        """Raises InvalidInputError (FIELD_NOT_FINITE) where a value since the last call was not finite."""
+        found, self._not_finite = self._not_finite, None
+        if found is not None and bool(found):
+            raise _not_finite()
 
     def _own(self, points: Tensor) -> Tensor:
-        return self.frame.out_of(points).float().to(self.field.device)
+        """Points (M, 3) in the field's frame, on its device."""
+        center = self._centers.get(points.device)
+        if center is None:
+            center = self._centers[points.device] = self.frame.center.to(points.device)
+        return (points.double() * self.frame.length + center).float().to(self.field.device)
+
+    def _finite(self, values: Tensor) -> Tensor:
+        faulty = ~torch.isfinite(values).all()
+        if not on_host(values):
+            self._not_finite = faulty if self._not_finite is None else self._not_finite | faulty
+        elif bool(faulty):
+            raise _not_finite()
+        return values
 
 
 class WorkingObservation:
-    """What was observed of a field, in its working frame: at (M, 3) float32 points on the CPU."""
+    """What was observed of a field, in its working frame: at (M, 3) float32 points on any device, results there."""
 
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
         self._observation = observation.seen_in(frame.to_field())
+        self._elsewhere: dict[torch.device, Observation] = {}
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
@@ -70,14 +97,19 @@ class WorkingObservation:
 
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
-        return self._observation.at(points) == SURFACE
+        return self._states(points) == SURFACE
 
     def unobserved(self, points: Tensor, _values: Tensor) -> Tensor:
         """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
-        return self._observation.at(points) == UNSEEN
+        return self._states(points) == UNSEEN
+
+    def _states(self, points: Tensor) -> Tensor:
+        if on_host(points):
+            return self._observation.at(points)
+        if points.device not in self._elsewhere:
+            self._elsewhere[points.device] = self._observation.to(points.device)
+        return self._elsewhere[points.device].at(points)
 
 
-def _finite(values: Tensor) -> Tensor:
-    if not torch.isfinite(values).all():
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    return values
+def _not_finite() -> InvalidInputError:
+    return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")

@@ -47,10 +47,11 @@ def coarse_to_fine(
             candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
             candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
         few = surfaces.subsample(stage.points, context.generator)
-        numbers = torch.arange(len(candidates))
+        numbers = torch.arange(len(candidates), device=candidates.scores.device)
         parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
         candidates = _admitted(PoseCandidates.cat(parts), context)
         candidates = candidates[_best(candidates, stage, context.extremal_points)]
+        surfaces.require_finite()
     return candidates
 
 
@@ -79,9 +80,9 @@ def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context:
 
 
 def _best(candidates: PoseCandidates, stage: Stage, extremal_points: Tensor) -> Tensor:
-    """Numbers of the candidates that go on, best first."""
-    scores = candidates.scores
+    """Numbers of the candidates that go on, best first, on their device. Chosen on the CPU: one copy a stage."""
+    scores, device = candidates.scores.cpu(), candidates.scores.device
     if stage.min_distance == 0.0:
-        return scores.argsort()[: stage.keep]
+        return scores.argsort()[: stage.keep].to(device)
     kept = distinct(candidates.T, scores, extremal_points, stage.min_distance, stage.keep)
-    return kept[scores[kept] <= scores[kept[0]] + stage.margin]
+    return kept[scores[kept] <= scores[kept[0]] + stage.margin].to(device)

@@ -7,7 +7,7 @@ matter instead, the part may be occluded (fields are solid behind what was obser
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -51,6 +51,11 @@ class Evidence:
     """(H, M) uint8, likewise."""
     partial: bool = False
     """Part of the scene is known not to have been observed. That part is left out; the rest was measured."""
+
+    def to(self, device: torch.device | str) -> Evidence:
+        """The same on another device."""
+        values = (getattr(self, one.name) for one in fields(self))
+        return Evidence(*(one.to(device) if isinstance(one, Tensor) else one for one in values))
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
@@ -102,7 +107,7 @@ def _signs(*marked: tuple[Tensor, int]) -> Tensor:
     """(H, N) uint8: the number of the last that marks each sample; 0 where none does."""
     signs = torch.zeros_like(marked[0][0], dtype=torch.uint8)
     for where, number in marked:
-        signs[where] = number
+        signs.masked_fill_(where, number)
     return signs
 
 
@@ -121,6 +126,6 @@ def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> tu
 
 def _tail_ratio(r: Residuals) -> Tensor:
     values = r.values if r.unobserved is None else r.values.masked_fill(r.unobserved, torch.nan)
-    core, tail = torch.nanquantile(values.abs(), torch.tensor(EVIDENCE.tail_quantiles), dim=1)
+    core, tail = torch.nanquantile(values.abs(), values.new_tensor(EVIDENCE.tail_quantiles), dim=1)
     ratio: Tensor = tail / core.clamp_min(1e-9)
     return ratio
