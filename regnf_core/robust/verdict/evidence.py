@@ -8,6 +8,7 @@ matter instead, the part may be occluded (fields are solid behind what was obser
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -54,8 +55,8 @@ class Evidence:
 
     def to(self, device: torch.device | str) -> Evidence:
         """The same on another device."""
-        values = (getattr(self, one.name) for one in fields(self))
-        return Evidence(*(one.to(device) if isinstance(one, Tensor) else one for one in values))
+        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        return Evidence(**{name: one.to(device) if isinstance(one, Tensor) else one for name, one in values.items()})
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
