@@ -23,7 +23,7 @@ from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
 from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.coarse_to_fine import RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.coarse_to_fine import Descent, RefinementContext, coarse_to_fine
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.report import result_of
 from regnf_core.robust.residuals import SurfacePair
@@ -102,6 +102,14 @@ def search_poses(
 
     bound: what is known of a pose.
     """
+    start = search_start(view, model, seeds, generator, bound)
+    return coarse_to_fine(start.surfaces, start.candidates, stages, start.context)
+
+
+def search_start(
+    view: SceneView, model: ObjectModel, seeds: Sim3, generator: torch.Generator, bound: PoseBound
+) -> Descent:
+    """What the search begins with: the seeds (H,) that the bound, loosened, admits, on distance grids."""
     seeds = bound.scale.limited_poses(seeds)
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
@@ -109,7 +117,7 @@ def search_poses(
     context = RefinementContext(
         model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
     )
-    return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
+    return Descent(grids, PoseCandidates.start(seeds), context)
 
 
 def refine_poses(
@@ -120,18 +128,36 @@ def refine_poses(
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
-    points = problem.model.extremal_points
-    bound, max_offset = problem.bound, problem.view.max_offset
+    start = refinement_start(problem, T, generator, on_step)
+    found = coarse_to_fine(start.surfaces, start.candidates, REFINEMENT.stages, start.context)
+    joined = with_equivalents(problem, found)
+    return coarse_to_fine(start.surfaces, joined, REFINEMENT.last_stages, start.context)
+
+
+def refinement_start(
+    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
+) -> Descent:
+    """What the refinement begins with: poses T (H,), on the fields."""
+    bound = problem.bound
     context = RefinementContext(
-        points, generator, bound.scale, max_offset, on_step=on_step, admits=bound.admits, penalty=bound.penalty
+        problem.model.extremal_points,
+        generator,
+        bound.scale,
+        problem.view.max_offset,
+        on_step=on_step,
+        admits=bound.admits,
+        penalty=bound.penalty,
     )
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
-    found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
-    equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
+    return Descent(problem.fit, start, context)
+
+
+def with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
+    """The candidates, and the best one's symmetry equivalents that are not among them."""
+    equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
     origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
     origins = origins.where(origins < len(found), 0)
-    joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
-    return coarse_to_fine(problem.fit, joined, REFINEMENT.last_stages, context)
+    return replace(found[origins], T=Sim3.cat([found.T, equivalents]))
 
 
 def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
@@ -168,7 +194,7 @@ def _best_attempt(
     """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
     others fail."""
     found: list[Evaluation] = []
-    for start in _starts(problem, options, seed, generator, T_start):
+    for start in starts_of(problem, options, seed, generator, T_start):
         found.append(_attempt(problem, start, options, run, generator))
         if found[-1].verdict != "rejected":
             break
@@ -176,7 +202,7 @@ def _best_attempt(
 
 
 @dataclass(frozen=True, eq=False)
-class _Start:
+class Start:
     """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
     stages: of the search."""
 
@@ -185,28 +211,28 @@ class _Start:
     stages: Sequence[Stage] = SEARCH.stages
 
 
-def _starts(
+def starts_of(
     problem: RegistrationProblem,
     options: RegistrationOptions,
     seed: int,
     generator: torch.Generator,
     T_start: Sim3 | None,
-) -> Iterator[_Start]:
+) -> Iterator[Start]:
     """One attempt after another, each made when its turn comes."""
     view, model, device = problem.view, problem.model, problem.view.foreground.points.device
     if T_start is not None:
         start = problem.in_working_frames(T_start).on(device)
-        yield _Start(seed_poses_around(start, generator), start.expand(1))
+        yield Start(seed_poses_around(start, generator), start.expand(1))
     seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
-    yield _Start(seeds, seeds[:0])
+    yield Start(seeds, seeds[:0])
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        yield _Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
+        yield Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
 
 
 def _attempt(
     problem: RegistrationProblem,
-    start: _Start,
+    start: Start,
     options: RegistrationOptions,
     run: Run,
     generator: torch.Generator,

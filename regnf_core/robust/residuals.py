@@ -72,7 +72,7 @@ class Residuals:
     cosines: (H, N + M), between a sample's normal and the other field's gradient where the pose carries the sample ·
     unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed; None: all of it was ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
-    the values.
+    the values · shares: (H, N + M), see :class:`Samples`; the sum of each direction is 1.
     """
 
     values: Tensor
@@ -81,6 +81,7 @@ class Residuals:
     scene_count: int
     unobserved: Tensor | None = None
     offset: Tensor | None = None
+    shares: Tensor | None = None
 
     @property
     def scene_to_object(self) -> Tensor:
@@ -91,6 +92,21 @@ class Residuals:
     def object_to_scene(self) -> Tensor:
         """(H, M) r2, of the object samples."""
         return self.values[:, self.scene_count :]
+
+    def means(self, of_samples: Tensor) -> tuple[Tensor, Tensor]:
+        """(H,) and (H,): the means of a quantity (H, N + M) of the samples over each direction."""
+        n = self.scene_count
+        if self.shares is None:
+            return of_samples[:, :n].mean(1), of_samples[:, n:].mean(1)
+        weighted = of_samples * self.shares
+        return weighted[:, :n].sum(1), weighted[:, n:].sum(1)
+
+    def weighted(self, weights: Tensor) -> Tensor:
+        """Weights (H, N + M) of the samples as parts of these means."""
+        if self.shares is not None:
+            return weights * self.shares
+        n, m = self.scene_count, weights.shape[1] - self.scene_count
+        return torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
 
     def jacobian_with_offset(self) -> Tensor:
         """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: its column is the last one."""
@@ -103,8 +119,9 @@ class Residuals:
     def to(self, device: torch.device | str) -> Residuals:
         """The same on another device."""
         values, J, cosines = (part.to(device) for part in (self.values, self.jacobian, self.cosines))
-        unobserved, offset = (None if part is None else part.to(device) for part in (self.unobserved, self.offset))
-        return Residuals(values, J, cosines, self.scene_count, unobserved, offset)
+        maybe = (self.unobserved, self.offset, self.shares)
+        unobserved, offset, shares = (None if part is None else part.to(device) for part in maybe)
+        return Residuals(values, J, cosines, self.scene_count, unobserved, offset, shares)
 
     @classmethod
     def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
@@ -116,6 +133,7 @@ class Residuals:
             first.scene_count,
             _where(mask[:, None], first.unobserved, second.unobserved),
             _where(mask, first.offset, second.offset),
+            first.shares,
         )
 
 
@@ -137,6 +155,7 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         len(A),
         None if unobserved is None else torch.cat([torch.zeros_like(r1, dtype=torch.bool), unobserved], 1),
         offset,
+        None if A.shares is None or B.shares is None else torch.cat([A.shares, B.shares], 1),
     )
 
 

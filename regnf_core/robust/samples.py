@@ -20,24 +20,30 @@ class UnobservedTest(Protocol):
 class Samples:
     """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
 
-    unobserved: where the field shows something that was not observed; None: everything was observed.
+    unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
+    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same.
+
+    Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
     """
 
     points: Tensor
     values: Tensor
     normals: Tensor
     unobserved: UnobservedTest | None = None
+    shares: Tensor | None = None
 
     def __len__(self) -> int:
-        return int(self.points.shape[0])
+        return int(self.points.shape[-2])
 
     def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved)
+        shares = None if self.shares is None else self.shares[index]
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares)
 
     def to(self, device: torch.device | str) -> Samples:
         """The same samples on another device. The test stays: it works where its points are."""
         points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
-        return Samples(points, values, normals, self.unobserved)
+        shares = None if self.shares is None else self.shares.to(device)
+        return Samples(points, values, normals, self.unobserved, shares)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) moved onto the surface along their normals."""

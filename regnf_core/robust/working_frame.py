@@ -13,6 +13,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.devices import on_host
+from regnf_core.robust.samples import UnobservedTest
 from regnf_core.schema.observation_grid import SURFACE, UNSEEN
 
 
@@ -91,24 +92,31 @@ class WorkingObservation:
         self._observation = observation.seen_in(frame.to_field())
         self._elsewhere: dict[torch.device, Observation] = {}
 
+    def on(self, device: torch.device) -> Observation:
+        """The observation for points of the working frame on the device; copied there once."""
+        if device.type == "cpu":
+            return self._observation
+        if device not in self._elsewhere:
+            self._elsewhere[device] = self._observation.to(device)
+        return self._elsewhere[device]
+
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
         return self._observation.measured_extent()
 
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
-        return self._states(points) == SURFACE
+        return self.on(points.device).at(points) == SURFACE
 
     def unobserved(self, points: Tensor, _values: Tensor) -> Tensor:
         """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
-        return self._states(points) == UNSEEN
+        return self.on(points.device).at(points) == UNSEEN
 
-    def _states(self, points: Tensor) -> Tensor:
-        if on_host(points):
-            return self._observation.at(points)
-        if points.device not in self._elsewhere:
-            self._elsewhere[points.device] = self._observation.to(points.device)
-        return self._elsewhere[points.device].at(points)
+
+def observation_behind(test: UnobservedTest | None) -> WorkingObservation | None:
+    """The observation whose method the test is; None where it is none's."""
+    owner = getattr(test, "__self__", None)
+    return owner if isinstance(owner, WorkingObservation) else None
 
 
 def _not_finite() -> InvalidInputError:

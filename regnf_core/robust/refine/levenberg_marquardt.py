@@ -13,7 +13,7 @@ from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.devices import on_host
 from regnf_core.robust.refine.loss import adaptive_width, normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound, ScaleBounds
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Settings:
     """What may move, and how the kernel widths are meant.
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
-    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters; 0: the
-    offset stays as it is.
+    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters, also
+    (H,), one for each pose; 0: the offset stays as it is.
     """
 
     widest: float = 0.0
-    scale: ScaleBound = ANY_SCALE
-    max_offset: float = REFINEMENT.max_offset
+    scale: ScaleBound | ScaleBounds = ANY_SCALE
+    max_offset: float | Tensor = REFINEMENT.max_offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,8 @@ def minimize(
 def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | None:
     if now.offset is None:
         return None
-    return (now.offset + step[:, 7]).clamp(-settings.max_offset, settings.max_offset)
+    most, moved = settings.max_offset, now.offset + step[:, 7]
+    return moved.clamp(-most, most)  # type: ignore[arg-type]  # two numbers or two tensors
 
 
 def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
@@ -99,7 +100,9 @@ def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, s
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest
-    if settings.max_offset == 0.0:
+    if isinstance(settings.max_offset, Tensor):
+        extra[:, 7:] += REFINEMENT.fixed_damping * (settings.max_offset == 0.0).to(extra)[:, None]
+    elif settings.max_offset == 0.0:
         extra[:, 7:] += REFINEMENT.fixed_damping
     step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings.scale)
     longest = step.abs().amax(-1, keepdim=True)
@@ -107,7 +110,7 @@ def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, s
     return limited
 
 
-def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound) -> Tensor:
+def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound | ScaleBounds) -> Tensor:
     """(H, K) x with A x = b; where the scale (H,) would leave the bound, it goes up to it and the others follow."""
     step = _solution(A, b)
     if bound.is_open:

@@ -23,7 +23,7 @@ class Step:
     width: float
     samples: int
 
-    def __getitem__(self, index: Tensor) -> Step:
+    def __getitem__(self, index: Tensor | slice) -> Step:
         return Step(
             self.T[index],
             self.costs[index],
@@ -73,7 +73,7 @@ class PoseCandidates:
     def __len__(self) -> int:
         return int(self.scores.numel())
 
-    def __getitem__(self, index: Tensor) -> PoseCandidates:
+    def __getitem__(self, index: Tensor | slice) -> PoseCandidates:
         offsets = None if self.offsets is None else self.offsets[index]
         return PoseCandidates(self.T[index], self.scores[index], offsets, tuple(step[index] for step in self.history))
 

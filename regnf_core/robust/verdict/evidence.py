@@ -56,7 +56,8 @@ class Evidence:
     def to(self, device: torch.device | str) -> Evidence:
         """The same on another device."""
         values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
-        return Evidence(**{name: one.to(device) if isinstance(one, Tensor) else one for name, one in values.items()})
+        values |= {name: one.to(device) for name, one in values.items() if isinstance(one, Tensor)}
+        return Evidence(**values)
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
