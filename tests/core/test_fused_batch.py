@@ -62,7 +62,8 @@ def together() -> dict[tuple[int, int], BatchOutcome]:
     return {(one.detection, one.object): one for one in register(PAIRS)}
 
 
-@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@pytest.mark.slow
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.sampled_from(PAIRS), min_size=1, max_size=4))
 def test_a_result_depends_neither_on_the_other_pairs_nor_on_their_order(
     together: dict[tuple[int, int], BatchOutcome], some: list[tuple[int, int]]
