@@ -15,13 +15,18 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.pairs import pairs_of
 from regnf_core.result import Phase, ProgressCallback, RegistrationResult
+from regnf_core.robust.devices import working_device
+from regnf_core.robust.fused.parts import Sizes
+from regnf_core.robust.fused.registering import SampledPair, register_together
 from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
-from regnf_core.run import Run
+from regnf_core.run import STARTS, Run
 from regnf_core.surface.result_clouds import with_clouds
 
 _T = TypeVar("_T")
+_MEMORY_ELSEWHERE = 256 * 2**20
+"""Bytes for the work on many pairs on a GPU."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,24 +60,29 @@ def register_batch(
     """Register pairs of detection and object (by number; None: each with each) by the preset `robust`.
 
     Each result is that of :func:`regnf_core.register` for this pair and seed; a pair that fails does not stop the
-    others. Without ``clouds`` the point clouds for viewers are left out, which take about half of the time.
-    ``progress`` gets the phases of one pair after the other, and the share done of all pairs. Raises
-    InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the lists,
-    and CancelledError from ``progress``.
+    others. On a GPU, and where the option ``robust.batch_memory`` is given, many pairs are worked on at once. A result
+    is then the same up to rounding, and does not depend on which pairs go together. Without ``clouds`` the point clouds
+    for viewers are left out, which take about half of the time. ``progress`` gets the phases of one pair, or of one
+    group of pairs, after the other, and the share done of all pairs.
+    Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN) for a number beyond the
+    lists, and CancelledError from ``progress``.
     """
     options = options or RegistrationOptions()
     options.require_robust("registers a batch")
     wanted = pairs_of(pairs, len(detections), len(objects))
     batch = _Batch(scene, detections, objects, options, seed)
-    outcomes = []
-    for number, (d, o) in enumerate(wanted):
-        run = Run(_share_of(progress, number, len(wanted)))
-        try:
-            outcomes.append(BatchOutcome(d, o, batch.register(d, o, run, clouds)))
-        except CancelledError:
-            raise
-        except RegnfError as error:
-            outcomes.append(BatchOutcome(d, o, None, error))
+    memory = options.robust.batch_memory
+    if memory is None and scene.device.type != "cpu":
+        memory = _MEMORY_ELSEWHERE
+    size = 1 if memory is None else Sizes(memory).pairs
+    outcomes: list[BatchOutcome] = []
+    while len(outcomes) < len(wanted):
+        begin, group = len(outcomes), wanted[len(outcomes) : len(outcomes) + size]
+        share = _share_of(progress, begin, len(group), len(wanted))
+        if memory is None:
+            outcomes.append(batch.one(*group[0], Run(share), clouds))
+        else:
+            outcomes += batch.several(group, Run(share), clouds, Sizes(memory))
     return outcomes
 
 
@@ -91,33 +101,83 @@ class _Batch:
         self.objects = [one.field if isinstance(one, ModeledObject) else one for one in objects]
         models = {number: one.model for number, one in enumerate(objects) if isinstance(one, ModeledObject)}
         self._views: dict[int, SceneView | RegnfError] = {}
-        self._models: dict[int, ObjectModel | RegnfError] = dict(models)
+        self._given: dict[int, ObjectModel | RegnfError] = dict(models)
+        self._models: dict[int, ObjectModel] = {}
 
-    def register(self, d: int, o: int, run: Run, clouds: bool) -> RegistrationResult:
+    def one(self, d: int, o: int, run: Run, clouds: bool) -> BatchOutcome:
+        """Of one pair."""
+        return _outcome(d, o, lambda: self._register(d, o, run, clouds))
+
+    def several(self, pairs: Sequence[tuple[int, int]], run: Run, clouds: bool, sizes: Sizes) -> list[BatchOutcome]:
+        """Of several pairs, registered together; of those that cannot be sampled, their errors."""
+        sampled: dict[int, SampledPair] = {}
+        failed: dict[int, RegnfError] = {}
+        with run.phase("sampling"):
+            for number, (d, o) in enumerate(pairs):
+                try:
+                    sampled[number] = SampledPair(self._view(d), self.objects[o], self._model(o))
+                except RegnfError as error:
+                    failed[number] = error
+                run.report("sampling", STARTS["initializing"] * (number + 1) / len(pairs))
+        try:
+            found = register_together(self.scene, list(sampled.values()), self.options, self.seed, run, sizes)
+        except CancelledError:
+            raise
+        except RegnfError:  # a field's own; whose it is shows when each pair is alone
+            return [self.one(d, o, run, clouds) for d, o in pairs]
+        ends = failed | dict(zip(sampled, found, strict=True))
+        outcomes = [self._ended(pair, ends[number], run, clouds) for number, pair in enumerate(pairs)]
+        run.report("exporting", 1.0)
+        for one in outcomes:
+            if one.result is not None:
+                one.result.metrics.update({name: value / len(found) for name, value in run.seconds.items()})
+        return outcomes
+
+    def _ended(
+        self, pair: tuple[int, int], found: RegistrationResult | RegnfError, run: Run, clouds: bool
+    ) -> BatchOutcome:
+        """The outcome, with the result's clouds."""
+        d, o = pair
+        if isinstance(found, RegnfError):
+            return BatchOutcome(d, o, None, found)
+        if not clouds:
+            return BatchOutcome(d, o, found)
+        with run.phase("exporting"):
+            return _outcome(d, o, lambda: self._with_clouds(d, o, found))
+
+    def _register(self, d: int, o: int, run: Run, clouds: bool) -> RegistrationResult:
         with run.phase("sampling"):
             view, model = self._view(d), self._model(o)
-        box = self.detections[d]
         result = register_robust(
             self.scene,
             self.objects[o],
-            box,
+            self.detections[d],
             self.options,
             self.seed,
             run,
             WarmStart(object_model=model),
             view,
         )
+        return run.finish(result, (lambda found: self._with_clouds(d, o, found)) if clouds else None)
 
-        def add_clouds(found: RegistrationResult) -> RegistrationResult:
-            return with_clouds(found, self.scene, self.objects[o], box, cloud_region(box))
-
-        return run.finish(result, add_clouds if clouds else None)
+    def _with_clouds(self, d: int, o: int, found: RegistrationResult) -> RegistrationResult:
+        box = self.detections[d]
+        return with_clouds(found, self.scene, self.objects[o], box, cloud_region(box))
 
     def _view(self, d: int) -> SceneView:
-        return _once(self._views, d, lambda: view_scene(self.scene, self.detections[d], self.options.robust, self.seed))
+        return _once(self._views, d, lambda: self._seen(self.detections[d]))
+
+    def _seen(self, detection: OrientedBox) -> SceneView:
+        """On the device that the work is done on."""
+        view = view_scene(self.scene, detection, self.options.robust, self.seed)
+        return view.to(working_device(self.scene))
 
     def _model(self, o: int) -> ObjectModel:
-        return _once(self._models, o, lambda: model_object(self.objects[o], self.options.robust))
+        """On the same device."""
+        if o not in self._models:
+            made = _once(self._given, o, lambda: model_object(self.objects[o], self.options.robust))
+            self._models[o] = made.to(working_device(self.scene))
+        return self._models[o]
 
 
 def _once(made: dict[int, _T | RegnfError], key: int, make: Callable[[], _T]) -> _T:
@@ -133,11 +193,22 @@ def _once(made: dict[int, _T | RegnfError], key: int, make: Callable[[], _T]) ->
     return found
 
 
-def _share_of(progress: ProgressCallback | None, number: int, count: int) -> ProgressCallback | None:
+def _outcome(d: int, o: int, make: Callable[[], RegistrationResult]) -> BatchOutcome:
+    """The result that is made, or the error. Raises CancelledError."""
+    try:
+        return BatchOutcome(d, o, make())
+    except CancelledError:
+        raise
+    except RegnfError as error:
+        return BatchOutcome(d, o, None, error)
+
+
+def _share_of(progress: ProgressCallback | None, begin: int, size: int, count: int) -> ProgressCallback | None:
+    """The progress of ``size`` pairs, from number ``begin`` on, as that of all ``count`` pairs."""
     if progress is None:
         return None
 
     def shared(phase: Phase, done: float) -> None:
-        progress(phase, (number + done) / count)
+        progress(phase, (begin + size * done) / count)
 
     return shared

@@ -1,4 +1,4 @@
-"""Neighbors, spacing and size of point sets, computed on the CPU: exact, and the same on any device."""
+"""Neighbors, spacing and size of point sets: exact on any device."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
+_DISTANCES_AT_ONCE = 2**25
+"""Of all points to some of those asked for, where there is no tree: bounds memory, at some 500 MB."""
+
 
 class NearestNeighbors:
-    """A search structure (k-d tree) over points (M, 3). Results are not differentiable."""
+    """A search structure over points (M, 3): a k-d tree on the CPU, all distances elsewhere. Results are not
+    differentiable."""
 
     def __init__(self, points: Tensor) -> None:
         self.points = points.detach()
-        self._tree = cKDTree(self.points.cpu().numpy())
+        self._tree = cKDTree(self.points.numpy()) if points.device.type == "cpu" else None
 
     def query(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Distance (N,) to the nearest point and its index (N,), for points (N, 3)."""
@@ -23,9 +27,23 @@ class NearestNeighbors:
 
     def query_several(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Distances (N, K) to the nearest points, nearest first, and their indices (N, K); K = ``count``, at most M."""
-        numbers = range(1, min(count, len(self.points)) + 1)
-        distance, index = self._tree.query(points.detach().cpu().numpy(), k=numbers)
+        count = min(count, len(self.points))
+        if self._tree is None:
+            return nearest_of_all(self.points, points.detach(), count)
+        distance, index = self._tree.query(points.detach().cpu().numpy(), k=range(1, count + 1))
         return torch.as_tensor(distance).to(points), torch.as_tensor(index, device=points.device)
+
+
+def nearest_of_all(points: Tensor, queries: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Distances (N, K) from queries (N, 3) to the ``count`` nearest of points (M, 3), nearest first, and the indices
+    (N, K): by all distances, in float64, in parts that bound memory. No part of it is read on the CPU."""
+    few = max(1, _DISTANCES_AT_ONCE // len(points))
+    found = []
+    for part in torch.split(queries.double(), few):
+        apart = (part[:, None] - points.double()).square_().sum(-1)
+        found.append(apart.topk(count, dim=1, largest=False))
+    squares, index = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return squares.sqrt().to(queries), index
 
 
 def gaps(points: Tensor) -> Tensor:

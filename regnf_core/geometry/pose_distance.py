@@ -21,8 +21,10 @@ def displacement(T: Sim3, reference: Sim3, points: Tensor) -> Tensor:
 def distinct(T: Sim3, scores: Tensor, points: Tensor, apart: float, limit: int) -> Tensor:
     """Numbers of the best poses (lowest score first), no two of which place ``points`` closer together than ``apart``.
 
-    points: (N, 3) of the object; a handful of its extreme points is enough.
+    points: (N, 3) of the object; a handful of its extreme points is enough. One pose decides on the next: that is done
+    on the CPU, whatever device T (H,) and scores (H,) are on; the numbers (K,) are on the CPU too.
     """
+    T, scores, points = T.on("cpu"), scores.cpu(), points.cpu()
     order = scores.argsort()
     placed = T[order].inverse().apply(points.double()).mT.contiguous()  # (H, 3, N)
     reach = (apart / T.scale[order].double()).square().tolist()

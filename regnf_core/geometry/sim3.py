@@ -206,6 +206,10 @@ class Sim3:
         """The same transform in the dtype and on the device of another tensor."""
         return Sim3(self.scale.to(like), self.rotation.to(like), self.translation.to(like))
 
+    def on(self, device: torch.device | str) -> Sim3:
+        """The same transform on another device."""
+        return Sim3(self.scale.to(device), self.rotation.to(device), self.translation.to(device))
+
     def detach(self) -> Sim3:
         """The same transform, cut from any autograd graph."""
         return Sim3(self.scale.detach(), self.rotation.detach(), self.translation.detach())

@@ -16,6 +16,7 @@ from regnf_core.fields.counting import CountingField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust.constants import LIBRARY
+from regnf_core.robust.devices import working_device
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.model.signature import signature
 from regnf_core.robust.pipeline import geometric_seeds, refine_poses, search_poses
@@ -68,12 +69,14 @@ def rank_by_signature(view: SceneView, models: Sequence[ObjectModel]) -> list[tu
 def match_coarsely(query: LibraryQuery, models: Sequence[ObjectModel], nearest: Sequence[int]) -> list[CoarseMatch]:
     """The nearest models after a coarse search on the samples, best first."""
     rotations = start_rotations(query.options, LIBRARY.rotations_divisor)
-    found = []
+    device = working_device(query.scene)
+    view, found = query.view.to(device), []
     for number in nearest[: LIBRARY.shortlist]:
         generator = torch.Generator().manual_seed(query.seed)
-        bound = pose_bound(query.view, models[number], query.options.robust)
-        seeds = geometric_seeds(query.view, models[number], rotations, bound.scale)
-        candidates = search_poses(query.view, models[number], seeds, generator, bound, LIBRARY.stages)
+        model = models[number].to(device)
+        bound = pose_bound(view, model, query.options.robust)
+        seeds = geometric_seeds(view, model, rotations, bound.scale)
+        candidates = search_poses(view, model, seeds, generator, bound, LIBRARY.stages)
         found.append(CoarseMatch(number, float(candidates.scores[0]), candidates.T))
     return sorted(found, key=lambda one: one.score)
 

@@ -23,7 +23,7 @@ from regnf_core.robust.constants import REFINEMENT, SAMPLING, SEARCH
 from regnf_core.robust.model.object_model import ObjectModel, model_object
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.coarse_to_fine import RefinementContext, coarse_to_fine
+from regnf_core.robust.refine.coarse_to_fine import Descent, RefinementContext, coarse_to_fine
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.report import result_of
 from regnf_core.robust.residuals import SurfacePair
@@ -66,6 +66,7 @@ def register_robust(
     """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
 
     ``scene_view`` saves making one; it must be of this scene, box, options and seed.
+    The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
     """
@@ -101,6 +102,14 @@ def search_poses(
 
     bound: what is known of a pose.
     """
+    start = search_start(view, model, seeds, generator, bound)
+    return coarse_to_fine(start.surfaces, start.candidates, stages, start.context)
+
+
+def search_start(
+    view: SceneView, model: ObjectModel, seeds: Sim3, generator: torch.Generator, bound: PoseBound
+) -> Descent:
+    """What the search begins with: the seeds (H,) that the bound, loosened, admits, on distance grids."""
     seeds = bound.scale.limited_poses(seeds)
     near = bound.loosened(SEARCH.seed_tolerance).admits(seeds)
     seeds = seeds[near.nonzero().squeeze(-1)] if bool(near.any()) else seeds
@@ -108,7 +117,7 @@ def search_poses(
     context = RefinementContext(
         model.extremal_points, generator, bound.scale, admits=bound.admits, penalty=bound.penalty
     )
-    return coarse_to_fine(grids, PoseCandidates.start(seeds), stages, context)
+    return Descent(grids, PoseCandidates.start(seeds), context)
 
 
 def refine_poses(
@@ -119,17 +128,36 @@ def refine_poses(
 
     ``on_step`` is called once for each of the ``ITERATIONS`` iterations.
     """
-    points = problem.model.extremal_points
-    bound, max_offset = problem.bound, problem.view.max_offset
+    start = refinement_start(problem, T, generator, on_step)
+    found = coarse_to_fine(start.surfaces, start.candidates, REFINEMENT.stages, start.context)
+    joined = with_equivalents(problem, found)
+    return coarse_to_fine(start.surfaces, joined, REFINEMENT.last_stages, start.context)
+
+
+def refinement_start(
+    problem: RegistrationProblem, T: Sim3, generator: torch.Generator, on_step: Callable[[], None] = lambda: None
+) -> Descent:
+    """What the refinement begins with: poses T (H,), on the fields."""
+    bound = problem.bound
     context = RefinementContext(
-        points, generator, bound.scale, max_offset, on_step=on_step, admits=bound.admits, penalty=bound.penalty
+        problem.model.extremal_points,
+        generator,
+        bound.scale,
+        problem.view.max_offset,
+        on_step=on_step,
+        admits=bound.admits,
+        penalty=bound.penalty,
     )
     start = PoseCandidates.start(bound.scale.limited_poses(T), with_offsets=True)
-    found = coarse_to_fine(problem.fit, start, REFINEMENT.stages, context)
-    equivalents = _missing_equivalents(found.T, problem.model.symmetry, points)
-    origins = torch.cat([torch.arange(len(found)), torch.zeros(len(equivalents), dtype=torch.long)])
-    joined = replace(found[origins], T=Sim3.cat([found.T, equivalents]))
-    return coarse_to_fine(problem.fit, joined, REFINEMENT.last_stages, context)
+    return Descent(problem.fit, start, context)
+
+
+def with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
+    """The candidates, and the best one's symmetry equivalents that are not among them."""
+    equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
+    origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)
+    origins = origins.where(origins < len(found), 0)
+    return replace(found[origins], T=Sim3.cat([found.T, equivalents]))
 
 
 def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim3:
@@ -143,14 +171,14 @@ def _missing_equivalents(T: Sim3, symmetry: SelfSymmetry, points: Tensor) -> Sim
 
 def geometric_seeds(view: SceneView, model: ObjectModel, rotations: Tensor, scale: ScaleBound = ANY_SCALE) -> Sim3:
     """Seeds (H,) from the two shapes and the box, for each of the rotations (K, 3, 3)."""
-    box = view.detection
+    box, device = view.detection, view.foreground.points.device
     return seed_poses(
         view.foreground.on_surface(),
         model.samples.on_surface(),
-        box.rotation,
-        box.size / box.diagonal,
-        rotations,
-        torch.tensor(SEARCH.scale_factors),
+        box.rotation.to(device),
+        (box.size / box.diagonal).to(device),
+        rotations.to(device),
+        torch.tensor(SEARCH.scale_factors, device=device),
         scale,
     )
 
@@ -165,15 +193,15 @@ def _best_attempt(
 ) -> Evaluation:
     """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
     others fail. What earlier attempts found stays among the candidates: a pose is compared with all of them."""
-    starts = _starts(problem, options, seed, generator, T_start)
+    starts = starts_of(problem, options, seed, generator, T_start)
     best = _attempt(problem, next(starts), [], options, run, generator)
     while best.verdict == "rejected" and (start := next(starts, None)) is not None:
-        best = _attempt(problem, start, [best.candidates], options, run, generator)
+        best = _attempt(problem, start, [best], options, run, generator)
     return best
 
 
 @dataclass(frozen=True, eq=False)
-class _Start:
+class Start:
     """What an attempt begins with. seeds: (H,) · given: what is refined whatever the search finds, (1,) or (0,) ·
     stages: of the search."""
 
@@ -182,29 +210,29 @@ class _Start:
     stages: Sequence[Stage] = SEARCH.stages
 
 
-def _starts(
+def starts_of(
     problem: RegistrationProblem,
     options: RegistrationOptions,
     seed: int,
     generator: torch.Generator,
     T_start: Sim3 | None,
-) -> Iterator[_Start]:
+) -> Iterator[Start]:
     """One attempt after another, each made when its turn comes."""
-    view, model = problem.view, problem.model
+    view, model, device = problem.view, problem.model, problem.view.foreground.points.device
     if T_start is not None:
-        start = problem.in_working_frames(T_start)
-        yield _Start(seed_poses_around(start, generator), start.expand(1))
+        start = problem.in_working_frames(T_start).on(device)
+        yield Start(seed_poses_around(start, generator), start.expand(1))
     seeds = geometric_seeds(view, model, start_rotations(options), problem.bound.scale)
-    yield _Start(seeds, seeds[:0])
+    yield Start(seeds, seeds[:0])
     if options.robust.feature_draws:
         matched = feature_seeds(view.foreground, model.samples, options.robust.feature_draws, seed)
-        yield _Start(Sim3.cat([seeds, matched]), seeds[:0], SEARCH.thorough_stages)
+        yield Start(Sim3.cat([seeds, matched.on(device)]), seeds[:0], SEARCH.thorough_stages)
 
 
 def _attempt(
     problem: RegistrationProblem,
-    start: _Start,
-    earlier: Sequence[PoseCandidates],
+    start: Start,
+    earlier: Sequence[Evaluation],
     options: RegistrationOptions,
     run: Run,
     generator: torch.Generator,
@@ -214,7 +242,15 @@ def _attempt(
     with run.phase("optimizing"):
         refined = refine_poses(problem, Sim3.cat([candidates.T, start.given]), generator, _progress_of_steps(run))
     with run.phase("verifying"):
-        return evaluate_candidates(problem, PoseCandidates.cat([*earlier, refined]), options)
+        return evaluate_with(earlier, problem, refined, options)
+
+
+def evaluate_with(
+    earlier: Sequence[Evaluation], problem: RegistrationProblem, refined: PoseCandidates, options: RegistrationOptions
+) -> Evaluation:
+    """The evaluation of these candidates and of those of the last of the ``earlier`` attempts, which has all before."""
+    known = [one.candidates.to(refined.scores.device) for one in earlier[-1:]]
+    return evaluate_candidates(problem, PoseCandidates.cat([*known, refined]), options)
 
 
 def _progress_of_steps(run: Run) -> Callable[[], None]:

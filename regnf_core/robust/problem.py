@@ -9,6 +9,7 @@ import torch
 from regnf_core.fields.base import SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
+from regnf_core.robust.devices import working_device
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.samples import split
@@ -21,6 +22,8 @@ from regnf_core.robust.search.scale_bound import ScaleBound
 class RegistrationProblem:
     """A detection and an object. Poses T (H,) map the scene's working frame to the object's.
 
+    All tensors are on the device that the work is done on, but for the frames and the poses between fields' frames.
+
     fit: what poses are refined on · held_out: the same fields with other samples, for the verdict alone · bound: what
     is known of a pose.
     """
@@ -32,12 +35,17 @@ class RegistrationProblem:
     bound: PoseBound
 
     def in_field_frames(self, T_work: Sim3) -> Sim3:
-        """A single pose between the working frames as T_object_scene."""
+        """A single pose between the working frames, on the CPU, as T_object_scene."""
         return self.model.frame.to_field() @ T_work @ self.view.frame.to_field().inverse()
 
     def in_working_frames(self, T_object_scene: Sim3) -> Sim3:
-        """A single T_object_scene as a pose between the working frames."""
+        """A single T_object_scene as a pose between the working frames, on the CPU."""
         return self.model.frame.to_field().inverse() @ T_object_scene @ self.view.frame.to_field()
+
+    def to(self, device: torch.device | str) -> RegistrationProblem:
+        """The same with all samples on another device. Fields stay where they are."""
+        fit, held_out = (pair.to(device) for pair in (self.fit, self.held_out))
+        return RegistrationProblem(self.view.to(device), self.model.to(device), fit, held_out, self.bound.to(device))
 
 
 def make_problem(
@@ -48,7 +56,12 @@ def make_problem(
     options: RobustOptions,
     generator: torch.Generator,
 ) -> RegistrationProblem:
-    """Divide the samples of both surfaces into those to fit and those to hold out."""
+    """Divide the samples of both surfaces into those to fit and those to hold out, on the device of the scene's field.
+
+    An object's field on another device is evaluated there, with a copy of each point and each value.
+    """
+    device = working_device(scene)
+    view, model = view.to(device), model.to(device)
     A, A_held = split(view.foreground, options.held_out_share, generator)
     B, B_held = split(model.samples, options.held_out_share, generator)
     scene_field, object_field = view.field(scene), model.field(obj)

@@ -36,12 +36,12 @@ def result_of(
         alternatives=evaluation.alternatives,
         considered=evaluation.considered,
         covariance=pose_covariance(problem, evaluation),
-        symmetry=model.symmetry.group(),
+        symmetry=model.symmetry.to("cpu").group(),
     )
 
 
 def _surface(samples: Samples, frame: WorkingFrame) -> SurfaceSamples:
-    return SurfaceSamples(frame.out_of(samples.on_surface()).float(), samples.normals)
+    return SurfaceSamples(frame.out_of(samples.on_surface()).float(), samples.normals.cpu())
 
 
 def _record(problem: RegistrationProblem, iteration: int, step: Step, winner: int) -> IterationRecord:

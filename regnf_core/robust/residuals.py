@@ -14,7 +14,7 @@ offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -30,6 +30,13 @@ class DistanceModel(Protocol):
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]: ...
 
 
+@runtime_checkable
+class CheckedLater(Protocol):
+    """A distance model whose values are checked when asked for: see :class:`WorkingField`."""
+
+    def require_finite(self) -> None: ...
+
+
 @dataclass(frozen=True, eq=False)
 class SurfacePair:
     """The scene's and the object's surface: a distance model and samples of each, in their working frames."""
@@ -38,6 +45,16 @@ class SurfacePair:
     obj: DistanceModel
     scene_samples: Samples
     object_samples: Samples
+
+    def to(self, device: torch.device | str) -> SurfacePair:
+        """The same with the samples on another device."""
+        return SurfacePair(self.scene, self.obj, self.scene_samples.to(device), self.object_samples.to(device))
+
+    def require_finite(self) -> None:
+        """Raises InvalidInputError (FIELD_NOT_FINITE) for what a field said where nobody could read it."""
+        for model in (self.scene, self.obj):
+            if isinstance(model, CheckedLater):
+                model.require_finite()
 
     def subsample(self, limit: int, generator: torch.Generator) -> SurfacePair:
         """The pair with at most ``limit`` samples of each surface, at random."""
@@ -57,7 +74,7 @@ class Residuals:
     unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed, or that face such
     space while the scene's own surface there does not face the same way; None: all of it was observed ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
-    the values.
+    the values · shares: (H, N + M), see :class:`Samples`; the sum of each direction is 1.
     """
 
     values: Tensor
@@ -66,6 +83,7 @@ class Residuals:
     scene_count: int
     unobserved: Tensor | None = None
     offset: Tensor | None = None
+    shares: Tensor | None = None
 
     @property
     def scene_to_object(self) -> Tensor:
@@ -77,6 +95,21 @@ class Residuals:
         """(H, M) r2, of the object samples."""
         return self.values[:, self.scene_count :]
 
+    def means(self, of_samples: Tensor) -> tuple[Tensor, Tensor]:
+        """(H,) and (H,): the means of a quantity (H, N + M) of the samples over each direction."""
+        n = self.scene_count
+        if self.shares is None:
+            return of_samples[:, :n].mean(1), of_samples[:, n:].mean(1)
+        weighted = of_samples * self.shares
+        return weighted[:, :n].sum(1), weighted[:, n:].sum(1)
+
+    def weighted(self, weights: Tensor) -> Tensor:
+        """Weights (H, N + M) of the samples as parts of these means."""
+        if self.shares is not None:
+            return weights * self.shares
+        n, m = self.scene_count, weights.shape[1] - self.scene_count
+        return torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
+
     def jacobian_with_offset(self) -> Tensor:
         """The Jacobian (H, N + M, 7), or (H, N + M, 8) where there is an offset: its column is the last one."""
         if self.offset is None:
@@ -84,6 +117,13 @@ class Residuals:
         column = torch.ones_like(self.values[:, None])
         column[..., : self.scene_count] = -1.0
         return torch.cat([self.jacobian.mT, column.to(self.jacobian)], 1).mT
+
+    def to(self, device: torch.device | str) -> Residuals:
+        """The same on another device."""
+        values, J, cosines = (part.to(device) for part in (self.values, self.jacobian, self.cosines))
+        maybe = (self.unobserved, self.offset, self.shares)
+        unobserved, offset, shares = (None if part is None else part.to(device) for part in maybe)
+        return Residuals(values, J, cosines, self.scene_count, unobserved, offset, shares)
 
     @classmethod
     def where(cls, mask: Tensor, first: Residuals, second: Residuals) -> Residuals:
@@ -95,6 +135,7 @@ class Residuals:
             first.scene_count,
             _where(mask[:, None], first.unobserved, second.unobserved),
             _where(mask, first.offset, second.offset),
+            first.shares,
         )
 
 
@@ -116,32 +157,33 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         len(A),
         None if unobserved is None else torch.cat([torch.zeros_like(r1, dtype=torch.bool), unobserved], 1),
         offset,
+        None if A.shares is None or B.shares is None else torch.cat([A.shares, B.shares], 1),
     )
 
 
 def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, Tensor, Tensor]:
     s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
-    arm = (s[..., None] * R) @ A.points.T  # y - t, (H, 3, N)
+    arm = (s[..., None] * R) @ A.points.mT  # y - t, (H, 3, N)
     value, g = _query(obj, arm + t)
     own = s * A.values
-    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.T)
+    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.mT)
 
 
 def _object_to_scene(
     scene: DistanceModel, B: Samples, T: Sim3, unobserved: UnobservedTest | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
     s, R, t = T.scale[:, None], T.rotation, T.translation[..., None]
-    arm = B.points.T - t  # z - t, (H, 3, M)
+    arm = B.points.mT - t  # z - t, (H, 3, M)
     w = (R.mT / s[..., None]) @ arm
     value, g = _query(scene, w)
     turned = R @ g  # R g_a
     scaled = s * value
     J = _jacobian(arm, -turned, scaled - _dot(turned, arm))
     r2 = scaled - B.values
-    cosines = _cosine(turned, B.normals.T)
+    cosines = _cosine(turned, B.normals.mT)
     if unobserved is None:
         return r2, J, cosines, None
-    places, fronts = _as_points(w), _as_points(R.mT @ B.normals.T)
+    places, fronts = _as_points(w), _as_points(R.mT @ B.normals.mT)
     hidden = unobserved.faces_unobserved(places, fronts).reshape(r2.shape) & (cosines < EVIDENCE.min_inlier_cosine)
     return r2, J, cosines, hidden | unobserved.unobserved(places, r2.reshape(-1)).reshape(r2.shape)
 

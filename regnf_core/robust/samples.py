@@ -21,24 +21,40 @@ class UnobservedTest(Protocol):
         space in front of them was not seen to be free."""
         ...
 
+    def to(self, device: torch.device | str) -> UnobservedTest:
+        """The same for points on another device."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32, CPU.
+    """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
 
-    unobserved: where the field shows something that was not observed; None: everything was observed.
+    unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
+    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same.
+
+    Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
     """
 
     points: Tensor
     values: Tensor
     normals: Tensor
     unobserved: UnobservedTest | None = None
+    shares: Tensor | None = None
 
     def __len__(self) -> int:
-        return int(self.points.shape[0])
+        return int(self.points.shape[-2])
 
     def __getitem__(self, index: Tensor) -> Samples:
-        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved)
+        shares = None if self.shares is None else self.shares[index]
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares)
+
+    def to(self, device: torch.device | str) -> Samples:
+        """The same samples on another device."""
+        points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
+        shares = None if self.shares is None else self.shares.to(device)
+        unobserved = None if self.unobserved is None else self.unobserved.to(device)
+        return Samples(points, values, normals, unobserved, shares)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) moved onto the surface along their normals."""
@@ -46,14 +62,15 @@ class Samples:
 
 
 def subsample(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
-    """At most ``limit`` of the samples, at random."""
+    """At most ``limit`` of the samples, at random: drawn on the CPU, so that a seed means the same on every device."""
     if len(samples) <= limit:
         return samples
-    return samples[torch.randperm(len(samples), generator=generator)[:limit]]
+    drawn = torch.randperm(len(samples), generator=generator)[:limit]
+    return samples[drawn.to(samples.points.device)]
 
 
 def split(samples: Samples, held_out: float, generator: torch.Generator) -> tuple[Samples, Samples]:
     """Two disjoint random parts; the second, a share ``held_out`` (0..1), is for the verdict alone."""
-    order = torch.randperm(len(samples), generator=generator)
+    order = torch.randperm(len(samples), generator=generator).to(samples.points.device)
     cut = len(samples) - int(held_out * len(samples))
     return samples[order[:cut]], samples[order[cut:]]

@@ -13,6 +13,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import OCCLUSION
+from regnf_core.robust.devices import on_host
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 
 
@@ -39,39 +40,120 @@ class WorkingFrame:
 
 
 class WorkingField:
-    """A field in its working frame: value and gradient at (M, 3) float32 points on the CPU, results on the CPU."""
+    """A field in its working frame: value and gradient at (M, 3) float32 points, results on the points' device.
+
+    Points on the field's device are not copied. On the CPU, values are checked at once; elsewhere it would take a copy
+    to ask, so what is not finite is remembered there until ``require_finite``.
+    """
 
     def __init__(self, field: SdfField, frame: WorkingFrame) -> None:
         self.field = field
         self.frame = frame
+        self._centers: dict[torch.device, Tensor] = {}
+        self._not_finite: Tensor | None = None
 
     def value(self, points: Tensor) -> Tensor:
         """Signed distance (M,), working units. Raises InvalidInputError (FIELD_NOT_FINITE)."""
-        distance = self.field.signed_distance(self._own(points)).cpu() / self.frame.length
-        return _finite(distance.float())
+        distance = self.field.signed_distance(self._own(points)).to(points.device) / self.frame.length
+        return self._finite(distance.float())
 
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (M,), working units, and its gradient (M, 3). Raises InvalidInputError (FIELD_NOT_FINITE)."""
         distance, gradient = self.field.signed_distance_and_gradient(self._own(points))
-        return _finite(distance.cpu().float() / self.frame.length), _finite(gradient.cpu().float())
+        distance, gradient = distance.to(points.device), gradient.to(points.device)
+        return self._finite(distance.float() / self.frame.length), self._finite(gradient.float())
+
+    def require_finite(self) -> None:
+        """Raises InvalidInputError (FIELD_NOT_FINITE) where a value since the last call was not finite."""
+        found, self._not_finite = self._not_finite, None
+        if found is not None and bool(found):
+            raise _not_finite()
 
     def _own(self, points: Tensor) -> Tensor:
-        return self.frame.out_of(points).float().to(self.field.device)
+        """Points (M, 3) in the field's frame, on its device."""
+        center = self._centers.get(points.device)
+        if center is None:
+            center = self._centers[points.device] = self.frame.center.to(points.device)
+        return (points.double() * self.frame.length + center).float().to(self.field.device)
+
+    def _finite(self, values: Tensor) -> Tensor:
+        faulty = ~torch.isfinite(values).all()
+        if not on_host(values):
+            self._not_finite = faulty if self._not_finite is None else self._not_finite | faulty
+        elif bool(faulty):
+            raise _not_finite()
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelStates:
+    """An observation's voxels, looked up in a working frame, or in that of each of H poses.
+
+    states: (V,) uint8, z fastest · counts: (3,) int64 · turn: (..., 3, 3) and shift: (..., 3), float32: a point x is in
+    the voxel floor(x turn + shift) · voxel: (...) float32, edge in working units.
+    """
+
+    states: Tensor
+    counts: Tensor
+    turn: Tensor
+    shift: Tensor
+    voxel: Tensor
+
+    @classmethod
+    def of(cls, observation: Observation) -> VoxelStates:
+        """For points of the observation's own frame, which T_grid_frame carries to the grid's."""
+        T = Sim3.identity() if observation.T_grid_frame is None else observation.T_grid_frame
+        to_cells = T.scale / observation.voxel
+        return cls(
+            observation.states.reshape(-1),
+            torch.tensor(observation.states.shape),
+            (to_cells * T.rotation).float().mT.contiguous(),
+            ((T.translation - observation.low) / observation.voxel).float(),
+            (1.0 / to_cells).float(),
+        )
+
+    def to(self, device: torch.device) -> VoxelStates:
+        """The same on another device."""
+        parts = (self.states, self.counts, self.turn, self.shift, self.voxel)
+        return VoxelStates(*(part.to(device) for part in parts))
+
+    def at(self, points: Tensor) -> Tensor:
+        """The states (..., M) at points (..., M, 3); UNSEEN beyond the grid."""
+        cells = (points @ self.turn).add_(self.shift.unsqueeze(-2)).floor_().long()
+        within = ((cells >= 0) & (cells < self.counts)).all(-1)
+        x, y, z = torch.minimum(cells.clamp_min_(0), self.counts - 1).unbind(-1)
+        index = x.mul(self.counts[1]).add_(y).mul_(self.counts[2]).add_(z)
+        return torch.where(within, self.states[index], UNSEEN)
+
+    def unseen(self, points: Tensor) -> Tensor:
+        """(..., M) bool: which points (..., M, 3) were not observed."""
+        return self.at(points) == UNSEEN
+
+    def facing_unseen(self, points: Tensor, normals: Tensor) -> Tensor:
+        """(..., M) bool: no line of sight passed in front of surface elements at points (..., M, 3) with unit normals
+        (..., M, 3)."""
+        step = self.voxel[..., None, None] * normals
+        near, far = (points + count * step for count in OCCLUSION.front_voxels)
+        return (self.at(near) != FREE) & (self.at(far) != FREE)
 
 
 class WorkingObservation:
-    """What was observed of a field, in its working frame: at (M, 3) float32 points on the CPU."""
+    """What was observed of a field, in its working frame: at (M, 3) float32 points on any device, results there."""
 
     def __init__(self, observation: Observation, frame: WorkingFrame) -> None:
         self._observation = observation.seen_in(frame.to_field())
-        T_grid_frame = self._observation.T_grid_frame
-        assert T_grid_frame is not None
-        to_cells = T_grid_frame.scale / observation.voxel
-        self._voxel = float(1.0 / to_cells)
-        self._turn = (to_cells * T_grid_frame.rotation).float().T.contiguous()
-        self._shift = ((T_grid_frame.translation - observation.low) / observation.voxel).float()
-        self._counts = torch.tensor(observation.states.shape)
-        self._states = observation.states.reshape(-1)
+        self._voxels = {torch.device("cpu"): VoxelStates.of(self._observation)}
+
+    def to(self, device: torch.device | str) -> WorkingObservation:
+        """Itself: it works where its points are."""
+        del device
+        return self
+
+    def on(self, device: torch.device) -> VoxelStates:
+        """The voxels for points of the working frame on the device; copied there once."""
+        if device not in self._voxels:
+            self._voxels[device] = self._voxels[torch.device("cpu")].to(device)
+        return self._voxels[device]
 
     def measured_extent(self) -> Tensor | None:
         """(2, 3) float64: lowest and highest corner of where surface was measured; None where none was."""
@@ -79,28 +161,17 @@ class WorkingObservation:
 
     def on_surface(self, points: Tensor) -> Tensor:
         """(M,) bool: a surface was measured there."""
-        return self._at(points) == SURFACE
+        return self.on(points.device).at(points) == SURFACE
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
         """(M,) bool: neither was a surface measured there, nor did a line of sight pass through. values: not needed."""
         del values
-        return self._at(points) == UNSEEN
+        return self.on(points.device).unseen(points)
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """(M,) bool: no line of sight passed in front of these surface elements, whose unit normals are (M, 3)."""
-        near, far = (points + step * self._voxel * normals for step in OCCLUSION.front_voxels)
-        return (self._at(near) != FREE) & (self._at(far) != FREE)
-
-    def _at(self, points: Tensor) -> Tensor:
-        """The states (M,) at points (M, 3); UNSEEN beyond the grid."""
-        cells = torch.addmm(self._shift, points, self._turn).floor_().long()
-        within = ((cells >= 0) & (cells < self._counts)).all(-1)
-        x, y, z = torch.minimum(cells.clamp_min_(0), self._counts - 1).unbind(-1)
-        index = x.mul(self._counts[1]).add_(y).mul_(self._counts[2]).add_(z)
-        return torch.where(within, self._states[index], UNSEEN)
+        return self.on(points.device).facing_unseen(points, normals)
 
 
-def _finite(values: Tensor) -> Tensor:
-    if not torch.isfinite(values).all():
-        raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    return values
+def _not_finite() -> InvalidInputError:
+    return InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")

@@ -72,9 +72,9 @@ def suits(function: NeusFactoFunction) -> bool:
     if encoding is not None:
         tensors.append(encoding.table)
         columns += encoding.width
-        if len(encoding.table) < encoding.layout.rows:
-            return False
     if not all(one.device.type == "cpu" and one.dtype == torch.float32 and one.is_contiguous() for one in tensors):
+        return False
+    if encoding is not None and len(encoding.table) < encoding.layout.rows:
         return False
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
         if weight.shape[1] != columns or bias.shape != weight.shape[:1]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import MODEL
+from regnf_core.robust.devices import working_device
 from regnf_core.robust.model.extremal_points import extremal_points
 from regnf_core.robust.model.hull import Hull
 from regnf_core.robust.model.self_symmetry import SelfSymmetry, confirm_symmetries, propose_symmetries
@@ -49,6 +50,23 @@ class ObjectModel:
         """The samples' convex hull."""
         return Hull.of(self.samples.on_surface())
 
+    def to(self, device: torch.device | str) -> ObjectModel:
+        """The same model on another device; itself where it is there already. The frame stays on the CPU."""
+        if self.samples.points.device == torch.device(device):
+            return self
+        moved = ObjectModel(
+            self.frame,
+            self.samples.to(device),
+            self.spacing,
+            self.extremal_points.to(device),
+            self.symmetry.to(device),
+            self.signature.to(device),
+        )
+        for name in ("distance_grid", "hull"):
+            if name in self.__dict__:
+                moved.__dict__[name] = self.__dict__[name].to(device)
+        return moved
+
     def field(self, obj: SdfField) -> WorkingField:
         """The object's field, the one that this model was made from, in the working frame."""
         return WorkingField(obj, self.frame)
@@ -57,7 +75,8 @@ class ObjectModel:
 def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectModel:
     """Sample the object's surface and find its symmetries, once for all registrations.
 
-    Deterministic. Of the options ``object_samples`` alone matters.
+    Deterministic. Of the options ``object_samples`` alone matters. The samples are worked on where the field is; the
+    model is on the CPU.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RobustOptions()
@@ -65,9 +84,12 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     sampled = sample_object_surface(obj, options.object_samples, generator)
     samples = sampled.samples
     outermost = extremal_points(samples.on_surface(), MODEL.extremal_points)
-    grid = distance_grid(samples, sampled.spacing)
-    proposed = propose_symmetries(grid, samples, outermost, super_fibonacci(MODEL.rotations), generator)
-    symmetry = confirm_symmetries(proposed, sampled.field, samples, outermost, generator)
+    device = working_device(obj)
+    there, rotations = samples.to(device), super_fibonacci(MODEL.rotations).to(device)
+    grid = distance_grid(there, sampled.spacing)
+    proposed = propose_symmetries(grid, there, outermost, rotations, generator)
+    symmetry = confirm_symmetries(proposed, sampled.field, there, outermost, generator).to("cpu")
+    sampled.field.require_finite()
     model = ObjectModel(sampled.frame, samples, sampled.spacing, outermost, symmetry, signature(samples))
-    model.__dict__["distance_grid"] = grid  # what the property would make again
+    model.__dict__["distance_grid"] = grid.to("cpu")  # what the property would make again
     return model

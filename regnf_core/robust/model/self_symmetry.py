@@ -35,8 +35,13 @@ class SelfSymmetry:
     axis: Tensor | None
     deviation: Tensor
 
+    def to(self, device: torch.device | str) -> SelfSymmetry:
+        """The same on another device."""
+        axis = None if self.axis is None else self.axis.to(device)
+        return SelfSymmetry(self.T.on(device), axis, self.deviation.to(device))
+
     def group(self) -> ObjectSymmetry:
-        """The symmetries that the object's field confirms."""
+        """The symmetries that the object's field confirms. On the CPU."""
         exact = self.T[self.deviation <= MODEL.max_deviating_share]
         omega = exact.log()[:, :3]
         if self.axis is not None:
@@ -52,14 +57,15 @@ def propose_symmetries(
 ) -> SelfSymmetry:
     """Likely symmetries of the object with the samples B (working frame, centroid at 0) and the distance model ``obj``.
 
-    rotations: (K, 3, 3) to try. The field still has to confirm what is found.
+    rotations: (K, 3, 3) to try, on the device of B and obj; what is found is on the CPU. The field still has to confirm
+    it.
     """
     few = subsample(B, MODEL.points, generator)
     itself = SurfacePair(obj, obj, few, few)
     context = RefinementContext(extremal_points, generator, SAME_SCALE)
     found = coarse_to_fine(itself, PoseCandidates.start(_rigid(rotations)), MODEL.stages, context)
     max_score = _score_of_identity(itself) + MODEL.max_score_above_identity
-    found = found[found.scores <= max_score]
+    found = found[found.scores <= max_score].to("cpu")
     T = found.T[_distinct_symmetries(found.T, found.scores, extremal_points)]
     axis = _continuous_axis(itself, T, max_score)
     if axis is not None:
@@ -79,10 +85,12 @@ def confirm_symmetries(
         return proposed
     few = subsample(B, MODEL.confirming_points, generator)
     settings = Settings(scale=SAME_SCALE)
-    refined = minimize(SurfacePair(obj, obj, few, few), proposed.T, MODEL.confirming_widths, settings)
-    deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1)
-    kept = _distinct_symmetries(refined.T, deviation, extremal_points)
-    T, deviation = refined.T[kept], deviation[kept]
+    start = proposed.T.on(B.points.device)
+    refined = minimize(SurfacePair(obj, obj, few, few), start, MODEL.confirming_widths, settings)
+    deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1).cpu()
+    found = refined.T.on("cpu")
+    kept = _distinct_symmetries(found, deviation, extremal_points)
+    T, deviation = found[kept], deviation[kept]
     axis = proposed.axis
     if axis is not None and bool((deviation[_about(T, axis)] > MODEL.max_deviating_share).any()):
         axis = None
@@ -90,7 +98,7 @@ def confirm_symmetries(
 
 
 def _score_of_identity(itself: SurfacePair) -> float:
-    identity = _rigid(torch.eye(3)[None].double())
+    identity = _rigid(torch.eye(3, dtype=torch.float64, device=itself.scene_samples.points.device)[None])
     return float(disagreement(residuals(itself, identity), _SCORE_WIDTH))
 
 
@@ -104,8 +112,8 @@ def _distinct_symmetries(T: Sim3, scores: Tensor, extremal_points: Tensor) -> Te
 
 def _rigid(rotations: Tensor) -> Sim3:
     """Rotations (K, 3, 3) as transforms (K,), float64."""
-    count = rotations.shape[0]
-    return Sim3(torch.ones(count).double(), rotations.double(), torch.zeros(count, 3).double())
+    rotations = rotations.double()
+    return Sim3(torch.ones_like(rotations[:, 0, 0]), rotations, torch.zeros_like(rotations[:, 0]))
 
 
 def _continuous_axis(itself: SurfacePair, T: Sim3, max_score: float) -> Tensor | None:
@@ -116,7 +124,7 @@ def _continuous_axis(itself: SurfacePair, T: Sim3, max_score: float) -> Tensor |
         if angle < low or angle > high:
             continue
         axis: Tensor = omega / omega.norm()
-        turns = _rigid(turns_about(axis, MODEL.axis_turns))
+        turns = _rigid(turns_about(axis, MODEL.axis_turns).to(itself.scene_samples.points.device))
         if bool((disagreement(residuals(itself, turns), _SCORE_WIDTH) <= max_score).all()):
             return axis
     return None

@@ -38,50 +38,70 @@ class RefinementContext:
     penalty: Callable[[Sim3], Tensor] = lambda T: torch.zeros_like(T.scale)
 
 
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """A pair of surfaces, its pose candidates, and the context: what goes through the stages."""
+
+    surfaces: SurfacePair
+    candidates: PoseCandidates
+    context: RefinementContext
+
+    def prepared(self, stage: Stage) -> Descent:
+        """With the copies that the stage asks for, and its samples of the surfaces."""
+        candidates, context = self.candidates, self.context
+        if stage.copies:
+            candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
+            candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
+        return Descent(self.surfaces.subsample(stage.points, context.generator), candidates, context)
+
+
 def coarse_to_fine(
     surfaces: SurfacePair, candidates: PoseCandidates, stages: Sequence[Stage], context: RefinementContext
 ) -> PoseCandidates:
     """The candidates that are left after all stages, best first."""
     for stage in stages:
-        if stage.copies:
-            candidates = candidates.with_copies(stage.copies, stage.spread, context.generator)
-            candidates = replace(candidates, T=context.scale.limited_poses(candidates.T))
-        few = surfaces.subsample(stage.points, context.generator)
-        numbers = torch.arange(len(candidates))
-        parts = [_refine(few, candidates[part], stage, context) for part in torch.split(numbers, SEARCH.batch)]
-        candidates = _admitted(PoseCandidates.cat(parts), context)
-        candidates = candidates[_best(candidates, stage, context.extremal_points)]
+        ready = Descent(surfaces, candidates, context).prepared(stage)
+        settings = Settings(stage.widest, context.scale, context.max_offset)
+        numbers = torch.arange(len(ready.candidates), device=candidates.scores.device)
+        parts = []
+        for part in torch.split(numbers, SEARCH.batch):
+            done = refined(ready.surfaces, ready.candidates[part], stage, settings, context.on_step)
+            parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
+        candidates = PoseCandidates.cat(parts)
+        left = survivors(candidates, context.admits(candidates.T), stage, context.extremal_points)
+        candidates = candidates[left.to(candidates.scores.device)]
+        surfaces.require_finite()
     return candidates
 
 
-def _admitted(candidates: PoseCandidates, context: RefinementContext) -> PoseCandidates:
-    admitted = context.admits(candidates.T)
-    return candidates[admitted.nonzero().squeeze(-1)] if bool(admitted.any()) else candidates
-
-
-def _refine(few: SurfacePair, candidates: PoseCandidates, stage: Stage, context: RefinementContext) -> PoseCandidates:
+def refined(
+    few: SurfacePair, candidates: PoseCandidates, stage: Stage, settings: Settings, on_step: Callable[[], None]
+) -> PoseCandidates:
     """All candidates after one stage's iterations, with their scores there."""
     if not stage.widths:
         r = residuals(few, candidates.T, candidates.offsets)
-        scores = disagreement(r, stage.score_width) + context.penalty(candidates.T)
-        return PoseCandidates(candidates.T, scores, candidates.offsets, candidates.history)
+        return replace(candidates, scores=disagreement(r, stage.score_width))
     history = list(candidates.history)
 
     def record(done: Iteration) -> None:
-        size, n = done.residuals.values.abs(), done.residuals.scene_count
-        history.append(Step(done.T, done.costs, size[:, :n].mean(1), size[:, n:].mean(1), done.width, stage.points))
-        context.on_step()
+        of_scene, of_object = done.residuals.means(done.residuals.values.abs())
+        history.append(Step(done.T, done.costs, of_scene, of_object, done.width, stage.points))
+        on_step()
 
-    settings = Settings(stage.widest, context.scale, context.max_offset)
-    refined = minimize(few, candidates.T, stage.widths, settings, candidates.offsets, record)
-    scores = disagreement(refined.residuals, stage.score_width) + context.penalty(refined.T)
-    return PoseCandidates(refined.T, scores, refined.residuals.offset, tuple(history))
+    found = minimize(few, candidates.T, stage.widths, settings, candidates.offsets, record)
+    scores = disagreement(found.residuals, stage.score_width)
+    return PoseCandidates(found.T, scores, found.residuals.offset, tuple(history))
 
 
-def _best(candidates: PoseCandidates, stage: Stage, extremal_points: Tensor) -> Tensor:
-    """Numbers of the candidates that go on, best first."""
-    scores = candidates.scores
+def survivors(candidates: PoseCandidates, admitted: Tensor, stage: Stage, extremal_points: Tensor) -> Tensor:
+    """Numbers of the candidates that go on, best first, on the CPU, where they are chosen: one copy a stage.
+
+    admitted: (H,) bool, which may go on; where it is none, all may.
+    """
+    admitted = admitted.cpu()
+    may = (admitted if bool(admitted.any()) else ~admitted).nonzero().squeeze(-1)
+    scores = candidates.scores.cpu()[may]
     if stage.min_distance == 0.0:
-        return scores.argsort()[: stage.keep]
-    kept = distinct(candidates.T, scores, extremal_points, stage.min_distance, stage.keep)
-    return kept[scores[kept] <= scores[kept[0]] + stage.margin]
+        return may[scores.argsort()[: stage.keep]]
+    kept = distinct(candidates.T.on("cpu")[may], scores, extremal_points, stage.min_distance, stage.keep)
+    return may[kept[scores[kept] <= scores[kept[0]] + stage.margin]]

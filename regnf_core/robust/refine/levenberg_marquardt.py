@@ -10,9 +10,10 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT
+from regnf_core.robust.devices import on_host
 from regnf_core.robust.refine.loss import adaptive_width, normal_equations, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound, ScaleBounds
 
 
 @dataclass(frozen=True)
@@ -20,13 +21,13 @@ class Settings:
     """What may move, and how the kernel widths are meant.
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
-    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters; 0: the
-    offset stays as it is.
+    are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters, also
+    (H,), one for each pose; 0: the offset stays as it is.
     """
 
     widest: float = 0.0
-    scale: ScaleBound = ANY_SCALE
-    max_offset: float = REFINEMENT.max_offset
+    scale: ScaleBound | ScaleBounds = ANY_SCALE
+    max_offset: float | Tensor = REFINEMENT.max_offset
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,8 @@ def minimize(
 def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | None:
     if now.offset is None:
         return None
-    return (now.offset + step[:, 7]).clamp(-settings.max_offset, settings.max_offset)
+    most, moved = settings.max_offset, now.offset + step[:, 7]
+    return moved.clamp(-most, most)  # type: ignore[arg-type]  # two numbers or two tensors
 
 
 def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
@@ -98,20 +100,29 @@ def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, s
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest
-    fixed = torch.tensor([False] * 7 + [settings.max_offset == 0.0])[: H.shape[-1]]
-    extra = extra + REFINEMENT.fixed_damping * fixed.double()
+    if isinstance(settings.max_offset, Tensor):
+        extra[:, 7:] += REFINEMENT.fixed_damping * (settings.max_offset == 0.0).to(extra)[:, None]
+    elif settings.max_offset == 0.0:
+        extra[:, 7:] += REFINEMENT.fixed_damping
     step = _solved(H + torch.diag_embed(extra), -b, scale.double(), settings.scale)
     longest = step.abs().amax(-1, keepdim=True)
     limited: Tensor = step * (REFINEMENT.max_step / longest.clamp_min(REFINEMENT.max_step))
     return limited
 
 
-def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound) -> Tensor:
+def _solved(A: Tensor, b: Tensor, scale: Tensor, bound: ScaleBound | ScaleBounds) -> Tensor:
     """(H, K) x with A x = b; where the scale (H,) would leave the bound, it goes up to it and the others follow."""
-    step: Tensor = torch.linalg.solve(A, b)
+    step = _solution(A, b)
     if bound.is_open:
         return step
     growth = bound.limited_growth(scale, step[:, 6])
     held, known = A.clone(), b.clone()
     held[:, 6], held[:, 6, 6], known[:, 6] = 0.0, 1.0, growth
-    return torch.where((growth != step[:, 6])[:, None], torch.linalg.solve(held, known), step)
+    return torch.where((growth != step[:, 6])[:, None], _solution(held, known), step)
+
+
+def _solution(A: Tensor, b: Tensor) -> Tensor:
+    """(H, K) x with A x = b. Whether A is singular is asked on the CPU alone: elsewhere the answer takes a copy, and a
+    step that is not finite is undone like any that raises the cost."""
+    x: Tensor = torch.linalg.solve_ex(A, b, check_errors=on_host(A)).result
+    return x

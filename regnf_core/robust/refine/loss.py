@@ -19,7 +19,12 @@ def adaptive_width(r: Residuals, lowest: float, widest: float) -> Tensor:
 
     With a fixed narrow kernel, fields with errors everywhere would be fitted at the few places without errors.
     """
-    spread = torch.quantile(r.values.abs(), REFINEMENT.spread_quantile, dim=1, keepdim=True)
+    size = r.values.abs()
+    if r.shares is None:
+        spread = torch.quantile(size, REFINEMENT.spread_quantile, dim=1, keepdim=True)
+    else:
+        counting = size.masked_fill(r.shares == 0.0, torch.nan)
+        spread = torch.nanquantile(counting, REFINEMENT.spread_quantile, dim=1, keepdim=True)
     return (REFINEMENT.spread_factor * spread).clamp(lowest, max(lowest, widest))
 
 
@@ -42,7 +47,8 @@ def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
     """
     widths = kernel_widths(r, width)
     loss = geman_mcclure_loss(r.values, widths) * (widths / width) ** 2
-    cost = 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
+    of_scene, of_object = r.means(loss)
+    cost = 0.5 * (of_scene + of_object)
     if r.offset is None:
         return cost
     prior: Tensor = 0.5 * offset_prior(r) * (r.offset.to(cost)[:, None] / width).square().squeeze(-1)
@@ -54,9 +60,7 @@ def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tenso
 
     Each direction has the same total influence. An offset is the eighth unknown.
     """
-    n, m = r.scene_count, r.values.shape[1] - r.scene_count
-    weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
-    weights = torch.cat([weights[:, :n] / n, weights[:, n:] / m], 1)
+    weights = r.weighted(geman_mcclure_weight(r.values, kernel_widths(r, width)))
     J = r.jacobian_with_offset().mT
     weighted = J * weights[:, None]
     H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()
@@ -75,4 +79,5 @@ def disagreement(r: Residuals, width: float) -> Tensor:
     loss = 1.0 - geman_mcclure_agreement(r.values, width) * r.cosines.clamp(0.0, 1.0)
     if r.unobserved is not None:
         loss = torch.where(r.unobserved, loss.clamp_max(REFINEMENT.unobserved_loss), loss)
-    return 0.5 * (loss[:, : r.scene_count].mean(1) + loss[:, r.scene_count :].mean(1))
+    of_scene, of_object = r.means(loss)
+    return 0.5 * (of_scene + of_object)

@@ -23,7 +23,7 @@ class Step:
     width: float
     samples: int
 
-    def __getitem__(self, index: Tensor) -> Step:
+    def __getitem__(self, index: Tensor | slice) -> Step:
         return Step(
             self.T[index],
             self.costs[index],
@@ -32,6 +32,11 @@ class Step:
             self.width,
             self.samples,
         )
+
+    def to(self, device: torch.device | str) -> Step:
+        """The same on another device."""
+        costs, scene, obj = (part.to(device) for part in (self.costs, self.residual_scene, self.residual_object))
+        return Step(self.T.on(device), costs, scene, obj, self.width, self.samples)
 
     @classmethod
     def cat(cls, parts: Sequence[Step]) -> Step:
@@ -68,20 +73,26 @@ class PoseCandidates:
     def __len__(self) -> int:
         return int(self.scores.numel())
 
-    def __getitem__(self, index: Tensor) -> PoseCandidates:
+    def __getitem__(self, index: Tensor | slice) -> PoseCandidates:
         offsets = None if self.offsets is None else self.offsets[index]
         return PoseCandidates(self.T[index], self.scores[index], offsets, tuple(step[index] for step in self.history))
 
+    def to(self, device: torch.device | str) -> PoseCandidates:
+        """The same on another device."""
+        offsets = None if self.offsets is None else self.offsets.to(device)
+        history = tuple(step.to(device) for step in self.history)
+        return PoseCandidates(self.T.on(device), self.scores.to(device), offsets, history)
+
     def with_copies(self, count: int, spread: Sequence[float], generator: torch.Generator) -> PoseCandidates:
         """These, and ``count`` copies of each, moved at random: ``spread`` is the standard deviation of the rotation
-        (radians), the translation and the log scale. Scores are those of the original."""
-        origins = torch.arange(len(self)).repeat(count + 1)
+        (radians), the translation and the log scale. Scores are those of the original. Drawn on the CPU."""
+        origins = torch.arange(len(self), device=self.scores.device).repeat(count + 1)
         turn, shift, growth = spread
         deviations = torch.tensor([turn] * 3 + [shift] * 3 + [growth], dtype=torch.float64)
         steps = torch.randn(len(origins), 7, generator=generator, dtype=torch.float64) * deviations
         steps[: len(self)] = 0.0
         found = self[origins]
-        return replace(found, T=found.T.perturb(steps))
+        return replace(found, T=found.T.perturb(steps.to(origins.device)))
 
     @classmethod
     def cat(cls, parts: Sequence[PoseCandidates]) -> PoseCandidates:

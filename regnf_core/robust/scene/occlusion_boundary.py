@@ -19,9 +19,13 @@ from regnf_core.robust.samples import Samples
 
 @dataclass(frozen=True, eq=False)
 class SingleView:
-    """A scene that was observed from one point, ``viewpoint`` (3,): it is unobserved behind its surface."""
+    """A scene that was observed from one point, ``viewpoint`` (3,) float32: it is unobserved behind its surface."""
 
     viewpoint: Tensor
+
+    def to(self, device: torch.device | str) -> SingleView:
+        """The same for points on another device."""
+        return SingleView(self.viewpoint.to(device))
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
         """(M,) bool, where the signed distances (M,) are those of matter. points: not needed."""
@@ -30,7 +34,7 @@ class SingleView:
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """(M,) bool: which surface elements at points (M, 3) with unit normals (M, 3) face away from the viewpoint."""
-        return ((self.viewpoint.to(points) - points) * normals).sum(-1) < 0.0
+        return ((self.viewpoint - points) * normals).sum(-1) < 0.0
 
 
 def occlusion_boundary(samples: Samples, generator: torch.Generator) -> tuple[Tensor, SingleView | None]:
@@ -41,7 +45,7 @@ def occlusion_boundary(samples: Samples, generator: torch.Generator) -> tuple[Te
     if viewpoint is None:
         return torch.zeros(len(samples), dtype=torch.bool), None
     edge_on: Tensor = _cosines(points, normals, viewpoint[None])[0].abs() < OCCLUSION.boundary_cosine
-    return edge_on, SingleView(viewpoint) if bool(edge_on.any()) else None
+    return edge_on, SingleView(viewpoint.float()) if bool(edge_on.any()) else None
 
 
 def _viewpoint(points: Tensor, normals: Tensor, generator: torch.Generator) -> Tensor | None:

@@ -44,6 +44,15 @@ class SceneView:
         """The scene's field, the one that this view is of, in the working frame."""
         return WorkingField(scene, self.frame)
 
+    def to(self, device: torch.device | str) -> SceneView:
+        """The same view with its samples on another device; its roughness is measured once. Itself where it is there
+        already."""
+        if self.foreground.points.device == torch.device(device):
+            return self
+        moved = replace(self, foreground=self.foreground.to(device))
+        moved.__dict__["normal_roughness"] = self.normal_roughness
+        return moved
+
     @cached_property
     def normal_roughness(self) -> float:
         """Of the foreground, see :class:`regnf_core.robust.scene.smoothing.SmoothedSurface`."""

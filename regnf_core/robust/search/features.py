@@ -23,10 +23,11 @@ _MATCHING = MatchingOptions(
 
 
 def feature_seeds(scene: Samples, obj: Samples, count: int, seed: int) -> Sim3:
-    """At most ``count`` poses (H,) between the working frames, float64; none where the features give none.
+    """At most ``count`` poses (H,) between the working frames, float64, CPU; none where the features give none.
 
-    Deterministic for a seed, whatever the number of threads. Loads open3d.
+    Deterministic for a seed, whatever the number of threads and the samples' device. Loads open3d.
     """
+    scene, obj = scene.to("cpu"), obj.to("cpu")
     found: list[Sim3] = []
     to_scene, to_object = _normalizing(scene), _normalizing(obj)
     with without_warnings():

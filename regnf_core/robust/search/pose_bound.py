@@ -35,9 +35,15 @@ class PoseBound:
     def of(
         cls, detection: OrientedBox, extremal_points: Tensor, tolerance: float, scale: ScaleBound = ANY_SCALE
     ) -> PoseBound:
-        """The bound for an object with these ``extremal_points`` (E, 3)."""
-        edges = detection.size / detection.diagonal
-        return cls(extremal_points.double(), detection.rotation.double(), edges.double(), tolerance, scale)
+        """The bound for an object with these ``extremal_points`` (E, 3), on their device."""
+        device = extremal_points.device
+        axes, edges = detection.rotation.double().to(device), (detection.size / detection.diagonal).double().to(device)
+        return cls(extremal_points.double(), axes, edges, tolerance, scale)
+
+    def to(self, device: torch.device | str) -> PoseBound:
+        """The same bound for poses on another device."""
+        points, axes, edges = (part.to(device) for part in (self.points, self.axes, self.edges))
+        return replace(self, points=points, axes=axes, edges=edges)
 
     def admits(self, T: Sim3) -> Tensor:
         """(H,) bool: which poses T (H,), scene to object, the detection allows."""

@@ -40,6 +40,6 @@ def super_fibonacci(count: int) -> Tensor:
 
 def turns_about(axis: Tensor, count: int) -> Tensor:
     """(count, 3, 3) float64 rotations about the unit vector ``axis`` (3,), in equal steps, the identity first."""
-    angle = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    angle = torch.arange(count, dtype=torch.float64, device=axis.device) * (2 * math.pi / count)
     q = torch.cat([(angle / 2).sin().unsqueeze(-1) * axis.double(), (angle / 2).cos().unsqueeze(-1)], dim=-1)
     return matrix_from_quaternion(q)

@@ -42,8 +42,8 @@ class ScaleBound:
 
     def limited_growth(self, scale: Tensor, growth: Tensor) -> Tensor:
         """The changes of log ``scale`` (H,), an allowed one, nearest to ``growth`` (H,) that lead to an allowed one."""
-        low, high = ((torch.full_like(scale, end) / scale).log() for end in (self.low, self.high))
-        return torch.minimum(torch.maximum(growth, low), high)
+        low, high = (torch.full_like(scale, end) for end in (self.low, self.high))
+        return ScaleBounds(low, high).limited_growth(scale, growth)
 
     def limited_poses(self, T: Sim3) -> Sim3:
         """Poses T (H,) with the nearest allowed scales; the object's center, 0, stays where it is in the scene."""
@@ -51,6 +51,20 @@ class ScaleBound:
             return T
         scale = self.limited(T.scale)
         return replace(T, scale=scale, translation=T.translation * (scale / T.scale)[..., None])
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleBounds:
+    """A bound for each pose of a batch: low, high (H,)."""
+
+    low: Tensor
+    high: Tensor
+    is_open = False
+
+    def limited_growth(self, scale: Tensor, growth: Tensor) -> Tensor:
+        """As that of :class:`ScaleBound`."""
+        low, high = ((end / scale).log() for end in (self.low, self.high))
+        return torch.minimum(torch.maximum(growth, low), high)
 
 
 ANY_SCALE = ScaleBound()

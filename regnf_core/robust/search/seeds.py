@@ -44,13 +44,13 @@ def seed_poses(
 
 def seed_poses_around(T_start: Sim3, generator: torch.Generator) -> Sim3:
     """A single pose and perturbed copies of it (H,): by about 10 degrees, 5 % of the object's size, 10 % of the
-    scale."""
+    scale. Drawn on the CPU, on the pose's device."""
     turn, shift, growth = SEARCH.warm_start_spread
     count = SEARCH.warm_start_copies
     spread = torch.tensor([turn] * 3 + [shift] * 3 + [growth], dtype=torch.float64)
     steps = torch.randn(count + 1, 7, generator=generator, dtype=torch.float64) * spread
     steps[0] = 0.0
-    return T_start.expand(count + 1).perturb(steps)
+    return T_start.expand(count + 1).perturb(steps.to(T_start.scale.device))
 
 
 def _from_moments(
@@ -59,7 +59,7 @@ def _from_moments(
     scene_center, object_center = scene_points.mean(0), object_points.mean(0)
     ratio = _radius(object_points, object_center) / _radius(scene_points, scene_center)
     tried = bound.limited(ratio * scales.double())
-    tried = tried if bound.is_open else torch.tensor(sorted(set(tried.tolist())), dtype=tried.dtype)
+    tried = tried if bound.is_open else tried.new_tensor(sorted(set(tried.tolist())))
     s = tried[:, None].expand(-1, rotations.shape[0]).reshape(-1)
     R = rotations.repeat(len(tried), 1, 1)
     return Sim3(s, R, object_center - s[:, None] * (R @ scene_center))

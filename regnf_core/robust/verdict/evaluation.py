@@ -28,7 +28,8 @@ from regnf_core.robust.verdict.relation import relation
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The best candidate by the held-out samples and what is known of it. winner: its number among the candidates."""
+    """The best candidate by the held-out samples and what is known of it, on the CPU. winner: its number among the
+    candidates."""
 
     verdict: Verdict
     reason: str
@@ -49,10 +50,15 @@ class Evaluation:
 def evaluate_candidates(
     problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions
 ) -> Evaluation:
-    """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets."""
+    """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
+
+    The residuals are taken on the problem's device; what follows from them is decided on the CPU.
+    """
     assert candidates.offsets is not None, "candidates refined on the fields have offsets"
-    evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust)
-    features = pose_features(problem, candidates.T, candidates.offsets)
+    evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust).to("cpu")
+    features = {name: one.cpu() for name, one in pose_features(problem, candidates.T, candidates.offsets).items()}
+    problem.held_out.require_finite()
+    problem, candidates = problem.to("cpu"), candidates.to("cpu")
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
     alone, among = pose_odds().log_odds(features, evidence.scores, elsewhere)
     ranking = Ranking(evidence.scores.double(), alone)
@@ -128,10 +134,11 @@ def _alternatives(
 def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Tensor:
     """(7, 7) of the best pose, in object units: see :mod:`regnf_core.robust.verdict.covariance`."""
     candidates, best = evaluation.candidates, torch.tensor([evaluation.winner])
-    T = candidates.T[evaluation.winner]
+    T, device = candidates.T[evaluation.winner], problem.fit.scene_samples.points.device
     offset = None if candidates.offsets is None or problem.view.max_offset == 0.0 else candidates.offsets[best]
-    r = residuals(problem.fit, candidates.T[best], offset)
-    A, B = problem.fit.scene_samples, problem.fit.object_samples
+    r = residuals(problem.fit, candidates.T[best].on(device), None if offset is None else offset.to(device)).to("cpu")
+    fit = problem.fit.to("cpu")
+    A, B = fit.scene_samples, fit.object_samples
     places = torch.cat([T.apply(A.points.double()), B.points.double()])
     last = REFINEMENT.last_stages[-1]
     cov = covariance(r, adaptive_width(r, last.widths[-1], last.widest), places)

@@ -7,7 +7,8 @@ matter instead, the part may be occluded (fields are solid behind what was obser
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,6 +52,12 @@ class Evidence:
     """(H, M) uint8, likewise."""
     partial: bool = False
     """Part of the scene is known not to have been observed. That part is left out; the rest was measured."""
+
+    def to(self, device: torch.device | str) -> Evidence:
+        """The same on another device."""
+        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
+        values |= {name: one.to(device) for name, one in values.items() if isinstance(one, Tensor)}
+        return Evidence(**values)
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
@@ -102,7 +109,7 @@ def _signs(*marked: tuple[Tensor, int]) -> Tensor:
     """(H, N) uint8: the number of the last that marks each sample; 0 where none does."""
     signs = torch.zeros_like(marked[0][0], dtype=torch.uint8)
     for where, number in marked:
-        signs[where] = number
+        signs.masked_fill_(where, number)
     return signs
 
 
@@ -121,6 +128,6 @@ def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> tu
 
 def _tail_ratio(r: Residuals) -> Tensor:
     values = r.values if r.unobserved is None else r.values.masked_fill(r.unobserved, torch.nan)
-    core, tail = torch.nanquantile(values.abs(), torch.tensor(EVIDENCE.tail_quantiles), dim=1)
+    core, tail = torch.nanquantile(values.abs(), values.new_tensor(EVIDENCE.tail_quantiles), dim=1)
     ratio: Tensor = tail / core.clamp_min(1e-9)
     return ratio

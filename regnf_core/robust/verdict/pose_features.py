@@ -52,7 +52,7 @@ class _Groups:
 
 
 def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dict[str, Tensor]:
-    """Each feature (H,) float64 of the poses T (H,) between the working frames, by name.
+    """Each feature (H,) float64 of the poses T (H,) between the working frames, by name, where the problem is.
 
     offsets: (H,) of the surfaces.
     """
@@ -124,7 +124,7 @@ def _spread(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
     agree = torch.cat([groups.scene_agrees, groups.object_agrees], 1)
     seen = torch.cat([groups.near, groups.visible], 1)
     size = torch.where(seen, r.values.abs(), torch.nan)
-    core, tail = torch.nanquantile(size, torch.tensor(EVIDENCE.tail_quantiles), dim=1).nan_to_num(1.0)
+    core, tail = torch.nanquantile(size, size.new_tensor(EVIDENCE.tail_quantiles), dim=1).nan_to_num(1.0)
     return {
         "noise": _mean(r.values.square(), agree, of_nothing=EVIDENCE.agreement**2).sqrt(),
         "tail": (tail / core.clamp_min(EVIDENCE.min_core)).log(),
@@ -141,9 +141,10 @@ def _stiffness(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Gro
     J = _about_origin(r.jacobian.double(), T.translation.double()[:, None])
     H = 0.5 * (J * weights.double()[..., None]).mT @ J
     points = problem.held_out.object_samples.points.double()
-    motion = torch.cat([_cross_matrix(points).mT, torch.eye(3).double().expand(m, 3, 3), points[..., None]], -1)
+    eye = torch.eye(7, dtype=points.dtype, device=points.device)
+    motion = torch.cat([_cross_matrix(points).mT, eye[:3, :3].expand(m, 3, 3), points[..., None]], -1)
     G = (motion.mT @ motion).mean(0)
-    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * torch.eye(7).double()))
+    inverse = torch.linalg.inv(torch.linalg.cholesky(G + 1e-9 * eye))
     least: Tensor = torch.linalg.eigvalsh(inverse @ H @ inverse.mT)[:, :2]
     return least.clamp_min(0.0).sqrt()
 

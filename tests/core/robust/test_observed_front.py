@@ -19,8 +19,10 @@ MIDDLE = COUNT // 2
 
 
 def wall_seen_from_above(margin: int = 0) -> Observation:
-    """Free above z = .1, a surface measured in the layer below it, nothing seen farther down; ``margin``: so many layers
-    above the surface count as unobserved. Field frame, the grid's middle at 0."""
+    """Free above z = .1, a surface measured in the layer below it, nothing seen farther down. The grid's middle is 0.
+
+    margin: so many layers above the surface count as unobserved.
+    """
     states = torch.full((COUNT, COUNT, COUNT), UNSEEN, dtype=torch.uint8)
     states[:, :, MIDDLE] = SURFACE
     states[:, :, MIDDLE + 1 + margin :] = FREE
