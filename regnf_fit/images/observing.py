@@ -49,7 +49,7 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
     states = torch.full(counts, UNSEEN, dtype=torch.uint8).view(-1)
     axes = [low[k] + (torch.arange(counts[k], dtype=torch.float64) + 0.5) * voxel for k in range(3)]
     centers = torch.cartesian_prod(*axes).float()
-    left = list(torch.arange(len(centers)).split(_AT_ONCE))
+    left = list(torch.split(torch.arange(len(centers)), _AT_ONCE))
     for image in range(len(images)):
         margins = np.maximum(_SPREADS * spread.at(images.depths[image]), np.float32(_MARGIN * voxel))
         for number, part in enumerate(left):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,9 +15,9 @@ from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.samples import Samples
 
 
-def kind_of(pair: SurfacePair) -> Hashable:
+def kind_of(pair: SurfacePair) -> str:
     """Pairs of one kind can be stacked: what tells where their scenes were not observed is the same."""
-    return type(pair.scene_samples.unobserved)
+    return type(pair.scene_samples.unobserved).__name__
 
 
 @dataclass(frozen=True, eq=False)
