@@ -72,7 +72,7 @@ def register_batch(
     wanted = pairs_of(pairs, len(detections), len(objects))
     batch = _Batch(scene, detections, objects, options, seed)
     memory = options.robust.batch_memory
-    if memory is None and scene.device.type != "cpu":
+    if memory is None and working_device(scene).type != "cpu":
         memory = _MEMORY_ELSEWHERE
     size = 1 if memory is None else Sizes(memory).pairs
     outcomes: list[BatchOutcome] = []
