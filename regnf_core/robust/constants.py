@@ -182,7 +182,7 @@ class OcclusionConstants:
     front_voxels: tuple[float, float] = (1.0, 2.0)
     """Voxels of the observation in front of a surface element. One of both places was seen to be free, or nobody saw
     the element from its front. [derived: the first lies beyond the surface's own voxel; next to a measured surface, a
-    voxel may count as unobserved although it was seen]"""
+    voxel may count as unobserved although it was seen. Compared with one and three voxels on random worlds]"""
 
     guesses: int = 3000
     """Viewpoints tried: where the tangent planes of three random samples meet. [by hand]"""
@@ -440,7 +440,8 @@ class VerdictConstants:
     """Log odds. Larger leads are not told apart. [by hand]"""
     log_odds_per_score: float = 30.0
     """Log odds that a difference of 1 in the score counts as when candidates are compared: odds of poses that fit alike
-    differ by chance. From 20 to 50 the choice is right as often. [random worlds]"""
+    differ by chance. At 20, 30 and 50 the choice is right in 333, 332 and 328 of 356 cases that have a right pose, at 0
+    in 319. [random worlds]"""
     rivals_min_distance: float = 0.1
     """Diameters. Poses closer together are one answer with its uncertainty. [by hand]"""
     rival_log_odds: float = 3.0

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from regnf_core.robust.fused.models import PartModel, Stack, stack_of
 from regnf_core.robust.fused.parts import Part
-from regnf_core.robust.fused.unobserved import Stacked, stacked_tests, test_of
+from regnf_core.robust.fused.unobserved import Stacked, of_part, stacked_tests
 from regnf_core.robust.residuals import SurfacePair
 from regnf_core.robust.samples import Samples
 
@@ -49,7 +49,7 @@ class StackedSurfaces:
         """The surfaces for each pose of the part: samples (H, N, 3)."""
         A, B = (samples[part.pairs] for samples in (self.scene_samples, self.object_samples))
         if self.unobserved is not None:
-            A = replace(A, unobserved=test_of(self.unobserved, part))
+            A = replace(A, unobserved=of_part(self.unobserved, part))
         scene, obj = self.scene.model_of(part), self.obj.model_of(part)
         return PartSurfaces(SurfacePair(scene, obj, A, B), (scene, obj))
 

@@ -29,7 +29,7 @@ def stacked_tests(tests: Sequence[UnobservedTest | None], device: torch.device) 
     return replace(seen[0], turn=turn, shift=shift, voxel=voxel)
 
 
-def test_of(stacked: Stacked, part: Part) -> UnobservedTest:
+def of_part(stacked: Stacked, part: Part) -> UnobservedTest:
     """The test for points (H N, 3), N of each pose of the part."""
     if isinstance(stacked, SingleView):
         return _OfPoses(SingleView(stacked.viewpoint[part.pairs][:, None]), len(part.pairs))
