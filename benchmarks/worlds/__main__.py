@@ -92,7 +92,11 @@ def _homes(arguments: argparse.Namespace) -> list[Path]:
 def _evidence(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
     known = sorted(path.parent for path in arguments.folder.glob(f"*/{WORLD}"))
-    way = {"observed": not arguments.without_observation, "limit": arguments.cases}
+    way = {
+        "observed": not arguments.without_observation,
+        "limit": arguments.cases,
+        "look_alikes_every": arguments.look_alikes_every,
+    }
     work = partial(evidence_of_world, known=known, **way)
     with arguments.output.open("a") as file:
         for rows in _in_parallel(work, homes, arguments.workers):
@@ -160,6 +164,7 @@ def _parser() -> argparse.ArgumentParser:
     gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
     gathering.add_argument("--without-observation", action="store_true")
     gathering.add_argument("--cases", type=int, default=8, help="of each world, at most")
+    gathering.add_argument("--look-alikes-every", type=int, default=1, help="of so many cases one has a look-alike too")
     for command in (making, registering, gathering):
         command.add_argument("folder", type=Path)
         command.add_argument("--part", choices=PARTS, default="train")

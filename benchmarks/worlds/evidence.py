@@ -37,20 +37,24 @@ _SAME_SHAPE = 0.03
 """Diameters. An object whose surface lies that close to the right one's, nearly everywhere, is no wrong object."""
 
 
-def evidence_of_world(home: Path, known: Sequence[Path], observed: bool, limit: int) -> list[Row]:
+def evidence_of_world(
+    home: Path, known: Sequence[Path], observed: bool, limit: int, look_alikes_every: int = 1
+) -> list[Row]:
     """The rows of the first ``limit`` cases of a world's folder. known: all folders; wrong objects come from the other
-    worlds of its part."""
+    worlds of its part. look_alikes_every: of so many cases the first has a look-alike."""
     draw = random.Random(home.name)
     others = [
         one for one in known if _seed(one) != _seed(home) and part_of_world(_seed(one)) == part_of_world(_seed(home))
     ]
     rows: list[Row] = []
-    for case in list(cases_of(home, observed))[:limit]:
+    for number, case in enumerate(list(cases_of(home, observed))[:limit]):
         facts = {**case.facts, "observed": observed}
         rows += [{**facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
         other = _another(case, others, draw)
         if other is not None:
             rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
+        if number % look_alikes_every:
+            continue
         alike = look_alike(home, case, np.random.default_rng(draw.getrandbits(32)))
         rows += [{**facts, "model": LOOK_ALIKE, **row} for row in _rows(case, alike)]
     return rows

@@ -13,7 +13,8 @@ class UnobservedTest(Protocol):
     """Tells what was not observed of a scene, in the samples' frame."""
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
-        """(M,) bool: which of the points (M, 3), with these signed distances (M,), were not observed."""
+        """(M,) bool: which of the points (M, 3) were not observed. values: (M,) the signed distances there, object
+        diameters."""
         ...
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:

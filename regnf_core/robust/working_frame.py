@@ -12,7 +12,7 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import OCCLUSION
+from regnf_core.robust.constants import EVIDENCE, OCCLUSION
 from regnf_core.robust.devices import on_host
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 
@@ -125,9 +125,12 @@ class VoxelStates:
         index = x.mul(self.counts[1]).add_(y).mul_(self.counts[2]).add_(z)
         return torch.where(within, self.states[index], UNSEEN)
 
-    def unseen(self, points: Tensor) -> Tensor:
-        """(..., M) bool: which points (..., M, 3) were not observed."""
-        return self.at(points) == UNSEEN
+    def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
+        """(..., M) bool: which points (..., M, 3), with these signed distances (..., M) in object diameters, were not
+        observed: those in unseen voxels, and those off the surface in voxels where one was measured. Such a voxel does
+        not tell which part of it is free."""
+        states = self.at(points)
+        return (states == UNSEEN) | ((states == SURFACE) & (values.abs() > EVIDENCE.agreement))
 
     def facing_unseen(self, points: Tensor, normals: Tensor) -> Tensor:
         """(..., M) bool: no line of sight passed in front of surface elements at points (..., M, 3) with unit normals
@@ -164,9 +167,8 @@ class WorkingObservation:
         return self.on(points.device).at(points) == SURFACE
 
     def unobserved(self, points: Tensor, values: Tensor) -> Tensor:
-        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through. values: not needed."""
-        del values
-        return self.on(points.device).unseen(points)
+        """(M,) bool: neither was a surface measured there, nor did a line of sight pass through."""
+        return self.on(points.device).unobserved(points, values)
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """(M,) bool: no line of sight passed in front of these surface elements, whose unit normals are (M, 3)."""

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.base import SdfField
@@ -39,7 +40,8 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
 
     voxels: along the longest side of the bounds; fewer where a pixel is wider than that. None without depths, or for 0.
     spread: of the depths from image to image; what is nearer to a measured surface than that is not seen to be free.
-    Voxels are classified by their centers, in every image that shows them.
+    A voxel is free where all four rays round its center, in some image, pass it by: at the edge of a thing one of them
+    ends there. (The center's own pixel is not enough: voxels are about as wide as a pixel.)
     """
     if images.depths is None or voxels == 0:
         return None
@@ -52,8 +54,9 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
     left = list(torch.split(torch.arange(len(centers)), _AT_ONCE))
     for image in range(len(images)):
         margins = np.maximum(_SPREADS * spread.at(images.depths[image]), np.float32(_MARGIN * voxel))
+        clear = _clear_depths(images, image, margins)
         for number, part in enumerate(left):
-            free = _looked_through(centers[part], images, image, torch.from_numpy(margins))
+            free = _looked_through(centers[part], images, image, clear)
             states[part[free]] = FREE
             left[number] = part[~free]
     ends = torch.cat([_ends(images, image) for image in range(len(images))])
@@ -70,22 +73,33 @@ def _pixel_width(images: PosedImages) -> float:
     return float(np.median(widths)) if widths.size else 0.0
 
 
-def _looked_through(centers: Tensor, images: PosedImages, image: int, margins: Tensor) -> Tensor:
-    """(N,) bool: which centers (N, 3) lie before what one image shows, by margins (H, W) along the camera's axis."""
+def _clear_depths(images: PosedImages, image: int, margins: NDArray[np.float32]) -> Tensor:
+    """(H + 1, W + 1): up to which depth all pixels at each corner of pixels were seen to be free; 0 where one of them
+    shows nothing.
+
+    margins: (H, W) before what was measured, along the camera's axis. The background is infinitely far.
+    """
     assert images.depths is not None
+    measured = images.depths[image]
+    clear = np.where(measured > 0.0, measured - margins, np.float32(0.0))
+    if images.masks is not None:
+        clear = np.where(images.masks[image], clear, np.float32(np.inf))
+    return -max_pool2d(torch.from_numpy(-clear)[None], kernel_size=2, stride=1, padding=1)[0]
+
+
+def _looked_through(centers: Tensor, images: PosedImages, image: int, clear: Tensor) -> Tensor:
+    """(N,) bool: which voxels with centers (N, 3) one image looked through. clear: of its pixels' corners, see
+    ``_clear_depths``."""
     T_camera_world = np.linalg.inv(images.T_world_camera[image])
     projection = torch.from_numpy(images.intrinsics[image] @ T_camera_world[:3]).float()
     x, y, z = torch.addmm(projection[:, 3:], projection[:, :3], centers.T)
     depth = z.clamp_min(1e-6)
-    column, row = x.div_(depth).floor_(), y.div_(depth).floor_()
+    column, row = x.div_(depth), y.div_(depth)
     height, width = images.size
     shown = (z > 1e-6) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     at = shown.nonzero()[:, 0]
-    places = row[at].long(), column[at].long()
-    measured = torch.from_numpy(images.depths[image])[places]
-    free = (measured > 0.0) & (z[at] < measured - margins[places])
-    if images.masks is not None:
-        free |= torch.from_numpy(~images.masks[image])[places]
+    corner = (row[at] + 0.5).long(), (column[at] + 0.5).long()
+    free = z[at] < clear[corner]
     return torch.zeros_like(shown).index_put((at,), free)
 
 

@@ -48,7 +48,7 @@ class _OfPoses:
         """See :class:`UnobservedTest`."""
         if isinstance(self.test, SingleView):
             return self.test.unobserved(points, values)
-        return self.test.unseen(self._apart(points)).reshape(-1)
+        return self.test.unobserved(self._apart(points), values.reshape(self.count, -1)).reshape(-1)
 
     def faces_unobserved(self, points: Tensor, normals: Tensor) -> Tensor:
         """See :class:`UnobservedTest`."""

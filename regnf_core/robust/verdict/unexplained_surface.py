@@ -42,6 +42,7 @@ def unexplained_samples(held_out: SurfacePair, T: Sim3, beyond: Tensor) -> Tenso
 def _covered(held_out: SurfacePair, T: Sim3, points: Tensor) -> Tensor:
     """(K,) bool: points (K, 3) of the scene's working frame that lie within matter, or were not observed."""
     value, _ = held_out.scene.value_and_gradient(points)
-    covered: Tensor = T.scale * value < -EVIDENCE.close
+    value = T.scale * value
+    covered: Tensor = value < -EVIDENCE.close
     unobserved = held_out.scene_samples.unobserved
     return covered if unobserved is None else covered | unobserved.unobserved(points, value)
