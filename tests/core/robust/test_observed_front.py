@@ -78,6 +78,14 @@ def test_states_in_a_working_frame_are_those_of_the_observation(name: str) -> No
     assert 0 < int((states == SURFACE).sum()) < int((states == UNSEEN).sum())
 
 
+def test_a_voxel_with_surface_tells_nothing_of_places_off_the_surface() -> None:
+    seen = in_frame(wall_seen_from_above(), Sim3.identity())
+    places = placed(Sim3.identity(), torch.tensor([[0.03, -0.21, 0.05], [0.03, -0.21, 0.65]])).repeat_interleave(3, 0)
+    distances = torch.tensor([0.029, 0.031, -0.031]).repeat(2)
+    assert seen.on_surface(places).tolist() == [True] * 3 + [False] * 3
+    assert seen.unobserved(places, distances).tolist() == [False, True, True] + [False] * 3, "free is free"
+
+
 def test_a_single_view_sees_what_faces_it() -> None:
     view = SingleView(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
     points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 0.0, 0.0]])

@@ -11,6 +11,7 @@ import torch
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_data.posed_images import PosedImages
 from regnf_fit.images.depth_spread import DepthSpread
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.observing import observe
@@ -119,3 +120,24 @@ def test_what_is_nearer_to_a_surface_than_the_noise_is_not_seen_to_be_free() -> 
     assert lost.any()
     # a ray of these images is at most 1.25 times as long as its depth
     assert distance(centers(lost.shape, sure.voxel)[lost]).max() < 1.25 * 3.0 * deviation + sure.voxel
+
+
+def test_a_voxel_at_the_edge_of_a_thing_is_not_free() -> None:
+    # The left half of the image shows a plate at depth 1, the right half a wall at 2, but for some pixels without depth.
+    depth = np.full((16, 16), 2.0, np.float32)
+    depth[:, :8] = 1.0
+    depth[:, 11:] = 0.0
+    camera = np.array([[8.0, 0.0, 8.0], [0.0, 8.0, 8.0], [0.0, 0.0, 1.0]])
+    bounds = np.array([[-0.5125, -0.5625, 1.3875], [0.6125, 0.5625, 1.6125]])
+    one = PosedImages(
+        colors=np.zeros((1, 16, 16, 3), np.uint8),
+        intrinsics=camera[None],
+        T_world_camera=np.eye(4)[None],
+        bounds=bounds,
+        depths=depth[None],
+    )
+    seen = observe(one, 5)
+    assert seen is not None
+    assert seen.states.shape == (5, 5, 1)
+    # Centers at x = -.4, -.175, .05, .275, .5 and depth 1.5: columns 5.9, 7.1, 8.3, 9.5, 10.7 of the image.
+    assert seen.states[:, 2, 0].tolist() == [UNSEEN, UNSEEN, UNSEEN, FREE, UNSEEN]
