@@ -30,7 +30,7 @@ from benchmarks.worlds import tables, training  # noqa: E402
 from benchmarks.worlds.evidence import evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
-from benchmarks.worlds.recipe import SCENES  # noqa: E402
+from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Way, register_world  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
 from regnf_data.worlds.walks import LENGTHS  # noqa: E402
@@ -81,12 +81,13 @@ def _register(arguments: argparse.Namespace) -> None:
 
 def _homes(arguments: argparse.Namespace) -> list[Path]:
     """The folders of the worlds that the arguments name."""
-    homes = sorted(path.parent for path in arguments.folder.glob(f"{arguments.scene}-*/{WORLD}"))
-    homes = [home for home in homes if part_of_world(int(home.name.split("-")[1])) == arguments.part]
-    homes = [home for home in homes if home.name.split("-")[2] in arguments.lengths]
-    if arguments.seeds:
-        homes = [home for home in homes if int(home.name.split("-")[1]) in arguments.seeds]
-    return homes
+    chosen = []
+    for home in sorted(path.parent for path in arguments.folder.glob(f"*/{WORLD}")):
+        scene, seed, length = parts_of_name(home.name)
+        wanted = scene == arguments.scene and length in arguments.lengths and part_of_world(seed) == arguments.part
+        if wanted and (not arguments.seeds or seed in arguments.seeds):
+            chosen.append(home)
+    return chosen
 
 
 def _evidence(arguments: argparse.Namespace) -> None:

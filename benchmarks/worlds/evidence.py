@@ -17,6 +17,7 @@ import torch
 
 from benchmarks.worlds.cases import WorldCase, cases_of
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
+from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.stages import NearestTruth, Recording, recorded
 from regnf_core import RegistrationOptions, RegnfError, Sim3, register
 from regnf_core.geometry.points import NearestNeighbors, diameter
@@ -61,7 +62,7 @@ def evidence_of_world(
 
 
 def _seed(home: Path) -> int:
-    return int(home.name.split("-")[1])
+    return parts_of_name(home.name)[1]
 
 
 def _another(known: WorldCase, others: Sequence[Path], draw: random.Random) -> WorldCase | None:

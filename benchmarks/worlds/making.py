@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.robust.library_objects import GIVEN
 from benchmarks.worlds.objects import ObjectKind, ObjectMaker
 from benchmarks.worlds.observing import observation_of_walk
-from benchmarks.worlds.recipe import FROM_IMAGES, Scene, Seen, see
+from benchmarks.worlds.recipe import FROM_IMAGES, RENDERED, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.schema.observation_grid import ObservationGrid
 from regnf_data.posed_images import PosedImages
@@ -68,7 +68,7 @@ def make(task: Task) -> str:
     part = part_of_world(task.seed)
     world = make_world(task.seed, read_catalog(task.meshes, part, GIVEN))
     try:
-        seen = see(world, task.length, rendered=task.scene == "rendered")
+        seen = see(world, task.length, rendered=task.scene in RENDERED)
     except RegnfError as error:
         return f"{task.home.name}: none, {error}"
     rough = task.home.with_name(f"{task.home.name}.part")

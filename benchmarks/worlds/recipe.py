@@ -19,10 +19,12 @@ from regnf_data.worlds.rooms import World
 from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor, rendered_sensor
 from regnf_data.worlds.walks import LENGTHS, Length, walk
 
-Scene = Literal["tsdf", "rendered", "fit", "under-trained", "mesh", "bent"]
-SCENES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "under-trained", "mesh", "bent")
-FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "under-trained")
+Scene = Literal["tsdf", "rendered", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
+SCENES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "rendered-fit", "under-trained", "mesh", "bent")
+FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fit", "rendered-fit", "under-trained")
 """Scenes that the poses' drift bends; the others are exact, or bent in another way."""
+RENDERED: tuple[Scene, ...] = ("rendered", "rendered-fit")
+"""Scenes whose images are those of a simulated dataset."""
 _FRAMES: dict[Length, dict[int, int]] = {
     "long": {120: 150, 240: 90, 480: 40},
     "short": {120: 48, 240: 32, 480: 16},
@@ -35,6 +37,12 @@ _FARTHEST_M = {"room": (3.0, 5.0), "table": (1.6, 2.2), "shelf": (2.0, 2.6)}
 _TRIES = 4
 _FEWER = 3
 """Times fewer images of another walk, from which objects are cut."""
+
+
+def parts_of_name(world: str) -> tuple[str, int, str]:
+    """Scene, seed and length of a world, by its name."""
+    scene, seed, length = world.rsplit("-", 2)
+    return scene, int(seed), length
 
 
 @dataclass(frozen=True, eq=False)

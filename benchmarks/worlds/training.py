@@ -24,6 +24,7 @@ from scipy.optimize import minimize
 from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.calibration import calibration_table, look_alike_line
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
+from benchmarks.worlds.recipe import parts_of_name
 from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG
@@ -111,7 +112,7 @@ def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
         np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows]),
         np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
         np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * counts,
-        np.array([row["world"].split("-")[1] for row in rows]),
+        np.array([parts_of_name(row["world"])[1] for row in rows]),
     )
     alone, odds = train(evidence)
     found = np.array([row["found"] for row in rows])

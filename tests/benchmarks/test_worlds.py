@@ -11,6 +11,7 @@ import trimesh
 
 from benchmarks.worlds.cases import cases_of
 from benchmarks.worlds.making import WORLD, Task, make
+from benchmarks.worlds.recipe import SCENES, Scene, parts_of_name
 from benchmarks.worlds.tables import lost_at, lower_bound, markdown, success, upper_bound, wrong
 from regnf_core.errors import DatasetError
 from regnf_core.fields.observation import observation_of
@@ -61,6 +62,12 @@ def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path:
         assert seen is not None
         off = one.case.scene.signed_distance(placed[seen.at(placed) == SURFACE]).abs() * float(one.case.truth.scale)
         assert float(off.median()) < 0.01 * float(torch.pdist(one.points[::20]).max())
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_worlds_name_tells_its_scene_seed_and_length(scene: Scene, tmp_path: Path) -> None:
+    task = Task(37, "short", scene, (), tmp_path)
+    assert parts_of_name(task.home.name) == (scene, 37, "short")
 
 
 def test_parts_share_no_mesh_and_a_folder_without_meshes_is_named(tmp_path: Path, meshes: Path) -> None:

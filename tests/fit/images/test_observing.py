@@ -123,7 +123,7 @@ def test_what_is_nearer_to_a_surface_than_the_noise_is_not_seen_to_be_free() -> 
 
 
 def test_a_voxel_at_the_edge_of_a_thing_is_not_free() -> None:
-    # The left half of the image shows a plate at depth 1, the right half a wall at 2, but for some pixels without depth.
+    # The image's left half shows a plate at depth 1, its right half a wall at 2, but for some pixels without depth.
     depth = np.full((16, 16), 2.0, np.float32)
     depth[:, :8] = 1.0
     depth[:, 11:] = 0.0
