@@ -108,7 +108,7 @@ def _evidence(arguments: argparse.Namespace) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     rows = [json.loads(line) for path in arguments.rows for line in _text(path).splitlines()]
-    model, table = training.trained(rows)
+    model, table = training.trained(rows, arguments.left_out)
     arguments.output.write_text(json.dumps(model, indent=1) + "\n")
     if arguments.table is not None:
         arguments.table.write_text(f"# The verdict's probability in worlds that were left out\n\n{table}")
@@ -177,6 +177,7 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
+    learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
     reporting = commands.add_parser("report", help="tables of runs")
     reporting.add_argument("runs", type=Path, nargs="+")
     reporting.add_argument("--output", type=Path)

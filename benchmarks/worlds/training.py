@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG
 
 Array = NDArray[np.float64]
+LeftOut = Literal["world", "part"]
+LEFT_OUT: tuple[LeftOut, ...] = ("world", "part")
 
 PIECES = 5
 """Ramps for each feature, between its quantiles."""
@@ -44,21 +46,21 @@ OF_OTHERS = 0.5
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """Poses with what is known of them: features (N, F), of the ``names`` · right (N,) 0 or 1 · weight (N,): of the
-    pose in the training; 0: none · world (N,): the room, by which poses belong together."""
+    pose in the training; 0: none · group (N,): the room or the part, by which poses belong together."""
 
     names: tuple[str, ...]
     features: Array
     right: Array
     weight: Array
-    world: NDArray[Any]
+    group: NDArray[Any]
 
     def __getitem__(self, index: Any) -> Evidence:
-        return Evidence(self.names, self.features[index], self.right[index], self.weight[index], self.world[index])
+        return Evidence(self.names, self.features[index], self.right[index], self.weight[index], self.group[index])
 
     def with_feature(self, name: str, values: Array, counts: NDArray[np.bool_]) -> Evidence:
         """The same with one more feature (N,), trained with where ``counts`` (N,)."""
         features = np.column_stack([self.features, values])
-        return Evidence((*self.names, name), features, self.right, self.weight * counts, self.world)
+        return Evidence((*self.names, name), features, self.right, self.weight * counts, self.group)
 
     @property
     def signs(self) -> Array:
@@ -102,9 +104,12 @@ class Ramps:
         return {"bias": round(self.bias, 4), "terms": terms}
 
 
-def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
+def trained(rows: Sequence[dict[str, Any]], left_out: LeftOut = "world") -> tuple[dict[str, Any], str]:
     """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
-    the probabilities hold in worlds that were left out."""
+    the probabilities hold in worlds that were left out.
+
+    left_out: one world at a time, or a part with all of its objects, which no other world has.
+    """
     alike = np.array([row["model"] == LOOK_ALIKE for row in rows])
     counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
     evidence = Evidence(
@@ -112,14 +117,18 @@ def trained(rows: Sequence[dict[str, Any]]) -> tuple[dict[str, Any], str]:
         np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows]),
         np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
         np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * counts,
-        np.array([parts_of_name(row["world"])[1] for row in rows]),
+        np.array([_group(row, left_out) for row in rows]),
     )
     alone, odds = train(evidence)
     found = np.array([row["found"] for row in rows])
-    among, left_out = train(evidence.with_feature(LEAD, _leads(rows, odds), found))
-    table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], left_out[counts])
-    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], left_out[alike])
+    among, odds_among = train(evidence.with_feature(LEAD, _leads(rows, odds), found))
+    table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], odds_among[counts])
+    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], odds_among[alike])
     return {"alone": alone.to_dict(), "among": among.to_dict()}, table
+
+
+def _group(row: dict[str, Any], left_out: LeftOut) -> str | int:
+    return str(row["part"]) if left_out == "part" else parts_of_name(row["world"])[1]
 
 
 def _leads(rows: Sequence[dict[str, Any]], odds: Array) -> Array:
@@ -135,11 +144,11 @@ def _told_apart_by_rivals(row: dict[str, Any]) -> bool:
 
 
 def train(evidence: Evidence) -> tuple[Ramps, Array]:
-    """The model, and the log odds (N,) that it gives each row when the row's world is left out."""
+    """The model, and the log odds (N,) that it gives each row when the row's group is left out."""
     left_out = np.zeros(len(evidence.right))
-    for world in np.unique(evidence.world):
-        of_world = evidence.world == world
-        left_out[of_world] = _fit(evidence[~of_world].counted).logit(evidence.features[of_world])
+    for group in np.unique(evidence.group):
+        of_group = evidence.group == group
+        left_out[of_group] = _fit(evidence[~of_group].counted).logit(evidence.features[of_group])
     slope, shift = _platt(left_out, evidence)
     return _fit(evidence.counted).scaled(slope, shift), slope * left_out + shift
 

@@ -95,9 +95,6 @@ def test_the_shipped_models_use_what_they_must() -> None:
     assert float(pose_odds().log_odds(best, alike, several)[1][0].sigmoid()) < likely[1]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="0.974: the sum for a pose alone was trained on fewer worlds (docs/verdict.md, Limits)"
-)
 def test_a_perfect_pose_alone_is_as_likely() -> None:
     best = {name: torch.tensor([1e3 if better else -1e3]).double() for name, better in SPEAKS_FOR.items()}
     assert float(pose_odds().alone.logit(best)[0].sigmoid()) > 0.98
