@@ -111,7 +111,9 @@ def _train(arguments: argparse.Namespace) -> None:
     model, table = training.trained(rows, arguments.left_out)
     arguments.output.write_text(json.dumps(model, indent=1) + "\n")
     if arguments.table is not None:
-        arguments.table.write_text(f"# The verdict's probability in {arguments.left_out}s that were left out\n\n{table}")
+        arguments.table.write_text(
+            f"# The verdict's probability in {arguments.left_out}s that were left out\n\n{table}"
+        )
     _say(table)
 
 
