@@ -3,6 +3,7 @@
     python -m benchmarks.worlds make FOLDER --meshes DIR [DIR ...] --part train --count 20
     python -m benchmarks.worlds register FOLDER --part train --output runs.jsonl
     python -m benchmarks.worlds report runs.jsonl [--output report.md]
+    python -m benchmarks.worlds worst FOLDER runs.jsonl --output worst.png
     python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
     python -m benchmarks.worlds train evidence.jsonl --output probability.json --table calibration.md
 
@@ -32,6 +33,7 @@ from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Way, register_world  # noqa: E402
+from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
 from regnf_data.worlds.walks import LENGTHS  # noqa: E402
 
@@ -42,6 +44,7 @@ def main() -> None:
         "make": _make,
         "register": _register,
         "report": _report,
+        "worst": _worst,
         "evidence": _evidence,
         "train": _train,
     }
@@ -117,6 +120,11 @@ def _train(arguments: argparse.Namespace) -> None:
     _say(table)
 
 
+def _worst(arguments: argparse.Namespace) -> None:
+    runs = [json.loads(line) for path in arguments.runs for line in path.read_text().splitlines()]
+    picture_of(worst_of(runs, arguments.count), arguments.folder).save(arguments.output)
+
+
 def _text(path: Path) -> str:
     """Of a file that may be compressed by gzip, as its name says."""
     data = path.read_bytes()
@@ -180,6 +188,11 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
+    showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
+    showing.add_argument("folder", type=Path, help="of the worlds")
+    showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")
+    showing.add_argument("--count", type=int, default=10)
+    showing.add_argument("--output", type=Path, required=True, help="an image file")
     reporting = commands.add_parser("report", help="tables of runs")
     reporting.add_argument("runs", type=Path, nargs="+")
     reporting.add_argument("--output", type=Path)
