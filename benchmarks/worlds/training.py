@@ -108,7 +108,7 @@ def trained(rows: Sequence[dict[str, Any]], left_out: LeftOut = "world") -> tupl
     """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
     the probabilities hold in worlds that were left out.
 
-    left_out: one world at a time, or a part with all of its objects, which no other world has.
+    left_out: one world at a time, or a part with all of its meshes, which no other part has.
     """
     alike = np.array([row["model"] == LOOK_ALIKE for row in rows])
     counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike

@@ -256,13 +256,13 @@ def entered(context: Context, sha256: str) -> None:
 
 def test_the_model_of_a_librarys_object_is_there_before_its_first_search(context: Context) -> None:
     engine = ModelEngine()
-    assert not is_unmodeled_entry(context, CHAIR, 1)
+    assert not is_unmodeled_entry(context.records, CHAIR, 1)
     entered(context, CHAIR)
-    assert is_unmodeled_entry(context, CHAIR, 1)
-    assert not is_unmodeled_entry(context, CHAIR, 2)
+    assert is_unmodeled_entry(context.records, CHAIR, 1)
+    assert not is_unmodeled_entry(context.records, CHAIR, 2)
     model_entry(context, CHAIR, engine)
     assert (engine.made, symmetry_of(context, CHAIR)) == ([b"chair"], SYMMETRY)
-    assert not is_unmodeled_entry(context, CHAIR, 1)
+    assert not is_unmodeled_entry(context.records, CHAIR, 1)
     assert run(context, engine, "j1", candidates=[CHAIR, TABLE]).status == "successful"
     assert engine.made == [b"chair", b"table"]
 

@@ -216,6 +216,26 @@ def test_imports_and_registrations_that_wait_for_them(tmp_path: Path) -> None:
         ]
 
 
+@pytest.mark.parametrize(("data", "modeled"), [(b"object", True), (b"air", False)])
+def test_what_becomes_an_entry_while_its_import_ends_is_modeled_once(
+    tmp_path: Path, data: bytes, modeled: bool
+) -> None:
+    with bench(tmp_path) as table:
+        table.add_ready_fields("else")
+        upload(table, SCENE, data)
+        table.start_worker()
+        imports = table.context.settings.state_dir / "imports"
+        eventually(lambda: imports.exists() and len(imports.read_text().split()) == 2, table.log)
+        eventually(lambda: not table.context.queue.holds_import(SCENE, 1), table.log)
+        table.submit("succeed", owner="else")
+        assert table.finished().status == "successful", table.log()
+        assert imports.read_text().split() == [SCENE, SCENE]
+        found = table.context.records.get_field(SCENE)
+        assert found is not None
+        assert found.library is not None
+        assert (found.symmetry is not None) is modeled
+
+
 def test_a_registration_of_a_rejected_field_fails(tmp_path: Path) -> None:
     with bench(tmp_path) as table:
         upload(table, SCENE, b"die")

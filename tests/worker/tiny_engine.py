@@ -18,6 +18,7 @@ from typing import Any
 from redis.exceptions import RedisError
 
 from regnf_core.errors import NoSurfaceError
+from regnf_core.library_entries import EntryNotes
 from regnf_core.rendering.request import RenderRequest
 from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
@@ -180,10 +181,25 @@ def run_registration(job_id: str, attempt: int, worker: str) -> None:
 
 
 def run_import(sha256: str, attempt: int, worker: str) -> None:
-    """An import whose upload says how it ends."""
+    """An import whose upload says how it ends: "object" and "air" become entries before the process has ended."""
     from regnf_worker.imports import run_import_attempt
 
-    run_import_attempt(Context.from_settings(Settings()), sha256, attempt, worker, tiny_importer)
+    context = Context.from_settings(Settings())
+    with (Settings().state_dir / "imports").open("a") as file:
+        file.write(f"{sha256}\n")
+    begun = context.records.get_field(sha256)
+    run_import_attempt(context, sha256, attempt, worker, tiny_importer)
+    field = context.records.get_field(sha256)
+    if begun is None or field is None or field.state != "ready":
+        return
+    with context.blobs.open(f"fields/{sha256}/field.safetensors") as file:
+        kind = file.read()
+    if begun.library is not None and kind == b"object":
+        symmetry = {"order": 1, "axis": None, "continuous": False}
+        context.records.update_field(sha256, attempt=attempt, symmetry=symmetry)
+    elif begun.library is None and kind in (b"object", b"air"):
+        context.records.set_entry(field, EntryNotes.checked("an entry"))
+        context.queue.enqueue_import(sha256, attempt)
 
 
 def tiny_importer(

@@ -39,7 +39,7 @@ def run_import(sha256: str, attempt: int, worker: str) -> None:
     )
     context = Context.from_settings(settings, existing=True)
     run_import_attempt(context, sha256, attempt, worker, core_importer(limits))
-    if is_unmodeled_entry(context, sha256, attempt):
+    if is_unmodeled_entry(context.records, sha256, attempt):
         JobLimits.of(settings).hold_here()
         model_entry(context, sha256, CoreEngine.on(settings.device, settings.workers))
 

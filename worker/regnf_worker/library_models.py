@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 from regnf_core.errors import RegnfError
 from regnf_core.options import RegistrationOptions
+from regnf_state.record_store import RecordStore
 from regnf_worker.context import Context
 from regnf_worker.engine import Engine
 from regnf_worker.models import ObjectModels
@@ -15,9 +16,9 @@ from regnf_worker.models import ObjectModels
 logger = logging.getLogger(__name__)
 
 
-def is_unmodeled_entry(context: Context, reference: str, attempt: int) -> bool:
+def is_unmodeled_entry(records: RecordStore, reference: str, attempt: int) -> bool:
     """Whether the field is ready, an entry of its owner's library, and its symmetry is not known."""
-    field = context.records.get_field(reference)
+    field = records.get_field(reference)
     return (
         field is not None
         and field.attempt == attempt

@@ -40,6 +40,7 @@ from regnf_worker.context import Context
 from regnf_worker.field_drawer import Draw, FieldDrawer
 from regnf_worker.finishing import ChildAtPictures, Finishing
 from regnf_worker.job_limits import JobLimits
+from regnf_worker.late_entries import LateEntries
 from regnf_worker.resilient_worker import ResilientWorker
 from regnf_worker.rest import give_up_rest
 from regnf_worker.scratch import Scratch
@@ -83,6 +84,7 @@ class RegnfWorker(ResilientWorker):
         self._functions = functions
         self._fair = FairQueue(redis, context.settings.caller_weights, context.settings.worker_reserve_s)
         self._taking = Taking(redis, self._fair, context.settings.queue_key)
+        self._late_entries = LateEntries(redis, context.queue)
         self._settlers: dict[Kind, Callable[[Context, str, int, str, ChildExit], None]] = {
             "import": settle_import,
             "registration": settle_registration,
@@ -149,6 +151,8 @@ class RegnfWorker(ResilientWorker):
         oom_kills = kernel.oom_kills()
         self._niceness = self._niceness_of(work)
         self.begin_job(job)
+        if work.kind == "import":
+            self._late_entries.before(work)
         folder = self._scratch.of_job()
         try:
             end = self._run_child(job, queue, folder)
@@ -163,6 +167,7 @@ class RegnfWorker(ResilientWorker):
                 self._settle(work, end, kernel.oom_kills() > oom_kills)
             if work.kind == "import":
                 self._if_possible("queueing what waited", lambda: self._fair.release(work.argument))
+                self._late_entries.after(work)
 
     def _charge(self, work: Work) -> None:
         """Have the caller pay for the time. When Redis refuses, the estimate stands."""
