@@ -28,6 +28,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
 
 from benchmarks.worlds import tables, training  # noqa: E402
+from benchmarks.worlds.cases import OBSERVED_BY  # noqa: E402
 from benchmarks.worlds.evidence import evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
@@ -70,8 +71,7 @@ def _make(arguments: argparse.Namespace) -> None:
 
 def _register(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
-    observed, probe = not arguments.without_observation, not arguments.quick
-    way = Way(arguments.registration_seed, observed, probe, arguments.known_scale)
+    way = Way(arguments.registration_seed, arguments.observed_by, not arguments.quick, arguments.known_scale)
     done = 0
     with arguments.output.open("a") as file:
         for runs in _in_parallel(partial(register_world, way=way), homes, arguments.workers):
@@ -97,7 +97,7 @@ def _evidence(arguments: argparse.Namespace) -> None:
     homes = _homes(arguments)
     known = sorted(path.parent for path in arguments.folder.glob(f"*/{WORLD}"))
     way = {
-        "observed": not arguments.without_observation,
+        "by": arguments.observed_by,
         "limit": arguments.cases,
         "look_alikes_every": arguments.look_alikes_every,
     }
@@ -168,14 +168,14 @@ def _parser() -> argparse.ArgumentParser:
     registering = commands.add_parser("register", help="register every object of the worlds in a folder")
     registering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
     registering.add_argument("--registration-seed", type=int, default=0)
-    registering.add_argument("--without-observation", action="store_true")
     registering.add_argument("--known-scale", type=float, metavar="SHARE", help="say the scale, give or take so much")
     registering.add_argument("--quick", action="store_true", help="do not look into the stages")
     gathering = commands.add_parser("evidence", help="poses with their evidence, for `train`")
     gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
-    gathering.add_argument("--without-observation", action="store_true")
     gathering.add_argument("--cases", type=int, default=8, help="of each world, at most")
     gathering.add_argument("--look-alikes-every", type=int, default=1, help="of so many cases one has a look-alike too")
+    for command in (registering, gathering):
+        command.add_argument("--observed-by", choices=OBSERVED_BY, default="images", help="what tells what was seen")
     for command in (making, registering, gathering):
         command.add_argument("folder", type=Path)
         command.add_argument("--part", choices=PARTS, default="train")

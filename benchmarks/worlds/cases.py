@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,13 +15,18 @@ from torch import Tensor
 from benchmarks.robust.bent_field import BentField
 from benchmarks.robust.cases import Case
 from benchmarks.robust.symmetries import in_frame
-from benchmarks.worlds.making import SCENE, WORLD, read_observation_grid
+from benchmarks.worlds.making import SCENE, WORLD, read_cameras, read_observation_grid
+from benchmarks.worlds.observing import observation_of_cameras
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.fields.observation import ObservedField, stored_observation
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.symmetry import Symmetries
+
+ObservedBy = Literal["images", "cameras", "map"]
+"""What tells what was seen of a scene: the walk's images, where its cameras stood alone, or the map's own file."""
+OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +42,12 @@ class WorldCase:
     near: Symmetries
 
 
-def cases_of(home: Path, observed: bool = True) -> Iterator[WorldCase]:
-    """All cases of a world's folder; observed: whether the scene's field says what was seen of it."""
+def cases_of(home: Path, by: ObservedBy = "images") -> Iterator[WorldCase]:
+    """All cases of a world's folder. by: what tells what was seen of the scene."""
     world = json.loads((home / WORLD).read_text())
-    scene = TransformedField(_scene(home, world, observed), Sim3.from_matrix(world["T_scene_room"]).inverse())
+    scene = TransformedField(
+        _observed(home, _scene(home, world), by), Sim3.from_matrix(world["T_scene_room"]).inverse()
+    )
     T_scene_room = Sim3.from_matrix(world["T_scene_room"])
     for number, known in enumerate(world["cases"]):
         yield _case(home, number, (world, known), scene, T_scene_room)
@@ -82,7 +89,7 @@ def _object(home: Path, number: int, kind: str, arrays: dict[str, Any], T_object
     return TransformedField(open_field(home / f"object-{number}.safetensors"), T_field_model @ T_object_model.inverse())
 
 
-def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
+def _scene(home: Path, world: dict[str, Any]) -> SdfField:
     field: SdfField
     told = world["scene"]
     if (home / SCENE).exists():
@@ -94,8 +101,15 @@ def _scene(home: Path, world: dict[str, Any], observed: bool) -> SdfField:
             field = MeshField(file["vertices"], file["faces"])
         if told["kind"] == "bent":
             field = BentField(field, told["amplitude"], told["wavelength"], told["bend_seed"])
-    if not observed:
+    return field
+
+
+def _observed(home: Path, field: SdfField, by: ObservedBy) -> SdfField:
+    """The scene's field, in the room's frame, with what was seen of it."""
+    if by == "map":
         return field
+    if by == "cameras":
+        return ObservedField(field, observation_of_cameras(field, read_cameras(home)))
     grid, words = read_observation_grid(home)
     return ObservedField(field, stored_observation(grid, torch.from_numpy(words)))
 

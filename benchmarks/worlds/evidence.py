@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.worlds.cases import WorldCase, cases_of
+from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.stages import NearestTruth, Recording, recorded
@@ -39,17 +39,18 @@ _SAME_SHAPE = 0.03
 
 
 def evidence_of_world(
-    home: Path, known: Sequence[Path], observed: bool, limit: int, look_alikes_every: int = 1
+    home: Path, known: Sequence[Path], by: ObservedBy, limit: int, look_alikes_every: int = 1
 ) -> list[Row]:
     """The rows of the first ``limit`` cases of a world's folder. known: all folders; wrong objects come from the other
-    worlds of its part. look_alikes_every: of so many cases the first has a look-alike."""
+    worlds of its part. by: what tells what was seen of the scene. look_alikes_every: of so many cases the first has a
+    look-alike."""
     draw = random.Random(home.name)
     others = [
         one for one in known if _seed(one) != _seed(home) and part_of_world(_seed(one)) == part_of_world(_seed(home))
     ]
     rows: list[Row] = []
-    for number, case in enumerate(list(cases_of(home, observed))[:limit]):
-        facts = {**case.facts, "observed": observed}
+    for number, case in enumerate(list(cases_of(home, by))[:limit]):
+        facts = {**case.facts, "observed": by != "map"}
         rows += [{**facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
         other = _another(case, others, draw)
         if other is not None:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from benchmarks.robust.library_objects import GIVEN
 from benchmarks.worlds.objects import ObjectKind, ObjectMaker
-from benchmarks.worlds.observing import observation_of_walk
+from benchmarks.worlds.observing import cameras_of_walk, observation_of_walk
 from benchmarks.worlds.recipe import FROM_IMAGES, RENDERED, Scene, Seen, see
 from regnf_core.errors import RegnfError
+from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.schema.observation_grid import ObservationGrid
 from regnf_data.posed_images import PosedImages
 from regnf_data.worlds.detections import draw_box
@@ -30,7 +32,7 @@ from regnf_data.worlds.walks import LENGTHS, Length
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.options import ReconstructionOptions
 
-WORLD, SCENE = "world.json", "scene.safetensors"
+WORLD, SCENE, CAMERAS = "world.json", "scene.safetensors", "cameras.npz"
 MAX_CASES = 8
 LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
 """Of an object's surface, measured in some image: what was seen less is no case."""
@@ -39,8 +41,8 @@ LEAST_VOXELS = 20.0
 _SCALES = (0.05, 20.0)
 _REACH = 1.9
 """Of the bounds that images are fitted in, in the units of the fit: its grid ends at 2."""
-_TRAINED = (0.03, 0.15)
-"""Shares of the iterations that an under-trained field is given."""
+_TRAINED = (90, 450)
+"""Iterations that an under-trained field is given."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
     rng = np.random.default_rng([task.seed, 17, LENGTHS.index(task.length)])
     scene = _write_scene(task.scene, world, seen, home, rng)
     _write_observation(seen, home)
+    _write_cameras(seen, home)
     # As many scenes stay in their own frame as do not.
     T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
     maker = ObjectMaker(world, seen, home, task.objects)
@@ -162,10 +165,11 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
     if scene in FROM_IMAGES:
         options = ReconstructionOptions(observation_voxels=0)
         if scene == "under-trained":
-            options = replace(options, iterations=int(options.iterations * rng.uniform(*_TRAINED)))
+            options = replace(options, iterations=int(rng.uniform(*_TRAINED)))
         units = min(1.0, _REACH / float(np.abs(seen.bounds).max()))
-        reconstruct(in_units(seen.taken.images(seen.bounds), units), FitFiles(home / SCENE), options, world.seed)
-        return {"kind": scene, "iterations": options.iterations, "units_per_meter": units}
+        images = in_units(seen.taken.images(seen.bounds), units)
+        report = reconstruct(images, FitFiles(home / SCENE), options, world.seed)
+        return {"kind": scene, "iterations": report.iterations, "units_per_meter": units}
     mesh = together(*(placed.mesh for placed in world.all))
     np.savez(home / "scene.npz", vertices=mesh.vertices, faces=mesh.faces)
     if scene == "mesh":
@@ -198,6 +202,17 @@ def read_observation_grid(home: Path) -> tuple[ObservationGrid, Any]:
         low, counts = file["low"].tolist(), file["counts"].tolist()
         grid = ObservationGrid((low[0], low[1], low[2]), float(file["voxel"]), (counts[0], counts[1], counts[2]))
         return grid, file["words"]
+
+
+def _write_cameras(seen: Seen, home: Path) -> None:
+    cameras = cameras_of_walk(seen.taken)
+    np.savez(home / CAMERAS, **{part.name: getattr(cameras, part.name).numpy() for part in fields(cameras)})
+
+
+def read_cameras(home: Path) -> PinholeCameras:
+    """Where the cameras of the walk are thought to have stood, in the world, as :func:`make` has written it."""
+    with np.load(home / CAMERAS) as file:
+        return PinholeCameras(**{part.name: torch.from_numpy(file[part.name]) for part in fields(PinholeCameras)})
 
 
 def _in_room(placed: Placed) -> Array:

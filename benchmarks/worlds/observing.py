@@ -1,12 +1,15 @@
-"""What the images of a walk have seen, as regnf keeps it; from a part of the images where there are many."""
+"""What a walk has seen, as regnf keeps it: told by its images, or by where its cameras stood alone."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
+from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
+from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.schema.observation_grid import SURFACE
+from regnf_core.surface.observing import observe_by_cameras
 from regnf_data.worlds.capture import Capture
 from regnf_data.worlds.mesh import Array
 from regnf_fit.images.observing import observe
@@ -14,6 +17,8 @@ from regnf_fit.images.observing import observe
 _CARVING = 36
 """Images that free space is carved with; measured surface comes from all."""
 _VOXELS = 192
+_EVALUATIONS = 5_000_000
+"""Of the field, for the rays of cameras without images: as many as the import of a field makes."""
 
 
 def observation_of_walk(taken: Capture, bounds: Array) -> Observation:
@@ -32,3 +37,17 @@ def observation_of_walk(taken: Capture, bounds: Array) -> Observation:
         x, y, z = cells[within].unbind(-1)
         seen.states[x, y, z] = SURFACE
     return seen
+
+
+def cameras_of_walk(taken: Capture) -> PinholeCameras:
+    """Where the walk's cameras are thought to have stood, in the world."""
+    (height, width), K, poses = taken.sensor.size, taken.sensor.intrinsics, torch.from_numpy(taken.estimated)
+    one = [[K[0, 0] / width, K[1, 1] / height], [K[0, 2] / width, K[1, 2] / height]]
+    focal, middle = (torch.tensor(pair, dtype=torch.float64).repeat(len(poses), 1) for pair in one)
+    aspect = torch.full((len(poses),), width / height, dtype=torch.float64)
+    return PinholeCameras(poses[:, :3, 3], poses[:, :3, :3], focal, middle, aspect)
+
+
+def observation_of_cameras(field: SdfField, cameras: PinholeCameras) -> Observation:
+    """What the cameras have seen of a field that was made of their images, in the same frame."""
+    return observe_by_cameras(field, cameras, _EVALUATIONS)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.robust.judging import SUCCESS, judge_error
-from benchmarks.worlds.cases import WorldCase, cases_of
+from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.stages import from_truth, recorded, stage_errors
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, Sim3, register
 from regnf_core.geometry.metrics import errors_against_truth
@@ -22,11 +22,11 @@ _ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale
 
 @dataclass(frozen=True)
 class Way:
-    """How to register. observed: with what was seen of the scene · probe: look into the stages as well ·
+    """How to register. observed_by: what tells what was seen of the scene · probe: look into the stages as well ·
     known_scale: the scale is said to lie within this share of the true one; None: nothing is said."""
 
     seed: int = 0
-    observed: bool = True
+    observed_by: ObservedBy = "images"
     probe: bool = True
     known_scale: float | None = None
 
@@ -40,14 +40,15 @@ class Way:
 
 def register_world(home: Path, way: Way) -> list[Run]:
     """The runs of all cases of a world's folder."""
-    return [_run(case, way) for case in cases_of(home, way.observed)]
+    return [_run(case, way) for case in cases_of(home, way.observed_by)]
 
 
 def _run(world_case: WorldCase, way: Way) -> Run:
     case = world_case.case
     assert case.truth is not None
     options = way.options(case.truth)
-    facts: Run = {**world_case.facts, "observed": way.observed, "seed": way.seed, "known_scale": way.known_scale}
+    told = {"observed": way.observed_by != "map", "observed_by": way.observed_by}
+    facts: Run = {**world_case.facts, **told, "seed": way.seed, "known_scale": way.known_scale}
     with recorded() as kept:
         begun = time.process_time()
         try:

@@ -48,7 +48,7 @@ def picture_of(runs: Sequence[Run], folder: Path) -> Image.Image:
 
 def _tile(run: Run, folder: Path) -> Image.Image:
     home = folder / str(run["world"])
-    known = list(cases_of(home, bool(run["observed"])))[int(run["case"])]
+    known = list(cases_of(home, run["observed_by"]))[int(run["case"])]
     truth = known.case.truth
     assert truth is not None
     options = Way(known_scale=run["known_scale"]).options(truth)

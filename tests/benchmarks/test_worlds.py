@@ -10,12 +10,13 @@ import torch
 import trimesh
 
 from benchmarks.worlds.cases import cases_of
-from benchmarks.worlds.making import WORLD, Task, make
+from benchmarks.worlds.making import WORLD, Task, make, read_cameras
 from benchmarks.worlds.recipe import SCENES, Scene, parts_of_name
 from benchmarks.worlds.tables import lost_at, lower_bound, markdown, success, upper_bound, wrong
+from regnf_core import Sim3
 from regnf_core.errors import DatasetError
 from regnf_core.fields.observation import observation_of
-from regnf_core.schema.observation_grid import SURFACE
+from regnf_core.schema.observation_grid import FREE, SURFACE
 from regnf_data.worlds.models import read_catalog
 from regnf_data.worlds.split import PARTS
 
@@ -47,6 +48,26 @@ def test_the_truth_puts_every_object_onto_the_scenes_surface(tmp_path: Path, mes
         assert seen is not None
         assert float((seen.at(placed) == SURFACE).float().mean()) > 0.05
     assert make(task).endswith("there")
+
+
+def test_what_cameras_saw_is_told_by_where_they_stood_alone(tmp_path: Path, meshes: Path) -> None:
+    task = Task(12, "single", "mesh", (meshes,), tmp_path / "worlds")
+    make(task)
+    T_scene_room = Sim3.from_matrix(json.loads((task.home / WORLD).read_text())["T_scene_room"])
+    camera = T_scene_room.apply(read_cameras(task.home).positions)
+    surfaces, before = 0, []
+    for one in cases_of(task.home, "cameras"):
+        seen = observation_of(one.case.scene)
+        assert seen is not None
+        assert one.case.truth is not None
+        placed = one.case.truth.inverse().apply(one.points)
+        found = placed[seen.at(placed) == SURFACE]
+        surfaces += len(found)
+        for share in (0.15, 0.2):
+            before.append(seen.at(found + share * (camera - found)))
+    assert surfaces > 100
+    assert float((torch.cat(before) == FREE).float().mean()) > 0.9
+    assert observation_of(next(cases_of(task.home, "map")).case.scene) is None
 
 
 def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path: Path, meshes: Path) -> None:
