@@ -38,8 +38,8 @@ _OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.au
 def fit(
     source: Source,
     output: SafeField,
-    iterations: Iterations = 3000,
-    table_log2: TableLog2 = 15,
+    iterations: Iterations = None,
+    table_log2: TableLog2 = None,
     extent: Extent = None,
     label: Label = None,
     seed: Seed = 0,
@@ -59,9 +59,8 @@ def fit(
     """
     require("engine")
     _check(output, extent, label)
-    settings: dict[str, Any] = {"iterations": iterations} | (
-        {} if hidden_width is None else {"hidden_width": hidden_width}
-    )
+    given = {"iterations": iterations, "hidden_width": hidden_width}
+    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     rest = {"seed": seed, "label": label}
     if not source.is_dir():
         if (snapshots, sdfstudio, pictures, start, refine_poses, device) != _OF_IMAGES_UNSAID:
@@ -79,14 +78,20 @@ def fit(
 
 
 def _fit_mesh(
-    mesh: Path, output: Path, settings: dict[str, Any], table_log2: int, extent: float | None, rest: dict[str, Any]
+    mesh: Path,
+    output: Path,
+    settings: dict[str, Any],
+    table_log2: int | None,
+    extent: float | None,
+    rest: dict[str, Any],
 ) -> None:
     from regnf_fit.mesh.file import mesh_target
     from regnf_fit.mesh.fit import fit_field
     from regnf_fit.mesh.options import FitOptions
 
     options = FitOptions(**settings)
-    options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
+    if table_log2 is not None:
+        options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     target = mesh_target(mesh, extent)
     _fit_with_bar(fit_field, target.field, output, options, rest | {"source": target.source})
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +18,14 @@ def fit_images(
 ) -> None:
     """Fit to the images in ``dataset``.
 
-    settings: of ReconstructionOptions, and ``table_log2`` · extra: ``snapshots``, percents between commas, and
-    ``sdfstudio``, a path, or None each; ``pictures``, whether to draw · rest: what
-    ``reconstruct`` takes beside.
+    settings: of ReconstructionOptions · extra: ``snapshots``, percents between commas, and ``sdfstudio``, a path, or
+    None each; ``pictures``, whether to draw · rest: what ``reconstruct`` takes beside.
     """
     from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fit import FitFiles, reconstruct
     from regnf_fit.images.options import ReconstructionOptions
 
-    table_log2 = settings.pop("table_log2")
     options = ReconstructionOptions(**settings)
-    options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     files = FitFiles(
         output,
         output.with_suffix(".checkpoint"),
@@ -37,13 +35,16 @@ def fit_images(
     )
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
     with Progress(*columns, console=err) as bar:
-        task = bar.add_task("fitting", total=options.iterations, state="reading the images")
+        task = bar.add_task("fitting", total=1.0, state="reading the images")
         images = load_dataset(dataset)
 
         def report(iteration: int, loss: float, seconds_left: float) -> None:
-            bar.update(task, completed=iteration, state=f"loss {loss:.5f}, {seconds_left:.0f} s left")
+            elapsed = time.monotonic() - started
+            state = f"iteration {iteration}, loss {loss:.5f}, {seconds_left:.0f} s left"
+            bar.update(task, completed=elapsed / max(elapsed + seconds_left, 1e-9), state=state)
 
         bar.update(task, state="laying out the rays")
+        started = time.monotonic()
         figures = reconstruct(
             images, files, options, progress=report, source={"dataset": dataset.resolve().name}, **rest
         )

@@ -32,8 +32,18 @@ Source = Annotated[
     typer.Argument(help="A mesh (glb, obj, ply, stl), or a folder of posed images with meta_data.json.", exists=True),
 ]
 SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
-Iterations = Annotated[int, typer.Option(min=1, help="Training steps; more is finer.")]
-TableLog2 = Annotated[int, typer.Option(min=8, max=22, help="log2 of the entries per hash level.")]
+Iterations = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Training steps; more is finer. Without it 3000, of images up to 5000 as their grid grows."
+    ),
+]
+TableLog2 = Annotated[
+    int | None,
+    typer.Option(
+        min=8, max=22, help="log2 of the entries per hash level. Without it 15, of images 15 to 18 by what they show."
+    ),
+]
 Label = Annotated[str | None, typer.Option(help="A name kept in the file, up to 200 characters.")]
 HiddenWidth = Annotated[
     int | None, typer.Option(min=8, max=1024, help="Width of the network: 128 for meshes, 64 for images.")

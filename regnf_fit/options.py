@@ -12,10 +12,11 @@ FitProgress = Callable[[int, float, float], None]
 """Called from time to time with the iteration, its loss and an estimate of the seconds left. May raise to stop."""
 
 
-def grid_of_levels(levels: int) -> HashGridConfig:
-    """Return a hash grid of so many levels, from 16 to 512 nodes along an edge, with at most 2^15 entries a level."""
+def grid_of_levels(levels: int, nodes: int = 512, log2_table_size: int = 15) -> HashGridConfig:
+    """Return a hash grid of so many levels, from 16 to ``nodes`` along an edge, with at most 2^log2_table_size entries
+    a level."""
     return HashGridConfig.from_top_resolution(
-        512, levels=levels, features_per_level=2, log2_table_size=15, base_resolution=16
+        nodes, levels=levels, features_per_level=2, log2_table_size=log2_table_size, base_resolution=16
     )
 
 

@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from regnf_core.geometry.box import OrientedBox
+from regnf_fit.images.cells import cells_of
+from regnf_fit.images.detail import in_boxes, uneven
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
 from regnf_fit.images.rays import PixelRays
@@ -19,7 +21,6 @@ from regnf_fit.images.rays import PixelRays
 _FREE_POOL = 400_000
 _CANDIDATES = 3
 """So many times the pool are drawn where those near instances are to be chosen from them."""
-_BOX_MARGIN = 0.1
 _VOXEL = 2.0 / 3.0
 """Bands: measured points closer together than this are averaged before distances to them are taken."""
 _PRECISE = 0.25
@@ -35,7 +36,7 @@ class DepthSupervision:
     """What is drawn from in every iteration; lengths in field units.
 
     rays: (R,) those with depth · before, behind: (R,) how far along them the band reaches before and behind the surface
-    · trust: (R,) what they count, 1 in the mean · detailed: (D,) indices of those that end in an instance's box ·
+    · trust: (R,) what they count, 1 in the mean · detailed: (D,) indices of those that end at detail ·
     free_points: (P, 3), free by what was seen · clearances: (P,) their distance to the nearest measured surface ·
     size: the bounds' diagonal.
     """
@@ -86,7 +87,7 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
         before=before[inside],
         behind=behind[inside],
         trust=_trust(surface.deviations),
-        detailed=_within(prepared.boxes, ends).nonzero()[:, 0],
+        detailed=(in_boxes(prepared.boxes, ends) | uneven(ends, surface.deviations, size)).nonzero()[:, 0],
         free_points=points,
         clearances=torch.from_numpy(cKDTree(cloud).query(points.numpy())[0].astype(np.float32)),
         size=size,
@@ -103,16 +104,8 @@ def _free_points(
     share = torch.from_numpy(rng.random(len(chosen), np.float32))
     picked = rays.take(chosen)
     points = picked.at((picked.near + share * (free_to[chosen] - picked.near))[:, None])[:, 0]
-    within = _within(boxes, points).nonzero()[:, 0][: int(detail_share * _FREE_POOL)]
+    within = in_boxes(boxes, points).nonzero()[:, 0][: int(detail_share * _FREE_POOL)]
     return torch.cat((points[within], points[: _FREE_POOL - len(within)]))
-
-
-def _within(boxes: Sequence[OrientedBox], points: Tensor) -> Tensor:
-    """(N,): whether points (N, 3) lie in any of the boxes, each a little grown."""
-    inside = torch.zeros(len(points), dtype=torch.bool)
-    for box in boxes:
-        inside |= box.contains(points, _BOX_MARGIN)
-    return inside
 
 
 def _trust(deviations: Tensor) -> Tensor:
@@ -135,7 +128,7 @@ def _cloud(points: NDArray[np.float32], deviations: NDArray[np.float32], band: f
 
 def _averaged(points: NDArray[np.float32], voxel: float) -> NDArray[np.float64]:
     """One point (V, 3) for each occupied voxel: the mean of those within."""
-    cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
-    _, index, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index.ravel(), points[:, axis]) for axis in range(3)], axis=1)
-    return np.asarray(sums / counts[:, None])
+    if len(points) == 0:
+        return np.zeros((0, 3))
+    given = torch.from_numpy(points)
+    return np.asarray(cells_of(given, voxel).means(given))

@@ -21,6 +21,7 @@ from regnf_core.schema.observation_grid import OBSERVATION
 from regnf_core.schema.safe_format import write_safe_field
 from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
+from regnf_fit.images.capacity import suited
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
 from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
@@ -73,6 +74,7 @@ def reconstruct(
     torch_device = pick_device(device)
     rng = np.random.default_rng(seed)
     prepared = prepare(images, options.start, rng)
+    options = suited(options, prepared)
     trainer = Trainer(prepared, options, seed, torch_device, rng)
     write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels, prepared.spread))
     key = _key(images, options, seed)

@@ -12,6 +12,9 @@ from regnf_fit.options import NetworkOptions, grid_of_levels
 Start = Literal["auto", "object", "room"]
 """The shape a field starts from: a ball in free space, a hollow ball in matter, or what the cameras' places suggest."""
 
+OF_IMAGES = grid_of_levels(8)
+"""Stands for the grid that the images ask for (:mod:`.capacity`), where no other one is given."""
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -37,7 +40,13 @@ class LossWeights:
 class ReconstructionOptions(NetworkOptions):
     """How a field is fitted to images. Lengths are shares of the bounds' diagonal."""
 
-    grid: HashGridConfig = field(default_factory=lambda: grid_of_levels(8))
+    grid: HashGridConfig = OF_IMAGES
+    """Over [-2, 2]^3. As it stands here: from 512 to 1024 nodes along an edge and 2^15 to 2^18 entries a level, by what
+    the images show."""
+    table_log2: int | None = None
+    """log2 of that grid's entries a level; None: by what the images show."""
+    iterations: int = 0
+    """0: 3000 with the smallest grid, up to 5000 with the largest."""
     hidden_width: int = 64
     feature_width: int = 16
     """What the geometry's network hands to the color's."""
@@ -62,7 +71,8 @@ class ReconstructionOptions(NetworkOptions):
     """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
-    """The share of rays and free points that are drawn from within the boxes of the dataset's instances, if any."""
+    """The share of rays that are drawn from those which end at detail (:mod:`.detail`): where the surface is not flat,
+    or in the boxes of the dataset's instances, if any; and the share of free points drawn from within these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4
     """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""
