@@ -11,8 +11,8 @@ import typer
 from regnf_core import __version__
 
 COMMANDS = (
-    "demo", "register", "search", "batch", "serve", "worker", "inspect", "convert", "fit", "render", "edit", "doctor",
-    "render-dataset", "manual",
+    "demo", "register", "search", "batch", "serve", "worker", "inspect", "convert", "fit", "fuse", "render", "edit",
+    "doctor", "render-dataset", "manual",
 )  # fmt: skip
 """In the order of the help. Each is a function in a module, both of its name, with underscores."""
 GROUPS = ("library",)

@@ -27,11 +27,11 @@ from regnf_cli.fit_options import (
     Start,
     StartChoice,
     TableLog2,
+    check_field_to_write,
 )
 from regnf_cli.options import Seed
 from regnf_core.errors import InvalidOptionsError
 
-_LONGEST_LABEL = 200  # of the safe format
 _OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto)
 
 
@@ -58,7 +58,9 @@ def fit(
     Examples: **regnf fit chair.glb chair.safetensors --extent 1.0**, **regnf fit images/ chair.safetensors**
     """
     require("engine")
-    _check(output, extent, label)
+    check_field_to_write(output, label)
+    if extent is not None and not 0.0 < extent < math.inf:
+        raise InvalidOptionsError("the extent must be positive")
     given = {"iterations": iterations, "hidden_width": hidden_width}
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     rest = {"seed": seed, "label": label}
@@ -94,18 +96,6 @@ def _fit_mesh(
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     target = mesh_target(mesh, extent)
     _fit_with_bar(fit_field, target.field, output, options, rest | {"source": target.source})
-
-
-def _check(output: Path, extent: float | None, label: str | None) -> None:
-    """Refuse before the work what would fail after it."""
-    if output.suffix != ".safetensors":
-        raise InvalidOptionsError(f"{output}: expected a name that ends in .safetensors")
-    if not output.parent.is_dir():
-        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
-    if extent is not None and not 0.0 < extent < math.inf:
-        raise InvalidOptionsError("the extent must be positive")
-    if label is not None and len(label) > _LONGEST_LABEL:
-        raise InvalidOptionsError(f"the label has more than {_LONGEST_LABEL} characters")
 
 
 def _fit_with_bar(fit_field: Any, target: Any, output: Path, options: Any, rest: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The options of ``regnf fit``."""
+"""The options of ``regnf fit``, some of ``regnf fuse`` too."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from regnf_core.errors import InvalidOptionsError
+
+_LONGEST_LABEL = 200  # of the safe format
 
 
 class StartChoice(StrEnum):
@@ -74,3 +78,13 @@ RefinePoses = Annotated[
     bool, typer.Option("--refine-poses", help="Images with depths: correct the cameras' poses with the field.")
 ]
 Device = Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")]
+
+
+def check_field_to_write(output: Path, label: str | None) -> None:
+    """Refuse before the work what would fail after it. Raises InvalidOptionsError."""
+    if output.suffix != ".safetensors":
+        raise InvalidOptionsError(f"{output}: expected a name that ends in .safetensors")
+    if not output.parent.is_dir():
+        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
+    if label is not None and len(label) > _LONGEST_LABEL:
+        raise InvalidOptionsError(f"the label has more than {_LONGEST_LABEL} characters")

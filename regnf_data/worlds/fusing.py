@@ -5,19 +5,16 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
-from regnf_core.importing.gate.report import ImportLimits
+from regnf_data.fusing import BlockGrid, DepthImages, fuse_blocks, import_own, open3d
 from regnf_data.worlds.capture import Capture
 from regnf_data.worlds.mesh import Array
 
 Volume = Literal["blocks", "dense"]
-_EDGE = 8
-_BLOCKS = 20_000
 LARGEST_DENSE = 200
 """Voxels along an edge of a dense grid."""
 _DENSE_IMAGES = 40
@@ -38,64 +35,29 @@ def fuse(taken: Capture, fusion: Fusion, bounds: Array, path: Path) -> None:
 
     bounds: (2, 3), what a dense grid covers. Raises FieldFormatError where nothing was measured.
     """
+    if fusion.volume == "blocks":
+        intrinsics = np.tile(taken.sensor.intrinsics, (len(taken.poses), 1, 1))
+        grid = BlockGrid(fusion.voxel_m, fusion.truncation, fusion.farthest_m)
+        fuse_blocks(DepthImages(taken.depths, intrinsics, taken.estimated), grid, path)
+        return
     source = path.with_suffix(".npz")
-    description: dict[str, Any] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if fusion.volume == "blocks":
-            _save_blocks(taken, fusion, source)
-            description["truncation"] = fusion.truncation * fusion.voxel_m
-        else:
-            _save_dense(taken, fusion, bounds, source)
-    _import(source, path, description)
+        _save_dense(taken, fusion, bounds, source)
+    import_own(source, path, {})
+    source.unlink()
 
 
 def write_dense(path: Path, values: NDArray[np.float32], origin: Array, spacing: float) -> None:
     """Write the safe field of distances at the nodes (X, Y, Z) of a grid to ``path``."""
     source = path.with_suffix(".npz")
     np.savez(source, sdf=values, origin=origin, spacing=np.float64(spacing))
-    _import(source, path, {})
-
-
-def _import(source: Path, path: Path, description: dict[str, Any]) -> None:
-    """What ``regnf convert`` does, in this process: the file is our own."""
-    out = path.parent / f"{path.stem}-import"
-    out.mkdir(exist_ok=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        convert_file(source, out, {**description, "accept_implausible": True}, ImportLimits())
-    (out / FIELD_NAME).replace(path)
-    out.rmdir()
+    import_own(source, path, {})
     source.unlink()
 
 
-def _open3d() -> Any:
-    """The library, whose type stubs leave out what numpy arrays may be given to."""
-    import open3d
-
-    return open3d
-
-
-def _save_blocks(taken: Capture, fusion: Fusion, path: Path) -> None:
-    o3d = _open3d()
-    core = o3d.core
-    grid = o3d.t.geometry.VoxelBlockGrid(
-        ("tsdf", "weight"), (core.float32, core.float32), ((1), (1)), fusion.voxel_m, _EDGE, _BLOCKS,
-        core.Device("CPU:0"),
-    )  # fmt: skip
-    K = core.Tensor(taken.sensor.intrinsics)
-    for depth, pose in zip(taken.depths, taken.estimated, strict=True):
-        if not (depth > 0.0).any():
-            continue
-        image, extrinsic = o3d.t.geometry.Image(core.Tensor(depth[..., None])), core.Tensor(np.linalg.inv(pose))
-        seen = (image, K, extrinsic, 1.0, float(fusion.farthest_m), float(fusion.truncation))
-        blocks = grid.compute_unique_block_coordinates(*seen)
-        grid.integrate(blocks, *seen)
-    grid.save(str(path))
-
-
 def _save_dense(taken: Capture, fusion: Fusion, bounds: Array, path: Path) -> None:
-    o3d = _open3d()
+    o3d = open3d()
     length = float((bounds[1] - bounds[0]).max())
     count = min(int(np.ceil(length / fusion.voxel_m)), LARGEST_DENSE)
     every = max(1, len(taken.poses) // _DENSE_IMAGES)

@@ -9,17 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
-
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.images.cells import cells_of
+from regnf_fit.images.measured import ends_of, measured_rays, sharp_width
 from regnf_fit.images.options import OF_IMAGES, ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
 from regnf_fit.network import GRID_RADIUS
 from regnf_fit.options import grid_of_levels
 
-_SHARP = 0.25
-"""The share of the pixels that are no wider at their surface than the finest cell is to be."""
 _LEVELS = {512: 8, 1024: 9}
 """Of a grid with so many nodes along an edge: neighboring levels differ by a factor of about 1.65."""
 _LEAST_LOG2, _MOST_LOG2 = 15, 18
@@ -41,14 +38,12 @@ def grid_of(prepared: PreparedImages, table_log2: int | None = None) -> HashGrid
 
     table_log2: log2 of the entries a level, where they are given.
     """
-    rays = prepared.training
-    shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & (rays.depths > 0.0) & ~rays.background
-    if not bool(shown.any()):
+    surface = measured_rays(prepared)
+    if len(surface) == 0:
         return grid_of_levels(_LEVELS[min(_LEVELS)], min(_LEVELS), table_log2 or _LEAST_LOG2)
-    surface = rays.take(shown)
-    width = prepared.pixel * float(np.quantile(surface.depths.numpy(), _SHARP))
+    width = sharp_width(prepared, surface)
     nodes = 2 ** math.ceil(math.log2(2.0 * GRID_RADIUS / width))
     nodes = min(max(nodes, min(_LEVELS)), max(_LEVELS))
-    cells = cells_of(surface.at(surface.depths[:, None])[:, 0], 2.0 * GRID_RADIUS / nodes)
+    cells = cells_of(ends_of(surface), 2.0 * GRID_RADIUS / nodes)
     needed = min(max(math.ceil(math.log2(len(cells.counts))), _LEAST_LOG2), _MOST_LOG2)
     return grid_of_levels(_LEVELS[nodes], nodes, table_log2 or needed)

@@ -19,18 +19,21 @@ if TYPE_CHECKING:
 def observed(converted: ConvertedField, read: ReadUpload, limits: ImportLimits, required: bool) -> ConvertedField:
     """The field with an observation, if anything tells. required: the caller has asked for that of the cameras.
 
-    A map's own weights go before all else: they know of depths that were missing, through which lines of sight would
-    pass. Then come cameras that were asked for, then an observation in the file, then cameras found beside it, if they
-    can be used. Raises FieldFormatError as ``observed_by_cameras`` does, if ``required``.
+    An observation in the file stays, unless cameras were asked for: it was made of the images, which know most, or as
+    here. A map's own weights go before cameras: they know of depths that were missing, through which lines of sight
+    would pass. Cameras found beside the file come last, if they can be used. Raises FieldFormatError as
+    ``observed_by_cameras`` does, if ``required``.
     """
     from regnf_core.importing.observing.by_weights import observed_by_weights
 
+    if converted.description.get(OBSERVATION) is not None and not required:
+        return converted
     found = observed_by_weights(converted.description, converted.tensors)
     if found is not None:
         if required:
             converted = with_unused_cameras(converted, "the map's weights say what was observed, and they tell more")
         return observed_field(converted, *found, "by the weights of the map")
-    if read.cameras is None or (converted.description.get(OBSERVATION) is not None and not required):
+    if read.cameras is None:
         return converted
     try:
         return _by_cameras(converted, read, read.cameras, limits)

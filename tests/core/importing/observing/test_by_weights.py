@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from safetensors.numpy import load_file
 
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.importing.observing.by_weights import observed_by_weights
-from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN, ObservationGrid
+from regnf_core.schema.safe_format import read_description, write_safe_field
 from tests.core.importing.in_process import convert
 
 STEP, TRUNCATION, EDGE = 0.05, 0.2, 4
@@ -96,3 +99,20 @@ def test_a_grid_without_weights_has_none(tmp_path: Path) -> None:
 def test_a_map_far_from_the_origin_has_none() -> None:
     values, weights, _ = ball_seen_from_above()
     assert states_of(values, weights, np.full(3, 2e6), blocks=False) is None
+
+
+def test_an_observation_that_a_file_has_stays_when_it_is_imported_again(tmp_path: Path) -> None:
+    values, weights, origin = ball_seen_from_above()
+    np.savez(tmp_path / "map.npz", sdf=values, weight=weights, origin=origin, spacing=STEP)
+    convert(tmp_path / "map.npz", tmp_path / "first", {"accept_implausible": True})
+    first = tmp_path / "first" / "field.safetensors"
+    description = read_description(first)
+    grid = ObservationGrid((-0.5, -0.5, -0.5), 0.25, (4, 4, 4))
+    states = np.full((4, 4, 4), FREE, np.uint8)
+    tensors = {**load_file(first), OBSERVATION: grid.pack(states)}
+    write_safe_field(tmp_path / "told.safetensors", {**description, OBSERVATION: asdict(grid)}, tensors)
+    convert(tmp_path / "told.safetensors", tmp_path / "second", {"accept_implausible": True})
+    seen = observation_of(open_field(tmp_path / "second" / "field.safetensors"))
+    assert seen is not None
+    assert seen.states.shape == (4, 4, 4)
+    assert (seen.states == FREE).all()

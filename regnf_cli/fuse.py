@@ -1,0 +1,59 @@
+"""``regnf fuse``: a map of truncated distances from posed depth images."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from regnf_cli.console import err, out
+from regnf_cli.extras import require
+from regnf_cli.fit_options import Label, SafeField, check_field_to_write
+from regnf_core.errors import InvalidOptionsError
+
+Images = Annotated[
+    Path, typer.Argument(help="A folder of posed RGB-D images with meta_data.json.", exists=True, file_okay=False)
+]
+Voxel = Annotated[
+    float | None,
+    typer.Option(help="From node to node, the dataset's units; without it as wide as a pixel is at its surface."),
+]
+Truncation = Annotated[
+    float | None,
+    typer.Option(min=1.0, help="Voxels; without it 4, or 3 standard deviations of the depths from image to image."),
+]
+
+
+def fuse(
+    images: Images, output: SafeField, voxel: Voxel = None, truncation: Truncation = None, label: Label = None
+) -> None:
+    """Fuse posed depth images to a map, with what they have seen of it: seconds, where a fit takes minutes.
+
+    Example: **regnf fuse room-images room.safetensors**
+    """
+    require("engine")
+    check_field_to_write(output, label)
+    if voxel is not None and not 0.0 < voxel < float("inf"):
+        raise InvalidOptionsError("the voxel's edge must be positive")
+    from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.fusion import FusionOptions, fuse_images
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    with Progress(*columns, console=err) as bar:
+        task = bar.add_task("reading the images", total=None)
+        given = load_dataset(images)
+        bar.update(task, description="fusing", total=len(given))
+        report = fuse_images(
+            given,
+            output,
+            FusionOptions(voxel, truncation),
+            progress=lambda done: bar.update(task, completed=done),
+            label=label,
+            source={"dataset": images.resolve().name},
+        )
+        bar.update(task, completed=len(given))
+    for name, value in asdict(report).items():
+        out.print(f"{name:<24} {value:.6g}")

@@ -1,0 +1,35 @@
+"""``regnf fuse``: a map of a folder of images, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from regnf_core.schema.safe_format import read_description
+from regnf_data.sdfstudio import write_dataset
+from tests.cli.conftest import Run
+from tests.fit.images import scenes
+
+
+def test_a_dataset_becomes_a_map(run: Run, tmp_path: Path) -> None:
+    write_dataset(scenes.images(count=3), tmp_path / "images")
+    outcome = run("fuse", tmp_path / "images", tmp_path / "map.safetensors", "--voxel", "0.02", "--label", "two")
+    assert outcome.code == 0, outcome.stderr
+    assert "depth_error_median" in outcome.stdout
+    description = read_description(tmp_path / "map.safetensors")
+    assert (description["label"], description["kind"]) == ("two", "voxel_blocks")
+    assert {path.name for path in tmp_path.iterdir()} == {"images", "map.safetensors"}
+
+
+@pytest.mark.parametrize(
+    ("output", "more"),
+    [("map.ply", []), ("absent/map.safetensors", []), ("map.safetensors", ["--voxel", "0"]),
+     ("map.safetensors", ["--voxel", "nan"]), ("map.safetensors", ["--label", 201 * "x"])],
+)  # fmt: skip
+def test_options_that_cannot_be_meant_are_refused(output: str, more: list[str], run: Run, tmp_path: Path) -> None:
+    write_dataset(scenes.images(count=2), tmp_path / "images")
+    outcome = run("fuse", tmp_path / "images", tmp_path / output, *more)
+    assert outcome.code == 2
+    assert "INVALID_OPTIONS " in outcome.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["images"]
