@@ -30,6 +30,7 @@ from regnf_data.worlds.rooms import World, make_world
 from regnf_data.worlds.split import part_of_world
 from regnf_data.worlds.walks import LENGTHS, Length
 from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.fusion import fuse_images
 from regnf_fit.images.options import ReconstructionOptions
 
 WORLD, SCENE, CAMERAS = "world.json", "scene.safetensors", "cameras.npz"
@@ -161,6 +162,9 @@ def _chosen(world: World, seen: Seen, length: Length, rng: np.random.Generator) 
 def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.random.Generator) -> dict[str, Any]:
     if scene in ("tsdf", "rendered"):
         fuse(seen.taken, seen.fusion, seen.bounds, home / SCENE)
+        return {"kind": scene}
+    if scene == "fused":
+        fuse_images(seen.taken.images(seen.bounds), home / SCENE)
         return {"kind": scene}
     if scene in FROM_IMAGES:
         options = ReconstructionOptions(observation_voxels=0)

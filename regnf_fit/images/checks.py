@@ -18,7 +18,7 @@ def check_images(images: PosedImages) -> None:
     """Raise DatasetError where a fit would have nothing to go by.
 
     Reasons: DATASET_NO_FRAMES, DATASET_POSE_NOT_RIGID, DATASET_INTRINSICS_INVALID, DATASET_BOUNDS_EMPTY,
-    DATASET_OUTSIDE_GRID, DATASET_DEPTH_MISSING, DATASET_NO_COLOR_VARIETY.
+    DATASET_DEPTH_MISSING, DATASET_NO_COLOR_VARIETY.
     """
     if len(images) == 0 or images.colors[0].size == 0:
         raise DatasetError("the dataset holds no pixels", reason="DATASET_NO_FRAMES")
@@ -51,6 +51,10 @@ def _check_cameras(images: PosedImages) -> None:
 def _check_bounds(bounds: np.typing.NDArray[np.float64]) -> None:
     if not (np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()):
         raise DatasetError("the dataset's bounds are empty", reason="DATASET_BOUNDS_EMPTY")
+
+
+def check_within_grid(bounds: np.typing.NDArray[np.float64]) -> None:
+    """Raise DatasetError (DATASET_OUTSIDE_GRID) for bounds (2, 3) beyond the hash grid of a fit."""
     if np.abs(bounds).max() > GRID_RADIUS:
         raise DatasetError(
             "the dataset's bounds reach beyond [-2, 2]: scale its poses and depths down", reason="DATASET_OUTSIDE_GRID"

@@ -23,6 +23,7 @@ from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.capacity import suited
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
+from regnf_fit.images.checks import check_within_grid
 from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
@@ -73,6 +74,7 @@ def reconstruct(
     started = time.monotonic()
     torch_device = pick_device(device)
     rng = np.random.default_rng(seed)
+    check_within_grid(images.bounds)
     prepared = prepare(images, options.start, rng)
     options = suited(options, prepared)
     trainer = Trainer(prepared, options, seed, torch_device, rng)

@@ -82,3 +82,11 @@ def test_what_cannot_be_fused_is_refused_and_nothing_is_left(tmp_path: Path) -> 
         fuse_images(replace(IMAGES, bounds=IMAGES.bounds + np.array([0.0, 0.0, 1.5])), tmp_path / "map.safetensors")
     assert caught.value.reason == "DATASET_NOTHING_IN_BOUNDS"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_maps_are_not_bound_to_a_hash_grids_cube(tmp_path: Path) -> None:
+    shift, poses = np.array([7.0, 0.0, 0.0]), IMAGES.T_world_camera.copy()
+    poses[:, :3, 3] += shift
+    fuse_images(replace(IMAGES, T_world_camera=poses, bounds=IMAGES.bounds + shift), tmp_path / "map.safetensors")
+    top = torch.from_numpy(scenes.BALL_CENTER + shift + [0.0, 0.0, scenes.BALL_RADIUS])[None].float()
+    assert abs(float(open_field(tmp_path / "map.safetensors").signed_distance(top))) < 0.005
