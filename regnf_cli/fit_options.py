@@ -39,7 +39,7 @@ SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safe
 Iterations = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Training steps; more is finer. Without it 3000, of images up to 5000 as their grid grows."
+        min=1, help="Training steps; more is finer. Without it 3000; with --refine-poses up to 5000 as the grid grows."
     ),
 ]
 TableLog2 = Annotated[

@@ -30,15 +30,22 @@ class Rendered:
 
 
 def render_rays(
-    field: RadianceField, rays: PixelRays, depths: Tensor, sharpness: Tensor, background: Tensor
+    field: RadianceField,
+    rays: PixelRays,
+    depths: Tensor,
+    sharpness: Tensor,
+    background: Tensor,
+    geometry_learns: bool = True,
 ) -> Rendered:
     """Render rays through samples at ``depths`` (R, S), ascending; background: (3,) the color behind everything.
 
     Differentiable by the field's parameters. Normals given to the color's network are not differentiated: the
-    geometry learns from the opacity.
+    geometry learns from the opacity. geometry_learns: False leaves all of it out, but for the sharpness.
     """
     function = field.function()
-    distances = function.value(rays.at(depths).flatten(0, 1)).view_as(depths)
+    learning = geometry_learns and torch.is_grad_enabled()
+    with torch.set_grad_enabled(learning):
+        distances = function.value(rays.at(depths).flatten(0, 1)).view_as(depths)
     weights, rest = render_weights(distances, sharpness)
     middles = (depths[:, 1:] + depths[:, :-1]) / 2.0
     opacity = 1.0 - rest
@@ -48,8 +55,9 @@ def render_rays(
     flat = points.flatten(0, 1)
     with torch.no_grad():
         normals = torch.nn.functional.normalize(function.value_and_gradient(flat)[1], dim=1)
-    _, features = field.distance_and_feature(flat)
-    colors = field.color(flat, directions.flatten(0, 1), normals, features).view_as(points)
+    with torch.set_grad_enabled(learning):
+        hidden = function.mlp.hidden(function.encode(flat))
+    colors = field.color(flat, directions.flatten(0, 1), normals, field.feature(hidden)).view_as(points)
     chosen = weights.gather(1, heaviest)
     share = chosen / chosen.sum(dim=1, keepdim=True).clamp_min(1e-6)  # the sections left out are colored alike
     color = opacity[:, None] * (share[..., None] * colors).sum(dim=1) + rest[:, None] * background

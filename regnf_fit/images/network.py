@@ -40,12 +40,9 @@ class RadianceField(TrainableField):
         self.log_sharpness = nn.Parameter(torch.zeros(()))
         """Logarithm of the sharpness over the least one that the schedule allows."""
 
-    def distance_and_feature(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance (N,) at points (N, 3), and the feature (N, F) that the color depends on."""
-        function = self.function()
-        h = function.mlp.hidden(function.encode(points))
-        distance = torch.addmm(self.biases[-1], h, self.weights[-1].T).squeeze(-1)
-        return distance, torch.addmm(self.feature_bias, h, self.feature_weight.T)
+    def feature(self, hidden: Tensor) -> Tensor:
+        """The feature (N, F) that the color depends on, of what the geometry's last layer is given (N, H)."""
+        return torch.addmm(self.feature_bias, hidden, self.feature_weight.T)
 
     def color(self, points: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
         """Color (N, 3) in [0, 1] of points seen along unit ``directions`` (N, 3)."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from regnf_fit.images.camera_poses import CameraPoses, expected_errors
 from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
 from regnf_fit.images.depth_supervision import DepthSupervision, supervise
 from regnf_fit.images.depth_terms import depth_terms
+from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import least_sharpness
 from regnf_fit.images.options import ReconstructionOptions
@@ -27,6 +29,8 @@ _SHARPEST = 50.0
 """How far above the least sharpness the learned one may rise."""
 _SHARPNESS_RATE = 5.0
 """The sharpness learns so much faster than the networks: it is one number with far to go."""
+_COLOR_EVERY = 8
+"""Where the geometry does not learn from the color, it learns in one of so many iterations."""
 
 
 class Trainer:
@@ -39,6 +43,7 @@ class Trainer:
         seed: int,
         device: torch.device,
         rng: np.random.Generator,
+        near: MapDistances | None = None,
     ) -> None:
         self.options = options
         self.iteration = 0
@@ -52,7 +57,7 @@ class Trainer:
         self._rays = prepared.training.to(device)
         self._data: DepthSupervision | None = None
         if prepared.has_depth:
-            self._data = supervise(prepared, options, rng).to(device)
+            self._data = replace(supervise(prepared, options, rng), near=near).to(device)
         self._masked = bool(prepared.training.background.any())
         self._bounds = prepared.bounds.float().to(device)
         self._device = device
@@ -118,12 +123,13 @@ class Trainer:
             loss, near = self._color_alone()
             return loss + weights.eikonal * self._eikonal(function, near)
         surface, free_space, near = depth_terms(function, self._data, self.options, self.generator, self._correct)
-        loss = weights.surface * surface + weights.free_space * free_space
+        of_map = self._data.near is not None
+        loss = (weights.map if of_map else weights.surface) * surface + weights.free_space * free_space
         if (poses := self._learning_poses()) is not None:
             loss = loss + weights.poses * poses.prior()
         loss = loss + weights.eikonal * self._eikonal(function, near)
-        if self.options.color_rays > 0:
-            loss = loss + self._color(self._data)
+        if self.options.color_rays > 0 and self.iteration % (_COLOR_EVERY if of_map else 1) == 0:
+            loss = loss + self._color(self._data, geometry_learns=not of_map)
         return loss
 
     def _learning_poses(self) -> CameraPoses | None:
@@ -143,13 +149,14 @@ class Trainer:
         loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
         return loss
 
-    def _color(self, data: DepthSupervision) -> Tensor:
+    def _color(self, data: DepthSupervision, geometry_learns: bool) -> Tensor:
         """Color and rendered depth of rays with depth, L1 both."""
         options = self.options
         index = torch.randint(len(data.rays), (options.color_rays,), generator=self.generator).to(self._device)
         rays = self._correct(data.rays.take(index))
         depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
-        rendered = render_rays(self.field, rays, depths, self.sharpness(), self.field.background.sigmoid())
+        background = self.field.background.sigmoid()
+        rendered = render_rays(self.field, rays, depths, self.sharpness(), background, geometry_learns)
         color = (rendered.colors - rays.colors).abs().mean()
         depth = (rendered.depths - rays.depths).abs().mean() / data.size
         return options.weights.color * color + options.weights.rendered_depth * depth

@@ -44,3 +44,18 @@ def test_the_loss_falls_as_its_gradient_says():
             below = float(loss())
             parameter.add_(step * direction)
         np.testing.assert_allclose((above - below) / (2.0 * step), expected, rtol=0.03)
+
+
+def test_a_geometry_that_does_not_learn_is_rendered_alike_and_has_no_gradient():
+    field, _ = loss_and_parameter()
+    images = scenes.images(count=2, height=12, width=16)
+    rays = rays_of_pixels(images, np.flatnonzero(images.depths.ravel() > 0.0)[:12], None)
+    depths = samples_about_depth(rays, torch.full((len(rays),), 0.05), torch.Generator().manual_seed(1))
+    sharpness = 15.0 * field.log_sharpness.exp()
+    learning, still = (render_rays(field, rays, depths, sharpness, torch.zeros(3), one) for one in (True, False))
+    for name in ("colors", "depths", "opacity"):
+        torch.testing.assert_close(getattr(still, name), getattr(learning, name))
+    (still.colors.mean() + still.depths.mean()).backward()
+    assert all(parameter.grad is None for parameter in (field.table, *field.weights, *field.biases))
+    for parameter in (field.log_sharpness, field.feature_weight, *field.color_weights):
+        assert float(parameter.grad.abs().max()) > 0.0

@@ -19,6 +19,7 @@ SMALL = ReconstructionOptions(
     grid=HashGridConfig.from_top_resolution(512, levels=8, log2_table_size=12),
     hidden_width=32,
     iterations=250,
+    map_points=768,
     surface_rays=192,
     free_points=384,
     eikonal_points=256,
@@ -116,7 +117,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
 
 
 def test_a_fit_that_diverges_says_so_and_writes_no_field(tmp_path):
-    options = replace(SMALL, iterations=20, weights=LossWeights(surface=float("inf")))
+    options = replace(SMALL, iterations=20, weights=LossWeights(map=float("inf")))
     files = FitFiles(tmp_path / "field.safetensors", snapshots=(0.05,), pictures=True)
     with pytest.raises(FitDivergedError) as caught:
         reconstruct(scenes.images(count=4), files, options, device="cpu")
