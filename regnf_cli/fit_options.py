@@ -38,9 +38,7 @@ Source = Annotated[
 SafeField = Annotated[Path, typer.Argument(help="The safe field to write, *.safetensors.")]
 Iterations = Annotated[
     int | None,
-    typer.Option(
-        min=1, help="Training steps; more is finer. Without it 3000; with --refine-poses up to 5000 as the grid grows."
-    ),
+    typer.Option(min=1, help="Training steps; more is finer. Without it 3000."),
 ]
 TableLog2 = Annotated[
     int | None,

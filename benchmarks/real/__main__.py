@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--objects", nargs="+", choices=KINDS, default=list(KINDS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     parser.add_argument("--only", nargs="+", default=[], help="names of things")
-    parser.add_argument("--iterations", type=int, default=0, help="of a fit; 0: as the images ask")
+    parser.add_argument("--iterations", type=int, default=3000, help="of a fit")
     parser.add_argument("--refine-poses", action="store_true", help="of a fit")
     parser.add_argument("--runs", nargs="+", default=["runs.json"], help="files of WORK that runs are kept in")
     parser.add_argument("--stages", action="store_true", help="find out which stage loses the truth")

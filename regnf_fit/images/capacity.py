@@ -20,17 +20,11 @@ from regnf_fit.options import grid_of_levels
 _LEVELS = {512: 8, 1024: 9}
 """Of a grid with so many nodes along an edge: neighboring levels differ by a factor of about 1.65."""
 _LEAST_LOG2, _MOST_LOG2 = 15, 18
-_ITERATIONS = 3000
-"""With the smallest table; where rays tell the distances, more for larger ones, by the fourth root of their entries."""
 
 
 def suited(options: ReconstructionOptions, prepared: PreparedImages) -> ReconstructionOptions:
-    """The options with the grid and the iterations that these images ask for, where none were given."""
-    grid = grid_of(prepared, options.table_log2) if options.grid is OF_IMAGES else options.grid
-    of_map = prepared.has_depth and not options.refine_poses
-    larger = 1.0 if of_map else 2.0 ** max(0, grid.log2_table_size - _LEAST_LOG2)
-    iterations = options.iterations or round(_ITERATIONS * larger**0.25)
-    return replace(options, grid=grid, iterations=iterations)
+    """The options with the grid that these images ask for, where none was given."""
+    return replace(options, grid=grid_of(prepared, options.table_log2)) if options.grid is OF_IMAGES else options
 
 
 def grid_of(prepared: PreparedImages, table_log2: int | None = None) -> HashGridConfig:

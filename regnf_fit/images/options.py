@@ -26,10 +26,10 @@ class LossWeights:
     color: float = 1.0
     eikonal: float = 0.4
     """The paper's lambda, against a color term of weight 1."""
-    surface: float = 20.0
-    """Where poses are corrected: |signed distance| where a depth was measured, and distances along the ray near it."""
-    map: float = 200.0
-    """Where they are not: |signed distance - that of the map of all depths| near surfaces."""
+    surface: float = 200.0
+    """|signed distance| where a depth was measured, and the distance along the ray near it."""
+    surface_with_poses: float = 20.0
+    """The same where poses are corrected: what depths of wrong poses say must not hold the shape."""
     free_space: float = 10.0
     rendered_depth: float = 2.0
     opacity: float = 0.1
@@ -47,22 +47,18 @@ class ReconstructionOptions(NetworkOptions):
     the images show."""
     table_log2: int | None = None
     """log2 of that grid's entries a level; None: by what the images show."""
-    iterations: int = 0
-    """0: 3000; where poses are corrected, up to 5000 with the largest grid."""
     hidden_width: int = 64
     feature_width: int = 16
     """What the geometry's network hands to the color's."""
-    map_points: int = 4096
-    """Points near surfaces an iteration, where the map of all depths tells their distances."""
-    surface_rays: int = 512
-    """Rays with depth an iteration, where poses are corrected; each gives one point on the surface and ``band_samples``
-    beside it."""
+    surface_rays: int = 1024
+    """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
     band_samples: int = 3
     free_points: int = 1024
     eikonal_points: int = 512
     """Points an iteration for the Eikonal term, half of them near surfaces, half anywhere in the bounds."""
     color_rays: int = 64
-    """Rays for color and opacity, where there is depth: every iteration, or every eighth with a map of all depths."""
+    """Rays for color, where there is depth, every eighth iteration. The geometry learns from it where poses are
+    corrected alone; then it is every iteration."""
     rays_without_depth: int = 384
     """The same where there is none: color is all there is to learn from."""
     band_deviations: float = 5.0
@@ -76,9 +72,8 @@ class ReconstructionOptions(NetworkOptions):
     """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
-    """The share of rays or of the map's points that are drawn from those at detail (:mod:`.detail`): where the surface
-    is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from within
-    these boxes."""
+    """The share of rays that are drawn from those which end at detail (:mod:`.detail`): where the surface is not flat,
+    or in the boxes of the dataset's instances, if any; and the share of free points drawn from within these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4
     """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""

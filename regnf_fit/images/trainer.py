@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from regnf_fit.images.camera_poses import CameraPoses, expected_errors
 from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
 from regnf_fit.images.depth_supervision import DepthSupervision, supervise
 from regnf_fit.images.depth_terms import depth_terms
-from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import least_sharpness
 from regnf_fit.images.options import ReconstructionOptions
@@ -29,8 +27,9 @@ _SHARPEST = 50.0
 """How far above the least sharpness the learned one may rise."""
 _SHARPNESS_RATE = 5.0
 """The sharpness learns so much faster than the networks: it is one number with far to go."""
+
 _COLOR_EVERY = 8
-"""Where the geometry does not learn from the color, it learns in one of so many iterations."""
+"""Where the geometry does not learn from colors, they learn in one of so many iterations."""
 
 
 class Trainer:
@@ -43,7 +42,6 @@ class Trainer:
         seed: int,
         device: torch.device,
         rng: np.random.Generator,
-        near: MapDistances | None = None,
     ) -> None:
         self.options = options
         self.iteration = 0
@@ -57,7 +55,7 @@ class Trainer:
         self._rays = prepared.training.to(device)
         self._data: DepthSupervision | None = None
         if prepared.has_depth:
-            self._data = replace(supervise(prepared, options, rng), near=near).to(device)
+            self._data = supervise(prepared, options, rng).to(device)
         self._masked = bool(prepared.training.background.any())
         self._bounds = prepared.bounds.float().to(device)
         self._device = device
@@ -123,13 +121,13 @@ class Trainer:
             loss, near = self._color_alone()
             return loss + weights.eikonal * self._eikonal(function, near)
         surface, free_space, near = depth_terms(function, self._data, self.options, self.generator, self._correct)
-        of_map = self._data.near is not None
-        loss = (weights.map if of_map else weights.surface) * surface + weights.free_space * free_space
+        of_surface = weights.surface if self.poses is None else weights.surface_with_poses
+        loss = of_surface * surface + weights.free_space * free_space
         if (poses := self._learning_poses()) is not None:
             loss = loss + weights.poses * poses.prior()
         loss = loss + weights.eikonal * self._eikonal(function, near)
-        if self.options.color_rays > 0 and self.iteration % (_COLOR_EVERY if of_map else 1) == 0:
-            loss = loss + self._color(self._data, geometry_learns=not of_map)
+        if self.options.color_rays > 0 and (self.poses is not None or self.iteration % _COLOR_EVERY == 0):
+            loss = loss + self._color(self._data)
         return loss
 
     def _learning_poses(self) -> CameraPoses | None:
@@ -149,14 +147,15 @@ class Trainer:
         loss: Tensor = (gradient.norm(dim=1) - 1.0).square().mean()
         return loss
 
-    def _color(self, data: DepthSupervision, geometry_learns: bool) -> Tensor:
-        """Color and rendered depth of rays with depth, L1 both."""
+    def _color(self, data: DepthSupervision) -> Tensor:
+        """Color and rendered depth of rays with depth, L1 both: for colors and sharpness, and where poses are corrected
+        for them and the geometry."""
         options = self.options
         index = torch.randint(len(data.rays), (options.color_rays,), generator=self.generator).to(self._device)
         rays = self._correct(data.rays.take(index))
         depths = samples_about_depth(rays, 2.0 * data.before[index], self.generator)
         background = self.field.background.sigmoid()
-        rendered = render_rays(self.field, rays, depths, self.sharpness(), background, geometry_learns)
+        rendered = render_rays(self.field, rays, depths, self.sharpness(), background, self.poses is not None)
         color = (rendered.colors - rays.colors).abs().mean()
         depth = (rendered.depths - rays.depths).abs().mean() / data.size
         return options.weights.color * color + options.weights.rendered_depth * depth
