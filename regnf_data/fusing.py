@@ -104,3 +104,15 @@ def _save(images: DepthImages, grid: BlockGrid, path: Path, progress: Progress |
         color = (images.colors[number] / np.float32(255.0)).astype(np.float32)
         blocks.integrate(near, image, o3d.t.geometry.Image(core.Tensor(color)), K, K, camera, *reach)
     blocks.save(str(path))
+    _sort(path)
+
+
+def _sort(path: Path) -> None:
+    """Order the blocks by their place: Open3D's threads leave them in any order, and maps shall be repeatable."""
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    order = np.lexsort(arrays["key"].T)
+    for name, array in arrays.items():
+        if array.ndim > 1 and len(array) == len(order):
+            arrays[name] = array[order]
+    np.savez(path, **arrays)

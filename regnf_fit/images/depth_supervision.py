@@ -14,6 +14,7 @@ from torch import Tensor
 from regnf_core.geometry.box import OrientedBox
 from regnf_fit.images.cells import cells_of
 from regnf_fit.images.detail import in_boxes, uneven
+from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
 from regnf_fit.images.rays import PixelRays
@@ -49,6 +50,7 @@ class DepthSupervision:
     free_points: Tensor
     clearances: Tensor
     size: float
+    near: MapDistances | None = None
 
     def to(self, device: torch.device) -> DepthSupervision:
         """The same on another device."""
@@ -61,6 +63,7 @@ class DepthSupervision:
             free_points=self.free_points.to(device),
             clearances=self.clearances.to(device),
             size=self.size,
+            near=None if self.near is None else self.near.to(device),
         )
 
 

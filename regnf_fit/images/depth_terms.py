@@ -3,7 +3,8 @@
 Near the measured surface the distance along the ray and free space before it, as Azinovic et al. (2022, "Neural RGB-D
 Surface Reconstruction") have it, with two changes for a field that shall be a distance, not one along a ray: the
 distance along the ray is shortened by the cosine between ray and surface, and free points are given their distance to
-the nearest measured surface (as Ortiz et al. 2022, "iSDF") in place of the truncation.
+the nearest measured surface (as Ortiz et al. 2022, "iSDF") in place of the truncation. In rooms, unless poses are
+corrected, the map that all depths fuse to (:mod:`.map_distances`) tells distances near surfaces instead of single rays.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
 from regnf_fit.images.depth_supervision import DepthSupervision
+from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.rays import PixelRays
 
@@ -35,6 +37,8 @@ def depth_terms(
 
     correct: the rays by corrected poses, which the surface's term is differentiable by.
     """
+    if data.near is not None:
+        return _map_terms(function, data, data.near, options, generator)
     chosen = _draw_rays(data, options, generator)
     rays = correct(data.rays.take(chosen))
     offsets = _offsets(data.before[chosen], data.behind[chosen], options.band_samples, generator)
@@ -49,8 +53,31 @@ def depth_terms(
     # where no plane could be laid, only the surface itself is believed
     weight = torch.where((rays.cosines[:, None] <= 0.0) & (offsets != 0.0), 0.0, weight)
     surface = (weight * error.abs()).mean() / data.size
-    free_space = (beyond - data.clearances[free]).abs().sum() / max(len(free), 1) / data.size
-    return surface, free_space, near.detach().flatten(0, 1)
+    return surface, _free_space(beyond, data, free), near.detach().flatten(0, 1)
+
+
+def _map_terms(
+    function: NeusFactoFunction,
+    data: DepthSupervision,
+    near: MapDistances,
+    options: ReconstructionOptions,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The terms where a map of the images tells the distances near surfaces: |value - the map's| in place of rays."""
+    device = near.points.device
+    count = int(options.detail_share * options.map_points) if len(near.detailed) else 0
+    detailed = near.detailed[_draw(len(near.detailed), count, generator, device)]
+    chosen = torch.cat((detailed, _draw(len(near.points), options.map_points - count, generator, device)))
+    points, free = near.points[chosen], _draw(len(data.free_points), options.free_points, generator, device)
+    values = function.value(torch.cat((points, data.free_points[free])))
+    surface = (values[: len(points)] - near.distances[chosen]).abs().mean() / data.size
+    return surface, _free_space(values[len(points) :], data, free), points
+
+
+def _free_space(values: Tensor, data: DepthSupervision, free: Tensor) -> Tensor:
+    """|value - distance to the nearest measured surface| of the free points ``free`` (F,), in diagonals."""
+    total: Tensor = (values - data.clearances[free]).abs().sum()
+    return total / max(len(free), 1) / data.size
 
 
 def _draw_rays(data: DepthSupervision, options: ReconstructionOptions, generator: torch.Generator) -> Tensor:

@@ -28,6 +28,7 @@ from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
 from regnf_fit.images.held_out_images import held_out_images, likeness
+from regnf_fit.images.map_distances import map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
@@ -77,7 +78,9 @@ def reconstruct(
     check_within_grid(images.bounds)
     prepared = prepare(images, options.start, rng)
     options = suited(options, prepared)
-    trainer = Trainer(prepared, options, seed, torch_device, rng)
+    of_map = prepared.has_depth and prepared.start.hollow and not options.refine_poses
+    near = map_distances(images, prepared, rng) if of_map else None
+    trainer = Trainer(prepared, options, seed, torch_device, rng, near)
     write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels, prepared.spread))
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():

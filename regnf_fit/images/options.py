@@ -30,6 +30,8 @@ class LossWeights:
     """|signed distance| where a depth was measured, and the distance along the ray near it."""
     surface_with_poses: float = 20.0
     """The same where poses are corrected: what depths of wrong poses say must not hold the shape."""
+    map: float = 200.0
+    """In rooms, instead: |signed distance - that of the map of all depths| near surfaces."""
     free_space: float = 10.0
     rendered_depth: float = 2.0
     opacity: float = 0.1
@@ -50,6 +52,8 @@ class ReconstructionOptions(NetworkOptions):
     hidden_width: int = 64
     feature_width: int = 16
     """What the geometry's network hands to the color's."""
+    map_points: int = 4096
+    """Points near surfaces an iteration, where the map of all depths tells their distances."""
     surface_rays: int = 1024
     """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
     band_samples: int = 3
@@ -72,8 +76,9 @@ class ReconstructionOptions(NetworkOptions):
     """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
-    """The share of rays that are drawn from those which end at detail (:mod:`.detail`): where the surface is not flat,
-    or in the boxes of the dataset's instances, if any; and the share of free points drawn from within these boxes."""
+    """The share of rays or of the map's points that are drawn from those at detail (:mod:`.detail`): where the surface
+    is not flat, or in the boxes of the dataset's instances, if any; and the share of free points drawn from within
+    these boxes."""
     weights: LossWeights = field(default_factory=LossWeights)
     levels_at_start: int = 4
     """The grid's levels that learn from the first iteration on; the finer ones follow one by one."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from regnf_core.geometry.box import OrientedBox
 from regnf_data.posed_images import PosedImages
@@ -25,12 +26,14 @@ _START_RADIUS = 0.2
 
 @dataclass(frozen=True)
 class PreparedImages:
-    """training, held_out: rays of different pixels · size: diagonal of the bounds (2, 3), field units · boxes: of the
+    """training, held_out: rays of different pixels · held_out_pixels: indices of the latter into the images' (N, H, W)
+    taken as one row · size: diagonal of the bounds (2, 3), field units · boxes: of the
     instances that the dataset names · pixel: a pixel's width at depth 1 · spread: of depths, from image to image ·
     images: how many."""
 
     training: PixelRays
     held_out: PixelRays
+    held_out_pixels: NDArray[np.int64]
     start: StartShape
     bounds: torch.Tensor
     size: float
@@ -47,7 +50,8 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
     pixels = rng.permutation(images.colors[..., 0].size)[:_MAX_PIXELS]
     planes = None if images.depths is None else local_planes(images.depths, images.intrinsics)
     rays = rays_of_pixels(images, pixels, planes)
-    rays = rays.take(rays.far > rays.near)
+    meet = rays.far > rays.near
+    rays, pixels = rays.take(meet), pixels[meet.numpy()]
     has_depth = images.depths is not None
     shown = (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
     check_seen(int(shown.sum()) if has_depth else int((~rays.background).sum()))
@@ -56,6 +60,7 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
     return PreparedImages(
         training=rays.take(order[held_out:]),
         held_out=rays.take(order[:held_out]),
+        held_out_pixels=pixels[:held_out],
         start=start_shape(images, start),
         bounds=torch.from_numpy(images.bounds),
         size=float(np.linalg.norm(images.bounds[1] - images.bounds[0])),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from regnf_fit.images.camera_poses import CameraPoses, expected_errors
 from regnf_fit.images.color_terms import render_rays, samples_about_depth, samples_by_weight
 from regnf_fit.images.depth_supervision import DepthSupervision, supervise
 from regnf_fit.images.depth_terms import depth_terms
+from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.opacity import least_sharpness
 from regnf_fit.images.options import ReconstructionOptions
@@ -42,6 +44,7 @@ class Trainer:
         seed: int,
         device: torch.device,
         rng: np.random.Generator,
+        near: MapDistances | None = None,
     ) -> None:
         self.options = options
         self.iteration = 0
@@ -55,7 +58,7 @@ class Trainer:
         self._rays = prepared.training.to(device)
         self._data: DepthSupervision | None = None
         if prepared.has_depth:
-            self._data = supervise(prepared, options, rng).to(device)
+            self._data = replace(supervise(prepared, options, rng), near=near).to(device)
         self._masked = bool(prepared.training.background.any())
         self._bounds = prepared.bounds.float().to(device)
         self._device = device
@@ -122,6 +125,7 @@ class Trainer:
             return loss + weights.eikonal * self._eikonal(function, near)
         surface, free_space, near = depth_terms(function, self._data, self.options, self.generator, self._correct)
         of_surface = weights.surface if self.poses is None else weights.surface_with_poses
+        of_surface = of_surface if self._data.near is None else weights.map
         loss = of_surface * surface + weights.free_space * free_space
         if (poses := self._learning_poses()) is not None:
             loss = loss + weights.poses * poses.prior()

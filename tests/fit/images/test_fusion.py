@@ -90,3 +90,9 @@ def test_maps_are_not_bound_to_a_hash_grids_cube(tmp_path: Path) -> None:
     fuse_images(replace(IMAGES, T_world_camera=poses, bounds=IMAGES.bounds + shift), tmp_path / "map.safetensors")
     top = torch.from_numpy(scenes.BALL_CENTER + shift + [0.0, 0.0, scenes.BALL_RADIUS])[None].float()
     assert abs(float(open_field(tmp_path / "map.safetensors").signed_distance(top))) < 0.005
+
+
+def test_the_same_images_make_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("one", "two", "three"):
+        fuse_images(IMAGES, tmp_path / f"{name}.safetensors")
+    assert len({one.read_bytes() for one in tmp_path.iterdir()}) == 1

@@ -9,7 +9,9 @@ from regnf_core.fields.build import open_field
 from regnf_core.fields.color import has_color
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
+from regnf_fit.images import fit
 from regnf_fit.images.fit import FitFiles, reconstruct
+from regnf_fit.images.map_distances import map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.options import LossWeights, ReconstructionOptions
 from tests.core.importing.in_process import convert
@@ -19,6 +21,7 @@ SMALL = ReconstructionOptions(
     grid=HashGridConfig.from_top_resolution(512, levels=8, log2_table_size=12),
     hidden_width=32,
     iterations=250,
+    map_points=768,
     surface_rays=192,
     free_points=384,
     eikonal_points=256,
@@ -167,3 +170,19 @@ def test_the_field_is_positive_round_the_start_and_a_room_the_other_way_round():
         with torch.no_grad():
             middle, corner = field.function().value(torch.tensor([[0.0, 0.0, 0.0], [1.2, 1.2, 1.2]]))
         assert sign * float(corner) > 0.0 > sign * float(middle)
+
+
+@pytest.mark.parametrize(
+    ("start", "refine_poses", "maps"), [("room", False, 1), ("object", False, 0), ("room", True, 0)]
+)
+def test_rooms_learn_from_the_map_of_their_depths(tmp_path, monkeypatch, start, refine_poses, maps):
+    made = []
+
+    def counted(*given):
+        made.append(map_distances(*given))
+        return made[-1]
+
+    monkeypatch.setattr(fit, "map_distances", counted)
+    options = replace(SMALL, iterations=2, start=start, refine_poses=refine_poses)
+    reconstruct(scenes.images(count=4), FitFiles(tmp_path / "field.safetensors"), options, device="cpu")
+    assert len(made) == maps
