@@ -39,7 +39,7 @@ class DepthSupervision:
     rays: (R,) those with depth · before, behind: (R,) how far along them the band reaches before and behind the surface
     · trust: (R,) what they count, 1 in the mean · detailed: (D,) indices of those that end at detail ·
     free_points: (P, 3), free by what was seen · clearances: (P,) their distance to the nearest measured surface ·
-    size: the bounds' diagonal.
+    size: the bounds' diagonal · near: what the map of all depths says, if that is learned in place of rays.
     """
 
     rays: PixelRays

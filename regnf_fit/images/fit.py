@@ -28,7 +28,7 @@ from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
 from regnf_fit.images.held_out_images import held_out_images, likeness
-from regnf_fit.images.map_distances import map_distances
+from regnf_fit.images.map_distances import MapDistances, map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
@@ -78,9 +78,7 @@ def reconstruct(
     check_within_grid(images.bounds)
     prepared = prepare(images, options.start, rng)
     options = suited(options, prepared)
-    of_map = prepared.has_depth and prepared.start.hollow and not options.refine_poses
-    near = map_distances(images, prepared, rng) if of_map else None
-    trainer = Trainer(prepared, options, seed, torch_device, rng, near)
+    trainer = Trainer(prepared, options, seed, torch_device, rng, _near(images, prepared, options, rng))
     write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels, prepared.spread))
     key = _key(images, options, seed)
     if files.checkpoint is not None and files.checkpoint.exists():
@@ -115,6 +113,15 @@ def reconstruct(
         seconds=time.monotonic() - started,
         **asdict(errors),
     )
+
+
+def _near(
+    images: PosedImages, prepared: PreparedImages, options: ReconstructionOptions, rng: np.random.Generator
+) -> MapDistances | None:
+    """Distances of the map that the depths fuse to: in rooms whose poses are believed. Otherwise rays tell them."""
+    if not prepared.has_depth or not prepared.start.hollow or options.refine_poses:
+        return None
+    return map_distances(images, prepared, rng)
 
 
 def _fit_color(trainer: Trainer, prepared: PreparedImages, held_out: list[int], seed: int) -> SurfaceColor | None:
