@@ -14,7 +14,7 @@ _LONGEST_LABEL = 200  # of the safe format
 
 
 class StartChoice(StrEnum):
-    """A ball, a hollow ball round the cameras, or what the cameras' places suggest."""
+    """A ball, a hollow ball round the bounds, or what the images suggest."""
 
     auto = "auto"
     object = "object"

@@ -163,7 +163,7 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
     if scene in ("tsdf", "rendered"):
         fuse(seen.taken, seen.fusion, seen.bounds, home / SCENE)
         return {"kind": scene}
-    if scene == "fused":
+    if scene in ("fused", "rendered-fused"):
         fuse_images(seen.taken.images(seen.bounds), home / SCENE)
         return {"kind": scene}
     if scene in FROM_IMAGES:

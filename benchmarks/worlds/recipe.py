@@ -19,11 +19,21 @@ from regnf_data.worlds.rooms import World
 from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor, rendered_sensor
 from regnf_data.worlds.walks import LENGTHS, Length, walk
 
-Scene = Literal["tsdf", "rendered", "fused", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
-SCENES: tuple[Scene, ...] = ("tsdf", "rendered", "fused", "fit", "rendered-fit", "under-trained", "mesh", "bent")
-FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fused", "fit", "rendered-fit", "under-trained")
+Scene = Literal["tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
+SCENES: tuple[Scene, ...] = (
+    "tsdf",
+    "rendered",
+    "fused",
+    "rendered-fused",
+    "fit",
+    "rendered-fit",
+    "under-trained",
+    "mesh",
+    "bent",
+)
+FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained")
 """Scenes that the poses' drift bends; the others are exact, or bent in another way."""
-RENDERED: tuple[Scene, ...] = ("rendered", "fused", "rendered-fit")
+RENDERED: tuple[Scene, ...] = ("rendered", "rendered-fused", "rendered-fit")
 """Scenes whose images are those of a simulated dataset."""
 _FRAMES: dict[Length, dict[int, int]] = {
     "long": {120: 150, 240: 90, 480: 40},

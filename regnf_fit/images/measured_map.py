@@ -21,8 +21,12 @@ from regnf_fit.images.rays import PixelRays
 
 _TRUNCATION = 4.0
 """Voxels, at least."""
-_SPREADS = 3.0
-"""Truncations, at least, in standard deviations of one image's depths from another's."""
+_SPREADS = 6.0
+"""Truncations, at least, in standard deviations of one image's depths from another's, measured across the surface.
+Depths are left out of voxels farther than a truncation behind them: where it is narrow, those that were read too near are
+left out and those read too far are not, so that surfaces recede; where it is wide, thin parts swell."""
+_LEAST_SPREADS = 0.5
+"""Voxels, at least, in these deviations: smaller ones say no more, and the truncation would have many."""
 _BLOCK, _MOST_BLOCKS = 8.0, 20_000
 """Voxels along a block's edge, and blocks with measured points at most: voxels that nobody gave grow beyond."""
 _REFUSED = 10
@@ -33,7 +37,8 @@ _GROWTH = 1.1
 @dataclass(frozen=True)
 class MapSize:
     """voxel: from node to node, field units; None: as wide as a pixel of the sharper images is at its surface, or as
-    many blocks allow · truncation: voxels; None: 4, or 3 standard deviations of the depths from image to image."""
+    noise and many blocks allow · truncation: voxels; None: 4, or 6 standard deviations of the depths from image to
+    image."""
 
     voxel: float | None = None
     truncation: float | None = None
@@ -44,16 +49,14 @@ def map_grid(prepared: PreparedImages, rays: PixelRays, size: MapSize) -> BlockG
 
     Raises InvalidOptionsError for voxels that are too small for the surface that was measured.
     """
-    width = sharp_width(prepared, rays)
-    voxel, ends = size.voxel or width, ends_of(rays)
+    width, ends = sharp_width(prepared, rays), ends_of(rays)
+    spread = float(np.median(prepared.spread.at(rays.depths.numpy())))
+    voxel = size.voxel or max(width, _LEAST_SPREADS * spread)
     while (blocks := len(cells_of(ends, _BLOCK * voxel).counts)) > _MOST_BLOCKS and size.voxel is None:
         voxel *= _GROWTH
     if voxel < width / _REFUSED or blocks > _REFUSED * _MOST_BLOCKS:
         raise InvalidOptionsError(f"voxels of {voxel:.3g} are too small for pixels that are {width:.3g} wide there")
-    truncation = size.truncation
-    if truncation is None:
-        spread = float(np.median(prepared.spread.at(rays.depths.numpy())))
-        truncation = max(_TRUNCATION, _SPREADS * spread / voxel)
+    truncation = size.truncation or max(_TRUNCATION, _SPREADS * spread / voxel)
     return BlockGrid(voxel, truncation, float(rays.depths.max()))
 
 

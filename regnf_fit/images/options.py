@@ -10,7 +10,8 @@ from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.options import NetworkOptions, grid_of_levels
 
 Start = Literal["auto", "object", "room"]
-"""The shape a field starts from: a ball in free space, a hollow ball in matter, or what the cameras' places suggest."""
+"""The shape a field starts from: a ball in free space, a hollow ball in matter, or what the images
+suggest (:mod:`.starting`)."""
 
 OF_IMAGES = grid_of_levels(8)
 """Stands for the grid that the images ask for (:mod:`.capacity`), where no other one is given."""

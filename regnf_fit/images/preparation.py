@@ -15,13 +15,12 @@ from regnf_fit.images.depth_normals import local_planes
 from regnf_fit.images.depth_spread import NO_SPREAD, DepthSpread, depth_spread
 from regnf_fit.images.options import Start
 from regnf_fit.images.rays import PixelRays, rays_of_pixels
+from regnf_fit.images.starting import start_shape
 from regnf_fit.network import StartShape
 
 _MAX_PIXELS = 3_000_000
 _HELD_OUT_SHARE = 0.02
 _MAX_HELD_OUT = 4_000
-_START_RADIUS = 0.2
-"""Diagonals: smaller than most objects, so that what is seen grows from it."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
         training=rays.take(order[held_out:]),
         held_out=rays.take(order[:held_out]),
         held_out_pixels=pixels[:held_out],
-        start=start_shape(images, start),
+        start=start_shape(images, start, rays.take(shown & (rays.depths > 0.0))),
         bounds=torch.from_numpy(images.bounds),
         size=float(np.linalg.norm(images.bounds[1] - images.bounds[0])),
         has_depth=has_depth,
@@ -70,14 +69,3 @@ def prepare(images: PosedImages, start: Start, rng: np.random.Generator) -> Prep
         spread=NO_SPREAD if planes is None else depth_spread(images, planes.cosines),
         images=len(images),
     )
-
-
-def start_shape(images: PosedImages, start: Start) -> StartShape:
-    """A ball in the middle of the bounds; for a room a hollow one, so large that the cameras are in free space."""
-    low, high = images.bounds
-    center = (low + high) / 2.0
-    cameras = images.T_world_camera[:, :3, 3]
-    within = ((cameras > low) & (cameras < high)).all(axis=1).mean()
-    hollow = start == "room" or (start == "auto" and within > 0.5)
-    size = float(np.linalg.norm(high - low))
-    return StartShape(torch.from_numpy(center).float(), (0.5 if hollow else _START_RADIUS) * size, hollow)

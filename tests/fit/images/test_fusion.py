@@ -15,7 +15,10 @@ from regnf_core.fields.color import has_color
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.observation_grid import FREE, SURFACE
 from regnf_core.schema.safe_format import read_description
+from regnf_data.posed_images import PosedImages
 from regnf_fit.images.fusion import FusionOptions, fuse_images
+from regnf_fit.images.measured import measured_rays
+from regnf_fit.images.preparation import prepare
 from tests.fit.images import scenes
 
 IMAGES = scenes.images(count=12, height=72, width=96)
@@ -45,6 +48,36 @@ def test_a_map_has_the_distances_colors_and_frame_of_its_images(tmp_path: Path) 
     description = read_description(path)
     assert (description["label"], description["source"]) == ("two", {"dataset": "images"})
     assert [one.name for one in tmp_path.iterdir()] == ["map.safetensors"]
+
+
+def misplaced(images: PosedImages, deviation: float) -> PosedImages:
+    """Each image's depths are wrong by a number of their own, as where poses drift."""
+    assert images.depths is not None
+    wrong = np.random.default_rng(7).normal(scale=deviation, size=(len(images), 1, 1)).astype(np.float32)
+    return replace(images, depths=np.where(images.depths > 0.0, images.depths + wrong, np.float32(0.0)))
+
+
+def test_the_truncation_follows_what_images_differ_by(tmp_path: Path) -> None:
+    images = misplaced(scenes.images(count=48, height=72, width=96, ball_alone=True), 0.04)
+    report = fuse_images(images, tmp_path / "map.safetensors")
+    prepared = prepare(images, "auto", np.random.default_rng(0))
+    deviation = np.median(prepared.spread.at(measured_rays(prepared).depths.numpy()))
+    assert report.truncation == pytest.approx(6.0 * deviation, rel=1e-3)
+    assert report.truncation > 4.5 * report.voxel
+    directions = np.random.default_rng(8).normal(size=(2000, 3))
+    surface = scenes.BALL_CENTER + scenes.BALL_RADIUS * directions / np.linalg.norm(directions, axis=1)[:, None]
+    distances = open_field(tmp_path / "map.safetensors").signed_distance(torch.from_numpy(surface).float())
+    # 48 images, each off by .04: their mean is off by .006
+    assert abs(float(distances.median())) < 0.01
+
+
+def test_voxels_are_no_smaller_than_half_the_deviation(tmp_path: Path) -> None:
+    sharp = scenes.images(count=24, height=288, width=384)
+    exact = fuse_images(sharp, tmp_path / "exact.safetensors")
+    rough = fuse_images(misplaced(sharp, 0.03), tmp_path / "rough.safetensors")
+    assert exact.truncation == pytest.approx(4.0 * exact.voxel)
+    assert rough.voxel > 1.3 * exact.voxel
+    assert rough.truncation == pytest.approx(12.0 * rough.voxel)
 
 
 def test_a_map_keeps_what_its_images_have_seen(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.map_distances import map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.options import LossWeights, ReconstructionOptions
+from regnf_fit.images.preparation import prepare
 from tests.core.importing.in_process import convert
 from tests.fit.images import scenes
 
@@ -162,10 +163,8 @@ def test_images_with_nothing_to_go_by_are_refused(tmp_path, change, reason):
 
 
 def test_the_field_is_positive_round_the_start_and_a_room_the_other_way_round():
-    from regnf_fit.images.preparation import start_shape
-
     for kind, sign in (("object", 1.0), ("room", -1.0)):
-        start = start_shape(scenes.images(count=4), kind)
+        start = prepare(scenes.images(count=4), kind, np.random.default_rng(0)).start
         field = RadianceField(SMALL, start, torch.Generator().manual_seed(0))
         with torch.no_grad():
             middle, corner = field.function().value(torch.tensor([[0.0, 0.0, 0.0], [1.2, 1.2, 1.2]]))
