@@ -28,6 +28,10 @@ _PRECISE = 0.25
 """Bands: the noise up to which a point shows where the surface is."""
 _ALONE = 3.0
 """Bands: noisier points count where no precise one is as near as this."""
+_NOISE = 3.0
+"""Standard deviations of one image's depths from another's: so far off may a depth be."""
+_STEEPEST = 0.3
+"""Cosines of rays and normals count as no less."""
 _MAX_TRUST = 4.0
 """At the most a depth counts so many times what the median one does, or so many times less."""
 
@@ -37,14 +41,16 @@ class DepthSupervision:
     """What is drawn from in every iteration; lengths in field units.
 
     rays: (R,) those with depth · before, behind: (R,) how far along them the band reaches before and behind the surface
-    · trust: (R,) what they count, 1 in the mean · detailed: (D,) indices of those that end at detail ·
-    free_points: (P, 3), free by what was seen · clearances: (P,) their distance to the nearest measured surface ·
-    size: the bounds' diagonal · near: what the map of all depths says, if that is learned in place of rays.
+    · noise: (R,) how far off along them their ends may be · trust: (R,) what they count, 1 in the mean · detailed: (D,)
+    indices of those that end at detail · free_points: (P, 3), free by what was seen · clearances: (P,) their distance
+    to the nearest measured surface · size: the bounds' diagonal · near: what the map of all depths says, if that is
+    learned in place of rays.
     """
 
     rays: PixelRays
     before: Tensor
     behind: Tensor
+    noise: Tensor
     trust: Tensor
     detailed: Tensor
     free_points: Tensor
@@ -58,6 +64,7 @@ class DepthSupervision:
             rays=self.rays.to(device),
             before=self.before.to(device),
             behind=self.behind.to(device),
+            noise=self.noise.to(device),
             trust=self.trust.to(device),
             detailed=self.detailed.to(device),
             free_points=self.free_points.to(device),
@@ -74,8 +81,11 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     bands = torch.maximum(options.band_deviations * rays.deviations, prepared.pixel * rays.depths)
     before, behind = bands.clamp_max(options.band * size), (0.5 * bands).clamp_max(options.band_behind * size)
     # within so many deviations the images contradict each other: a narrower band would be torn between them
-    least = options.band_spreads * torch.from_numpy(prepared.spread.at(rays.depths.numpy()))
-    before, behind = before.maximum(least), behind.maximum(0.5 * least)
+    # they differ by so much across the surface, and by more along a ray that meets it at a grazing angle
+    cosines = torch.where(rays.cosines > 0.0, rays.cosines.clamp_min(_STEEPEST), 1.0)
+    spreads = torch.from_numpy(prepared.spread.at(rays.depths.numpy())) / cosines
+    before = before.maximum(options.band_spreads * spreads)
+    behind = behind.maximum(0.5 * options.band_spreads * spreads)
     seen = (rays.depths > 0.0) & ~rays.background
     inside = seen & (rays.depths >= rays.near) & (rays.depths <= rays.far)
     surface = rays.take(inside)
@@ -89,6 +99,7 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
         rays=surface,
         before=before[inside],
         behind=behind[inside],
+        noise=_NOISE * spreads[inside],
         trust=_trust(surface.deviations),
         detailed=(in_boxes(prepared.boxes, ends) | uneven(ends, surface.deviations, size)).nonzero()[:, 0],
         free_points=points,

@@ -21,9 +21,11 @@ from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.rays import PixelRays
 
 _MORE_MATTER = 0.3
-"""What an error counts behind a surface, when a point is less deep than the ray says: the part may be thin."""
-_PLACES_BEHIND = 0.25
-"""The share of the points beside a surface that lie behind it."""
+"""What an error counts behind a surface and beyond the noise, when a point is less deep than the ray says: the part may
+be thin."""
+_PLACES_BEHIND = 1.0 / 3.0
+"""The share of the points beside a surface that lie behind it: as dense as before it, where the band is twice as
+wide."""
 
 
 def depth_terms(
@@ -41,7 +43,8 @@ def depth_terms(
         return _map_terms(function, data, data.near, options, generator)
     chosen = _draw_rays(data, options, generator)
     rays = correct(data.rays.take(chosen))
-    offsets = _offsets(data.before[chosen], data.behind[chosen], options.band_samples, generator)
+    noise = torch.where(rays.cosines > 0.0, data.noise[chosen], 0.0)
+    offsets = _offsets(data.before[chosen], data.behind[chosen], noise, options.band_samples, generator)
     cosines = torch.where(rays.cosines > 0.0, rays.cosines, 1.0)
     depths = rays.depths[:, None] - offsets / rays.directions.norm(dim=1, keepdim=True)
     near = rays.at(depths)  # (R, 1 + B, 3)
@@ -49,9 +52,10 @@ def depth_terms(
     values = function.value(torch.cat((near.flatten(0, 1), data.free_points[free])))
     beside, beyond = values[: offsets.numel()].view_as(offsets), values[offsets.numel() :]
     error = beside - offsets * cosines[:, None]
-    weight = torch.where((offsets < 0.0) & (error > 0.0), _MORE_MATTER, 1.0) * data.trust[chosen, None]
+    behind = offsets < -noise[:, None]
+    weight = torch.where(behind & (error > 0.0), _MORE_MATTER, 1.0) * data.trust[chosen, None]
     # where no plane could be laid, only the surface itself is believed
-    weight = torch.where((rays.cosines[:, None] <= 0.0) & (offsets != 0.0), 0.0, weight)
+    weight[:, 1:] *= (rays.cosines > 0.0)[:, None]
     surface = (weight * error.abs()).mean() / data.size
     return surface, _free_space(beyond, data, free), near.detach().flatten(0, 1)
 
@@ -88,12 +92,19 @@ def _draw_rays(data: DepthSupervision, options: ReconstructionOptions, generator
     return torch.cat((detailed, _draw(len(data.rays), options.surface_rays - count, generator, device)))
 
 
-def _offsets(before: Tensor, behind: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(R, 1 + count): 0 for the surface itself, then distances along the ray before it (positive) and behind."""
-    share = torch.rand(len(before), count, generator=generator).to(before.device)
-    is_behind = (torch.rand(len(before), count, generator=generator) < _PLACES_BEHIND).to(before.device)
-    beside = torch.where(is_behind, -behind[:, None] * share, before[:, None] * share)
-    return torch.cat((torch.zeros_like(before)[:, None], beside), dim=1)
+def _offsets(before: Tensor, behind: Tensor, noise: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(R, 1 + count): about where the ray ends, then distances along it before the end (positive) and behind.
+
+    The first lies up to ``noise`` from the end. Wrong depths that all said "surface" where they end would say so of
+    places before and behind the surface, and no distance would be learned within the noise.
+    """
+
+    def share(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator).to(before.device)
+
+    is_behind = share(len(before), count) < _PLACES_BEHIND
+    beside = torch.where(is_behind, -behind[:, None], before[:, None]) * share(len(before), count)
+    return torch.cat((noise[:, None] * (2.0 * share(len(before), 1) - 1.0), beside), dim=1)
 
 
 def _draw(pool: int, count: int, generator: torch.Generator, device: torch.device) -> Tensor:

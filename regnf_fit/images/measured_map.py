@@ -23,8 +23,8 @@ _TRUNCATION = 4.0
 """Voxels, at least."""
 _SPREADS = 6.0
 """Truncations, at least, in standard deviations of one image's depths from another's, measured across the surface.
-Depths are left out of voxels farther than a truncation behind them: where it is narrow, those that were read too near are
-left out and those read too far are not, so that surfaces recede; where it is wide, thin parts swell."""
+Depths are left out of voxels farther than a truncation behind them: where it is narrow, those that were read too near
+are left out and those read too far are not, so that surfaces recede; where it is wide, thin parts swell."""
 _LEAST_SPREADS = 0.5
 """Voxels, at least, in these deviations: smaller ones say no more, and the truncation would have many."""
 _BLOCK, _MOST_BLOCKS = 8.0, 20_000

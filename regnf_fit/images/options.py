@@ -56,7 +56,8 @@ class ReconstructionOptions(NetworkOptions):
     map_points: int = 4096
     """Points near surfaces an iteration, where the map of all depths tells their distances."""
     surface_rays: int = 1024
-    """Rays with depth an iteration; each gives one point on the surface and ``band_samples`` beside it."""
+    """Rays with depth an iteration; each gives one point at the surface, within the noise, and ``band_samples`` beside
+    it."""
     band_samples: int = 3
     free_points: int = 1024
     eikonal_points: int = 512
@@ -73,7 +74,7 @@ class ReconstructionOptions(NetworkOptions):
     """At most so far before it, but for ``band_spreads``."""
     band_behind: float = 0.006
     """At most so far behind it, but for ``band_spreads``: half of the thinnest part worth having."""
-    band_spreads: float = 3.0
+    band_spreads: float = 6.0
     """At least so far before it, in standard deviations of one image's depths from another's, and half as far behind:
     the sensor's noise and the poses' errors, which the images themselves show."""
     detail_share: float = 0.5
