@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -20,17 +20,7 @@ from regnf_data.worlds.sensors import RandomSensor, draw_matter, draw_sensor, re
 from regnf_data.worlds.walks import LENGTHS, Length, walk
 
 Scene = Literal["tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained", "mesh", "bent"]
-SCENES: tuple[Scene, ...] = (
-    "tsdf",
-    "rendered",
-    "fused",
-    "rendered-fused",
-    "fit",
-    "rendered-fit",
-    "under-trained",
-    "mesh",
-    "bent",
-)
+SCENES: tuple[Scene, ...] = get_args(Scene)
 FROM_IMAGES: tuple[Scene, ...] = ("tsdf", "rendered", "fused", "rendered-fused", "fit", "rendered-fit", "under-trained")
 """Scenes that the poses' drift bends; the others are exact, or bent in another way."""
 RENDERED: tuple[Scene, ...] = ("rendered", "rendered-fused", "rendered-fit")

@@ -80,8 +80,8 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     # depths are distinguished from the surface by their noise, or by the width of a pixel there
     bands = torch.maximum(options.band_deviations * rays.deviations, prepared.pixel * rays.depths)
     before, behind = bands.clamp_max(options.band * size), (0.5 * bands).clamp_max(options.band_behind * size)
-    # within so many deviations the images contradict each other: a narrower band would be torn between them
-    # they differ by so much across the surface, and by more along a ray that meets it at a grazing angle
+    # Within so many deviations the images contradict each other: a narrower band would be torn between them. They are
+    # measured across the surface; along a ray that meets it at a grazing angle, depths differ by more.
     cosines = torch.where(rays.cosines > 0.0, rays.cosines.clamp_min(_STEEPEST), 1.0)
     spreads = torch.from_numpy(prepared.spread.at(rays.depths.numpy())) / cosines
     before = before.maximum(options.band_spreads * spreads)
