@@ -19,14 +19,13 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.make_fields import UNITS_PER_METER, surface
-from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.options import ReconstructionOptions
@@ -36,21 +35,8 @@ ROOMS = ("ac-room", "atbl-room", "mix-room")
 SINGLE_VIEW_ROOM = "ac-room"
 PERCENTS = (1, 3, 10)
 KINDS = ("objects", "rooms", "single")
-OBJECT_OPTIONS = ReconstructionOptions(observation_voxels=0)
-"""What was seen of an object is not asked for."""
-ROOM_OPTIONS = replace(
-    OBJECT_OPTIONS,
-    grid=HashGridConfig.from_top_resolution(1024, levels=8, log2_table_size=17),
-    iterations=5000,
-    surface_rays=768,
-    free_points=1536,
-    color_rays=32,
-    band=0.006,
-    band_behind=0.002,
-)
-LONG_OPTIONS = replace(ROOM_OPTIONS, level_interval=0.1)
-"""Fine levels of the grid so late that none is half learned after a tenth of the training."""
-SINGLE_OPTIONS = replace(ROOM_OPTIONS, iterations=2000)
+OPTIONS = ReconstructionOptions()
+"""The defaults, as a user gets them."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +46,6 @@ class Fit:
     kind: str
     images: str
     name: str
-    options: ReconstructionOptions
     snapshots: tuple[int, ...] = ()
 
 
@@ -87,13 +72,13 @@ def fits(images: Path) -> Iterator[Fit]:
     names = sorted(path.name for path in images.iterdir() if (path / "meta_data.json").exists())
     for name in names:
         if name in UNITS_PER_METER:
-            yield Fit("objects", name, name, OBJECT_OPTIONS)
+            yield Fit("objects", name, name)
         elif "-single-" in name:
-            yield Fit("single", name, name, SINGLE_OPTIONS)
+            yield Fit("single", name, name)
         elif name.endswith("-long"):
-            yield Fit("rooms", name, name.removesuffix("-long"), LONG_OPTIONS, PERCENTS)
+            yield Fit("rooms", name, name.removesuffix("-long"), PERCENTS)
         elif name.endswith("-short"):
-            yield Fit("rooms", name, name, ROOM_OPTIONS)
+            yield Fit("rooms", name, name)
 
 
 def make(fit: Fit, images: Path, fields: Path) -> None:
@@ -109,7 +94,7 @@ def make(fit: Fit, images: Path, fields: Path) -> None:
     files = FitFiles(path, path.with_suffix(".checkpoint"), tuple(percent / 100 for percent in fit.snapshots))
     source = {"dataset": fit.images, "attribution": demo.ATTRIBUTION}
     posed = load_dataset(images / fit.images)
-    report = reconstruct(posed, files, fit.options, device="cpu", progress=show, label=fit.name, source=source)
+    report = reconstruct(posed, files, OPTIONS, device="cpu", progress=show, label=fit.name, source=source)
     path.with_suffix(".fit.json").write_text(json.dumps(asdict(report), indent=1) + "\n")
 
 

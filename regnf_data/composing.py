@@ -114,8 +114,6 @@ def render_object(
     scene = MeshScene([thing])
     bounds = thing.solid.bounds.numpy()
     floor = float(bounds[0, 2])
-    if not (bounds[1] > bounds[0]).any():
-        raise DatasetError("the mesh is a single point", reason="DATASET_NO_VIEW")
     if options.trajectory == "single":
         poses = bad_view(scene, thing, options.size, options.intrinsics, floor)[None]
     else:

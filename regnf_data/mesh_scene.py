@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
-from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_solid
 from regnf_data.paint import Paint, TilePaint, paint_of
 
 _SEEN_SHARE = 0.003
@@ -59,7 +59,7 @@ def load_thing(path: str | os.PathLike[str], T_scene_mesh: ArrayLike | None = No
     import trimesh
 
     matrix = np.eye(4) if T_scene_mesh is None else np.asarray(T_scene_mesh, dtype=np.float64)
-    solid = MeshField.load(path).transformed(matrix)  # refuses what is malformed
+    solid = load_solid(path)[0].transformed(matrix)  # refuses what is malformed
     scene = trimesh.load_scene(os.fspath(path), process=False)
     meshes = tuple(
         PaintedMesh(

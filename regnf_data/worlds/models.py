@@ -12,6 +12,7 @@ import torch
 
 from regnf_core.errors import DatasetError
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_solid
 from regnf_data.worlds import seats, tables
 from regnf_data.worlds.mesh import Array, Mesh, standing
 from regnf_data.worlds.small_things import SMALL
@@ -122,5 +123,5 @@ def _from_file(rng: np.random.Generator, paths: Sequence[Path]) -> Model:
 
 @lru_cache(maxsize=256)
 def _read(path: Path) -> Mesh:
-    field = MeshField.load(path)
+    field, _ = load_solid(path)
     return Mesh(field.vertices, field.faces)

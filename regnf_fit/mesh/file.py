@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from regnf_core.errors import InvalidInputError
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_solid
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,14 @@ class MeshTarget:
 def mesh_target(mesh: Path, extent: float | None = None) -> MeshTarget:
     """The mesh in a file; with ``extent`` moved to the origin and scaled so that its longest edge has this length.
 
-    Raises InvalidInputError (NO_SURFACE_IN_TARGET), and what ``MeshField.load`` raises.
+    Faces are turned as an upload's are; the source's ``mesh_faces`` says what was done to them, if anything.
+    Raises what ``load_solid`` does.
     """
-    target = MeshField.load(mesh)
-    source: dict[str, Any] = {"mesh": mesh.name}
+    target, done = load_solid(mesh)
+    source: dict[str, Any] = {"mesh": mesh.name, **({"mesh_faces": list(done)} if done else {})}
     if extent is None:
         return MeshTarget(target, source)
     low, high = target.bounds.numpy()
-    if not (high > low).any():
-        raise InvalidInputError("the mesh is a single point", reason="NO_SURFACE_IN_TARGET")
     T_field_mesh = np.eye(4)
     T_field_mesh[:3, :3] *= extent / (high - low).max()
     T_field_mesh[:3, 3] = -T_field_mesh[0, 0] * (low + high) / 2

@@ -49,8 +49,8 @@ def test_inspect_refuses_what_is_no_field(content: bytes, reason: str, run: Run,
         (TRIANGLE, "field.safetensors", ["--label", "x" * 201], "INVALID_OPTIONS"),
         (TRIANGLE, "field.safetensors", ["--extent", "5"], "TARGET_OUTSIDE_GRID"),
         ("f 1 2 3\n", "field.safetensors", [], "MESH_INVALID"),
-        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", [], "NO_SURFACE_IN_TARGET"),
-        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", ["--extent", "1"], "NO_SURFACE_IN_TARGET"),
+        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", [], "MESH_INVALID"),
+        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "field.safetensors", ["--extent", "1"], "MESH_INVALID"),
     ],
 )
 def test_fit_refuses(mesh: str, output: str, more: list[str], reason: str, run: Run, tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ def test_a_layout_becomes_a_dataset(run: Run, tmp_path: Path) -> None:
         ("chest.ply", ["--meshes", "."], "INVALID_OPTIONS"),
         ("chest.ply", ["--trajectory", "single", "--frames", "2"], "DATASET_FRAMES_INVALID"),
         ("broken.glb", [], "MESH_INVALID"),
-        ("point.obj", [], "DATASET_NO_VIEW"),
+        ("point.obj", [], "MESH_INVALID"),
         ("room.json", [], "INVALID_OPTIONS"),
         ("room.json", ["--meshes", ".", "--trajectory", "single"], "INVALID_OPTIONS"),
         ("room.json", ["--meshes", ".", "--instance", "a"], "INVALID_OPTIONS"),

@@ -11,22 +11,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import igl
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from regnf_core.importing.families.winding import areas, places_before, winding_number
 from regnf_core.importing.meshes.geometry import Float64Array, Int64Array
 
 SAMPLES = 2_000
 """Places on the faces, and as many in the volume, where the winding number is asked for."""
-_BEFORE = 1e-4
-"""How far before its face a place lies, in the mesh's diagonals."""
 _CLOSED = 0.1
 """Free space this near to 0 counts as that round a closed mesh."""
-_INWARD = -0.6
+INWARD = -0.6
 """Below this, most faces look into a hollow: sheets that are open on one side have -0.5."""
 _FILLED, _WITHIN = 0.45, 0.05
 """A room's free space takes this share of its box, and this share of its faces lies ..."""
@@ -57,7 +55,7 @@ def facing_of(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing
         before = _winding_before(vertices, faces)
         return _seen_from_within(faces, before, "its outermost part encloses the rest and was turned to face it")
     free = float(np.median(before.values))
-    if free > _INWARD:
+    if free > INWARD:
         return _outward(faces, free)
     if asked == "object" or (asked is None and not _is_room(vertices, faces, before, free + 0.5)):
         turned = "its faces look inward and were turned round; if it is a room seen from within, say as: scene"
@@ -81,24 +79,11 @@ class _Before:
 
 
 def _winding_before(vertices: Float64Array, faces: Int64Array) -> _Before:
-    corner, first, second = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(first - corner, second - corner)
-    area = np.linalg.norm(normal, axis=1)
+    area = areas(vertices, faces)
     random = np.random.default_rng(0)
     face = random.choice(len(faces), SAMPLES, p=area / area.sum())
-    a, b = random.random((2, SAMPLES, 1))
-    a, b = np.where(a + b > 1.0, 1.0 - a, a), np.where(a + b > 1.0, 1.0 - b, b)
-    places = corner[face] + a * (first - corner)[face] + b * (second - corner)[face]
-    diagonal = np.linalg.norm(np.ptp(vertices, axis=0))
-    places = places + _BEFORE * diagonal * normal[face] / area[face, None]
-    return _Before(places, face, _winding(vertices, faces, places))
-
-
-def _winding(vertices: Float64Array, faces: Int64Array, places: Float64Array) -> Float64Array:
-    tree = igl.FastWindingNumberBVH()
-    tree.init(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
-    values: Float64Array = np.asarray(tree.winding_number(np.ascontiguousarray(places)), dtype=np.float64).reshape(-1)
-    return values
+    places = places_before(vertices, faces, face, random)
+    return _Before(places, face, winding_number(vertices, faces, places))
 
 
 def _outward(faces: Int64Array, free: float) -> Facing:
@@ -125,7 +110,7 @@ def _is_room(vertices: Float64Array, faces: Int64Array, before: _Before, level: 
     """Whether the free side fills the mesh's box, and faces stand in it: an empty box is an object turned round."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     probes = low + (high - low) * np.random.default_rng(1).random((SAMPLES, 3))
-    if (_winding(vertices, faces, probes) < level).mean() < _FILLED:
+    if (winding_number(vertices, faces, probes) < level).mean() < _FILLED:
         return False
     try:
         hull = ConvexHull(before.places)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,8 @@ from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
 from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.facing import SAMPLES, facing_of
+from regnf_core.importing.families.facing import SAMPLES, Asked, Facing, facing_of
+from regnf_core.importing.families.inverted_parts import PLACES, facing_outward
 from regnf_core.importing.families.orientation import agreeing
 from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
@@ -30,11 +32,10 @@ def mesh_field(
     require_family(overrides, family)
     refuse_other_entries(overrides, family)
     _check(geometry)
-    vertices, faces, kept = _welded(geometry.vertices, geometry.faces)
-    require_within(mesh_seconds(vertices, faces, 3 * SAMPLES), work_s)
-    faces, turned = agreeing(vertices.astype(np.float64), faces)
+    vertices, faces, kept = welded(geometry.vertices, geometry.faces)
+    require_within(mesh_seconds(vertices, faces, 3 * SAMPLES + PLACES), work_s)
     asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
-    facing = facing_of(vertices.astype(np.float64), faces, asked)
+    facing = oriented(vertices.astype(np.float64), faces, asked)
     faces = facing.faces
     low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
     diagonal = float(np.linalg.norm(high - low))
@@ -45,7 +46,6 @@ def mesh_field(
         "watertight"
         if loose == 0.0
         else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
-        *turned,
         *facing.why,
         *(f"ignored: {what}" for what in geometry.left_out),
     )
@@ -65,6 +65,14 @@ def mesh_field(
     return with_values(converted, lambda: None if colors is None else colors[kept].astype(np.float16))
 
 
+def oriented(vertices: Float64Array, faces: Int64Array, asked: Asked = None) -> Facing:
+    """The faces (F, 3) of welded triangles turned towards free space, as far as their places tell. vertices: (V, 3)."""
+    faces, agreed = agreeing(vertices, faces)
+    facing = facing_of(vertices, faces, asked)
+    faces, parts = facing_outward(vertices, facing.faces, facing.free)
+    return replace(facing, faces=faces, why=(*agreed, *facing.why, *parts))
+
+
 def _check(geometry: Geometry) -> None:
     if not np.isfinite(geometry.vertices).all() or np.abs(geometry.vertices).max(initial=0.0) > 1e30:
         raise malformed("the mesh has a vertex that is not a finite number")
@@ -72,7 +80,7 @@ def _check(geometry: Geometry) -> None:
         raise malformed("a face names a vertex that does not exist")
 
 
-def _welded(
+def welded(
     vertices: Float64Array, faces: Int64Array
 ) -> tuple[npt.NDArray[np.float32], Int64Array, npt.NDArray[np.int64]]:
     """Vertices at one place are one, those of no face and triangles without area are dropped.
