@@ -169,7 +169,7 @@ class _Batch:
 
     def _seen(self, detection: OrientedBox) -> SceneView:
         """On the device that the work is done on."""
-        view = view_scene(self.scene, detection, self.options.robust, self.seed)
+        view = view_scene(self.scene, detection, self.options.robust)
         return view.to(working_device(self.scene))
 
     def _model(self, o: int) -> ObjectModel:

@@ -93,7 +93,7 @@ def search_library(
     run = Run(progress)
     models = [one.model for one in library]
     with run.phase("sampling"):
-        query = LibraryQuery(scene, view_scene(scene, detection, options.robust, seed), options, seed)
+        query = LibraryQuery(scene, view_scene(scene, detection, options.robust), options, seed)
     with run.phase("initializing"):
         nearest = rank_by_signature(query.view, models)
         coarse = match_coarsely(query, models, [number for number, _ in nearest])

@@ -106,10 +106,10 @@ def _search(setting: _Setting, seed: int) -> tuple[Sim3, dict[str, Any]]:
 
 def _problem(case: Case, options: RegistrationOptions, seed: int) -> tuple[RegistrationProblem, torch.Generator]:
     generator = torch.Generator().manual_seed(seed)
-    view = view_scene(case.scene, case.detection, options.robust, seed)
+    view = view_scene(case.scene, case.detection, options.robust)
     obj = CountingField(case.obj)
     model = model_object(obj, options.robust)
-    return make_problem(view, model, CountingField(case.scene), obj, options.robust, generator), generator
+    return make_problem(view, model, CountingField(case.scene), obj, options.robust), generator
 
 
 def _lost_by(found: dict[str, Any], verdict: str) -> str:

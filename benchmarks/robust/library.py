@@ -109,7 +109,7 @@ def _search(kind: str, pair: Pair, library: dict[str, LibraryObject], size: int,
         "seed": seed,
         "size": size,
         "place": place,
-        "signature_place": _signature_place(case, pair, some, seed),
+        "signature_place": _signature_place(case, pair, some),
         "seconds": seconds,
         "seconds_one": alone,
         "times_one": seconds / alone,
@@ -122,8 +122,8 @@ def _missed(found: LibrarySearch) -> Run:
     return {"verdict": str(first.verdict), "reason": str(first.verdict_reason), "category": "another object first"}
 
 
-def _signature_place(case: Case, pair: Pair, some: Sequence[LibraryObject], seed: int) -> int:
-    view = view_scene(case.scene, case.detection, ROBUST.robust, seed)
+def _signature_place(case: Case, pair: Pair, some: Sequence[LibraryObject]) -> int:
+    view = view_scene(case.scene, case.detection, ROBUST.robust)
     order = rank_by_signature(view, [one.model for one in some])
     return 1 + [some[number].name for number, _ in order].index(pair.instance)
 

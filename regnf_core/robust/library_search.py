@@ -92,7 +92,7 @@ def refine_match(
     """Refine the poses of one match on the fields, and evaluate them. Raises InvalidInputError (FIELD_NOT_FINITE)."""
     counted_scene, counted_object = CountingField(query.scene), CountingField(obj)
     generator = torch.Generator().manual_seed(query.seed)
-    problem = make_problem(query.view, model, counted_scene, counted_object, query.options.robust, generator)
+    problem = make_problem(query.view, model, counted_scene, counted_object, query.options.robust)
     refined = refine_poses(problem, match.poses, generator, on_step)
     evaluation = evaluate_candidates(problem, refined, query.options)
     return RefinedMatch(match.number, problem, evaluation, counted_scene.evaluations + counted_object.evaluations)

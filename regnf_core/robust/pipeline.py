@@ -27,6 +27,7 @@ from regnf_core.robust.refine.coarse_to_fine import Descent, RefinementContext, 
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.report import result_of
 from regnf_core.robust.residuals import SurfacePair
+from regnf_core.robust.samples import fixed_generator
 from regnf_core.robust.scene.scene_view import SceneView, view_scene
 from regnf_core.robust.search.features import feature_seeds
 from regnf_core.robust.search.pose_bound import PoseBound
@@ -65,7 +66,7 @@ def register_robust(
 ) -> RegistrationResult:
     """T_object_scene from two fields and a box, with a verdict, all equivalent poses and a covariance.
 
-    ``scene_view`` saves making one; it must be of this scene, box, options and seed.
+    ``scene_view`` saves making one; it must be of this scene, box and options.
     The work is done on the device of the scene's field. Random numbers are drawn on the CPU, whatever the device.
     Deterministic for a seed, on one machine and with the same number of threads.
     Raises InvalidDetectionError, NoSurfaceError, InvalidInputError (FIELD_NOT_FINITE).
@@ -74,9 +75,9 @@ def register_robust(
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
     with run.phase("sampling"):
-        view = scene_view or view_scene(scene_field, detection, options.robust, seed)
+        view = scene_view or view_scene(scene_field, detection, options.robust)
         model = known.object_model or model_object(obj, options.robust)
-        problem = make_problem(view, model, scene, obj, options.robust, generator)
+        problem = make_problem(view, model, scene, obj, options.robust)
     best = _best_attempt(problem, options, seed, run, generator, known.T_object_scene)
     evaluations = view.evaluations + scene.evaluations + obj.evaluations
     return result_of(problem, best, options, seed, evaluations)
@@ -130,8 +131,8 @@ def refine_poses(
     """
     start = refinement_start(problem, T, generator, on_step)
     found = coarse_to_fine(start.surfaces, start.candidates, REFINEMENT.stages, start.context)
-    joined = with_equivalents(problem, found)
-    return coarse_to_fine(start.surfaces, joined, REFINEMENT.last_stages, start.context)
+    last = last_descent(problem, start, found)
+    return coarse_to_fine(last.surfaces, last.candidates, REFINEMENT.last_stages, last.context)
 
 
 def refinement_start(
@@ -152,7 +153,14 @@ def refinement_start(
     return Descent(problem.fit, start, context)
 
 
-def with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
+def last_descent(problem: RegistrationProblem, start: Descent, found: PoseCandidates) -> Descent:
+    """What the last stages begin with: what was found and its equivalents. Their samples are the same for every seed:
+    the same optimum is met at the same place."""
+    context = replace(start.context, generator=fixed_generator())
+    return Descent(start.surfaces, _with_equivalents(problem, found), context)
+
+
+def _with_equivalents(problem: RegistrationProblem, found: PoseCandidates) -> PoseCandidates:
     """The candidates, and the best one's symmetry equivalents that are not among them."""
     equivalents = _missing_equivalents(found.T, problem.model.symmetry, problem.model.extremal_points)
     origins = torch.arange(len(found) + len(equivalents), device=found.scores.device)

@@ -12,7 +12,7 @@ from regnf_core.options import RobustOptions
 from regnf_core.robust.devices import working_device
 from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.samples import split
+from regnf_core.robust.samples import fixed_generator, split
 from regnf_core.robust.scene.scene_view import SceneView
 from regnf_core.robust.search.pose_bound import PoseBound
 from regnf_core.robust.search.scale_bound import ScaleBound
@@ -54,14 +54,15 @@ def make_problem(
     scene: SdfField,
     obj: SdfField,
     options: RobustOptions,
-    generator: torch.Generator,
 ) -> RegistrationProblem:
     """Divide the samples of both surfaces into those to fit and those to hold out, on the device of the scene's field.
 
+    The same at every call: seeds of registrations do not move what a pose is judged by.
     An object's field on another device is evaluated there, with a copy of each point and each value.
     """
     device = working_device(scene)
     view, model = view.to(device), model.to(device)
+    generator = fixed_generator()
     A, A_held = split(view.foreground, options.held_out_share, generator)
     B, B_held = split(model.samples, options.held_out_share, generator)
     scene_field, object_field = view.field(scene), model.field(obj)

@@ -62,6 +62,11 @@ class Samples:
         return self.points - self.values.unsqueeze(-1) * self.normals
 
 
+def fixed_generator() -> torch.Generator:
+    """A new generator for what is the same in every registration, whatever its seed."""
+    return torch.Generator().manual_seed(0)
+
+
 def subsample(samples: Samples, limit: int, generator: torch.Generator) -> Samples:
     """At most ``limit`` of the samples, at random: drawn on the CPU, so that a seed means the same on every device."""
     if len(samples) <= limit:

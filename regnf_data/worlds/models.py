@@ -8,10 +8,8 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from regnf_core.errors import DatasetError
-from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.mesh_file import load_solid
 from regnf_data.worlds import seats, tables
 from regnf_data.worlds.mesh import Array, Mesh, standing
@@ -23,7 +21,10 @@ BIG_M = 0.62
 _LARGEST_M, _SMALLEST_M = 2.7, 0.05
 _FORMATS = (".glb", ".ply", ".obj", ".stl")
 _SAMPLES = 2500
-_OUTWARD = 1e-3
+_OUTWARD = 1e-4
+"""Diagonals from a face at which a ray begins."""
+_RAYS = 48
+"""From each point, in all directions."""
 _BIG = (
     (seats.chair, 0.42), (seats.stool, 0.08), (seats.sofa, 0.08), (tables.table, 0.17), (tables.desk, 0.06),
     (tables.shelf, 0.1), (tables.cabinet, 0.09),
@@ -43,19 +44,21 @@ class Model:
         return float(np.linalg.norm(self.mesh.size)) >= BIG_M
 
     @cached_property
-    def field(self) -> MeshField:
-        """Its exact distance."""
-        return MeshField(self.mesh.vertices, self.mesh.faces)
-
-    @cached_property
     def surface(self) -> Array:
-        """(N, 3): points even over what can be seen from outside; parts that overlap hide some of each other."""
+        """(N, 3): points even over what can be seen from outside; parts that overlap hide some of each other.
+
+        Seen is a point from which a ray leaves the mesh, from either side of its face: sheets and parts that are inside
+        out are seen as cameras see them.
+        """
         rng = np.random.default_rng(0)
         points, normals = self.mesh.sample(_SAMPLES, rng)
+        directions = rng.normal(size=(len(points), _RAYS, 3))
+        side = np.sign((directions * normals[:, None]).sum(axis=-1, keepdims=True))
         step = _OUTWARD * float(np.linalg.norm(self.mesh.size))
-        sides = [self.field.signed_distance(torch.from_numpy(points + s * step * normals)).numpy() for s in (-1, 1)]
-        outside: Array = points[(np.maximum(*sides) > 0.0) & (np.minimum(*sides) < 0.5 * step)]
-        return outside if len(outside) >= 100 else points
+        origins = points[:, None] + step * side * normals[:, None]
+        left = ~np.isfinite(self.mesh.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)))
+        seen: Array = points[left.reshape(len(points), _RAYS).any(axis=1)]
+        return seen
 
     @cached_property
     def diameter(self) -> float:

@@ -1,7 +1,7 @@
-"""Parts of a mesh whose faces look into them: the rest of the mesh faces free space, and these parts would be no matter.
+"""Parts of a mesh whose faces look into them, while those of the rest face free space: they would be no matter.
 
-Free space has the same generalized winding number everywhere, and matter has more. Less than that of free space is found
-within such a part alone: a leg of a chair that was mirrored, a blade that was exported the wrong way round.
+Free space has the same generalized winding number everywhere, and matter has more. Less than that of free space is
+found within such a part alone: a leg of a chair that was mirrored, a blade that was exported the wrong way round.
 """
 
 from __future__ import annotations

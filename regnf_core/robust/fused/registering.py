@@ -20,10 +20,10 @@ from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.pipeline import (
     Start,
     evaluate_with,
+    last_descent,
     refinement_start,
     search_start,
     starts_of,
-    with_equivalents,
 )
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine.coarse_to_fine import Descent
@@ -76,7 +76,7 @@ def register_together(
 def _lane(scene: SdfField, pair: SampledPair, options: RegistrationOptions, seed: int) -> _Lane:
     generator = torch.Generator().manual_seed(seed)
     counts = CountingField(scene), CountingField(pair.obj)
-    problem = make_problem(pair.view, pair.model, *counts, options.robust, generator)
+    problem = make_problem(pair.view, pair.model, *counts, options.robust)
     return _Lane(problem, generator, starts_of(problem, options, seed, generator, None), counts)
 
 
@@ -125,7 +125,7 @@ def _refined(
     for number in whole:
         one, start = found[number], starts[number]
         assert isinstance(one, PoseCandidates)
-        joined.append(Descent(start.surfaces, with_equivalents(lanes[number].problem, one), start.context))
+        joined.append(last_descent(lanes[number].problem, start, one))
     last = _Progress(run, "optimizing", middle, STARTS["verifying"])
     ends = all_coarse_to_fine(joined, REFINEMENT.last_stages, sizes, last)
     for number, end in zip(whole, ends, strict=True):

@@ -16,13 +16,11 @@ from regnf_core.robust.model.extremal_points import extremal_points
 from regnf_core.robust.model.hull import Hull
 from regnf_core.robust.model.self_symmetry import SelfSymmetry, confirm_symmetries, propose_symmetries
 from regnf_core.robust.model.signature import signature
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.samples import Samples, fixed_generator
 from regnf_core.robust.sampling import sample_object_surface
 from regnf_core.robust.search.distance_grid import DistanceGrid, distance_grid
 from regnf_core.robust.search.rotations import super_fibonacci
 from regnf_core.robust.working_frame import WorkingField, WorkingFrame
-
-_SEED = 0  # an object's model is the same for every registration
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +78,7 @@ def model_object(obj: SdfField, options: RobustOptions | None = None) -> ObjectM
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     options = options or RobustOptions()
-    generator = torch.Generator().manual_seed(_SEED)
+    generator = fixed_generator()
     sampled = sample_object_surface(obj, options.object_samples, generator)
     samples = sampled.samples
     outermost = extremal_points(samples.on_surface(), MODEL.extremal_points)

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.constants import SIGNATURE
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.samples import Samples, fixed_generator
 
-_SEED = 0
 _FEATURE_BINS = SIGNATURE.feature_distance_bins * SIGNATURE.angle_bins**3
 SIGNATURE_LENGTH = SIGNATURE.distance_bins + _FEATURE_BINS
 
@@ -25,7 +24,7 @@ def signature(samples: Samples) -> Tensor:
     Hellinger distances.
     """
     points, normals = samples.on_surface(), samples.normals
-    generator = torch.Generator().manual_seed(_SEED)
+    generator = fixed_generator()
     i, j = torch.randint(len(samples), (2, SIGNATURE.pairs), generator=generator)
     line = points[j] - points[i]
     length = line.norm(dim=-1)

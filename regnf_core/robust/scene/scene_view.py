@@ -14,7 +14,7 @@ from regnf_core.fields.observation import observation_of
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import REFINEMENT, SCENE
-from regnf_core.robust.samples import Samples, UnobservedTest
+from regnf_core.robust.samples import Samples, UnobservedTest, fixed_generator
 from regnf_core.robust.sampling import SampledField, sample_scene_surface
 from regnf_core.robust.scene.occlusion_boundary import occlusion_boundary
 from regnf_core.robust.scene.smoothing import smooth
@@ -70,13 +70,13 @@ class SceneView:
         return distance_grid(self.foreground, self.spacing)
 
 
-def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions, seed: int) -> SceneView:
+def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) -> SceneView:
     """Sample the scene's surface in the box; remove floors, walls, occlusion boundaries and unobserved surface.
 
-    Deterministic for ``seed``. Raises InvalidDetectionError (DETECTION_OUTSIDE_SCENE), NoSurfaceError
-    (NO_SURFACE_IN_DETECTION), InvalidInputError (FIELD_NOT_FINITE).
+    The same at every call: seeds of registrations do not move the samples. Raises InvalidDetectionError
+    (DETECTION_OUTSIDE_SCENE), NoSurfaceError (NO_SURFACE_IN_DETECTION), InvalidInputError (FIELD_NOT_FINITE).
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = fixed_generator()
     counted = CountingField(scene)
     sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
     removed, unobserved = _unobserved_surface(counted, sampled, generator)

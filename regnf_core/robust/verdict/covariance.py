@@ -21,10 +21,10 @@ from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.kernel import geman_mcclure_curvature, geman_mcclure_weight
 from regnf_core.robust.refine.loss import kernel_widths, offset_prior
 from regnf_core.robust.residuals import Residuals
+from regnf_core.robust.samples import fixed_generator
 from regnf_core.robust.working_frame import WorkingFrame
 
 _TINY = COVARIANCE.regularization
-_SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ def _inliers(r: Residuals, width: float, points: Tensor) -> _Inliers:
     agreeing = (weights > COVARIANCE.min_weight).nonzero().squeeze(-1)
     if len(agreeing) < 2 * r.jacobian.shape[-1]:  # hardly any sample agrees: all of them count
         agreeing = torch.arange(total)
-    generator = torch.Generator().manual_seed(_SEED)
+    generator = fixed_generator()
     few = agreeing[torch.randperm(len(agreeing), generator=generator)[: COVARIANCE.propagated_samples]]
     weights = weights * share
     curvatures = geman_mcclure_curvature(values, widths, weights)

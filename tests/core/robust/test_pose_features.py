@@ -25,8 +25,8 @@ NO_OFFSET = torch.zeros(1, dtype=torch.float64)
 def problem() -> RegistrationProblem:
     """A chair in a room, both exact."""
     scene, obj = room(chair_pose()), chair()
-    view = view_scene(scene, detection(), OPTIONS, 0)
-    return make_problem(view, model_object(obj, OPTIONS), scene, obj, OPTIONS, torch.Generator().manual_seed(0))
+    view = view_scene(scene, detection(), OPTIONS)
+    return make_problem(view, model_object(obj, OPTIONS), scene, obj, OPTIONS)
 
 
 def features_at(problem: RegistrationProblem, T: Sim3) -> dict[str, float]:
