@@ -14,7 +14,7 @@ from regnf_core.registration import WarmStart, register
 from regnf_core.result import RegistrationResult
 from regnf_core.robust import pipeline
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from tests.core.analytic import chair, chair_pose, room, table
+from tests.core.analytic import AnalyticField, chair, chair_pose, room, table
 from tests.core.robust.shapes import (
     ROBUST,
     can,
@@ -194,3 +194,15 @@ def test_with_an_up_axis_only_turns_about_it_are_searched() -> None:
 def perturbed(T: Sim3, step: torch.Tensor) -> Sim3:
     moved = T[None].perturb(step[None].double())
     return Sim3(moved.scale[0], moved.rotation[0], moved.translation[0])
+
+
+def test_other_seeds_meet_the_same_optimum_at_the_same_place() -> None:
+    """In a scene whose errors differ from place to place, so that other samples would have another optimum."""
+    exact = room(chair_pose())
+    rough = AnalyticField(lambda points: exact.formula(points) + 0.012 * torch.sin(11.0 * points).prod(-1), exact.bounds.tolist())
+    results = [register(rough, chair(), detection(), ROBUST, seed=seed, clouds=False) for seed in range(3)]
+    assert [result.verdict for result in results] == ["registered"] * 3
+    first, *others = (result.T_object_scene.matrix() for result in results)
+    assert float((first - torch.eye(4)).abs().max()) > 0.1
+    for other in others:
+        torch.testing.assert_close(other, first, atol=1e-4, rtol=0.0)
