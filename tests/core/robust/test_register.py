@@ -199,10 +199,11 @@ def perturbed(T: Sim3, step: torch.Tensor) -> Sim3:
 def test_other_seeds_meet_the_same_optimum_at_the_same_place() -> None:
     """In a scene whose errors differ from place to place, so that other samples would have another optimum."""
     exact = room(chair_pose())
-    rough = AnalyticField(lambda points: exact.formula(points) + 0.012 * torch.sin(11.0 * points).prod(-1), exact.bounds.tolist())
+    bounds = exact.bounds.tolist()
+    rough = AnalyticField(lambda points: exact.formula(points) + 0.008 * torch.sin(17.0 * points).prod(-1), bounds)
     results = [register(rough, chair(), detection(), ROBUST, seed=seed, clouds=False) for seed in range(3)]
     assert [result.verdict for result in results] == ["registered"] * 3
     first, *others = (result.T_object_scene.matrix() for result in results)
     assert float((first - torch.eye(4)).abs().max()) > 0.1
     for other in others:
-        torch.testing.assert_close(other, first, atol=1e-4, rtol=0.0)
+        torch.testing.assert_close(other, first, atol=5e-5, rtol=0.0)
