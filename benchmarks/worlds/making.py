@@ -91,36 +91,8 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
     # As many scenes stay in their own frame as do not.
     T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
     maker = ObjectMaker(world, seen, home, task.objects)
-    cases = []
     chosen = _chosen(world, seen, task.length, rng)
-    for number in chosen:
-        placed = world.things[number]
-        assert placed.model is not None
-        T_object_model = similarity(rng, _SCALES)
-        kind = maker.make(number, len(cases), rng)
-        T_fused_room, spread = np.eye(4), 0.0
-        if task.scene in FROM_IMAGES:
-            points = _in_room(placed)
-            T_fused_room, spread = seen.taken.carried(number, points)
-        T_fused_model = T_fused_room @ placed.T_room_model
-        box = draw_box(placed.model.surface @ T_fused_model[:3, :3].T + T_fused_model[:3, 3], T_fused_model, rng)
-        cases.append(
-            {
-                "name": placed.model.name,
-                "field": kind,
-                "seen": float((seen.taken.seen[number] > 0).mean()),
-                "diameter_m": placed.model.diameter,
-                "voxels_across": placed.model.diameter / seen.fusion.voxel_m,
-                "drift_spread": spread / placed.model.diameter,
-                "T_object_scene": (T_object_model @ np.linalg.inv(T_scene_room @ T_fused_model)).tolist(),
-                "T_object_model": T_object_model.tolist(),
-                "detection": {
-                    "center": box.center.tolist(),
-                    "size": box.size.tolist(),
-                    "rotation": box.rotation.tolist(),
-                },
-            }
-        )
+    cases = [_case(task.scene, maker, case, number, T_scene_room, rng) for case, number in enumerate(chosen)]
     return {
         "seed": world.seed,
         "kind": world.kind,
@@ -133,6 +105,32 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
         "T_scene_room": T_scene_room.tolist(),
         "things": [placed.model.name for placed in world.things if placed.model is not None],
         "cases": cases,
+    }
+
+
+def _case(
+    scene: Scene, maker: ObjectMaker, case: int, number: int, T_scene_room: Array, rng: np.random.Generator
+) -> dict[str, Any]:
+    """What ``world.json`` says of case number ``case``, the thing of this ``number``; writes the object's field."""
+    placed, seen = maker.world.things[number], maker.seen
+    assert placed.model is not None
+    T_object_model = similarity(rng, _SCALES)
+    kind = maker.make(number, case, rng)
+    T_fused_room, spread = np.eye(4), 0.0
+    if scene in FROM_IMAGES:
+        T_fused_room, spread = seen.taken.carried(number, _in_room(placed))
+    T_fused_model = T_fused_room @ placed.T_room_model
+    box = draw_box(placed.model.surface @ T_fused_model[:3, :3].T + T_fused_model[:3, 3], T_fused_model, rng)
+    return {
+        "name": placed.model.name,
+        "field": kind,
+        "seen": float((seen.taken.seen[number] > 0).mean()),
+        "diameter_m": placed.model.diameter,
+        "voxels_across": placed.model.diameter / seen.fusion.voxel_m,
+        "drift_spread": spread / placed.model.diameter,
+        "T_object_scene": (T_object_model @ np.linalg.inv(T_scene_room @ T_fused_model)).tolist(),
+        "T_object_model": T_object_model.tolist(),
+        "detection": {"center": box.center.tolist(), "size": box.size.tolist(), "rotation": box.rotation.tolist()},
     }
 
 

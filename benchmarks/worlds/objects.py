@@ -39,14 +39,14 @@ class ObjectMaker:
     """Makes the objects of one world. wanted: all of one kind; None: of any, as a seed draws."""
 
     def __init__(self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None) -> None:
-        self._world, self._seen, self._home, self._wanted = world, seen, home, wanted
+        self.world, self.seen, self._home, self._wanted = world, seen, home, wanted
 
     def make(self, thing: int, case: int, rng: np.random.Generator) -> ObjectKind:
         """Write the field of a thing as case number ``case``, and its mesh. Returns which kind it came to be.
 
         Fields are in the model's frame, but those that are cut: these are in the room's.
         """
-        placed = self._world.things[thing]
+        placed = self.world.things[thing]
         assert placed.model is not None
         model = placed.model
         drawn = OBJECT_KINDS[int(rng.choice(3, p=_SHARES))] if self._wanted is None else self._wanted
@@ -54,7 +54,7 @@ class ObjectMaker:
         kind: ObjectKind = "mesh"
         extra: dict[str, Array] = {}
         if drawn == "orbit":
-            _fused_orbit(model, rng, path, self._seen.rendered)
+            _fused_orbit(model, rng, path, self.seen.rendered)
             kind = "orbit"
         elif drawn == "cut":
             bounds = self._cut(thing, path)
@@ -76,7 +76,7 @@ class ObjectMaker:
         other = self._other
         if other is None or (other.taken.seen[thing] > 0).mean() < _LEAST_SEEN:
             return None
-        placed = self._world.things[thing]
+        placed = self.world.things[thing]
         assert placed.model is not None
         points = placed.model.surface @ placed.T_room_model[:3, :3].T + placed.T_room_model[:3, 3]
         T, _ = other.taken.carried(thing, points)
@@ -101,7 +101,7 @@ class ObjectMaker:
     def _other(self) -> Seen | None:
         """A long walk that is not the scene's."""
         try:
-            return see(self._world, "long", self._seen.rendered, again=1)
+            return see(self.world, "long", self.seen.rendered, again=1)
         except RegnfError:
             return None
 
