@@ -2,6 +2,7 @@
 
 Free space has the same generalized winding number everywhere, and matter has more. Less than that of free space is
 found within such a part alone: a leg of a chair that was mirrored, a blade that was exported the wrong way round.
+Only parts that are closed, or nearly so, can tell: sheets that were scanned from one side may face each other.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ _MOST = 300
 """Parts that are looked at, the largest ones."""
 _PLACES = 9
 """On each of them, where the winding number is asked for."""
+_CLOSED = -0.9
+"""A part is closed if its faces look at no more than this of their own winding number."""
 _FEW = 0.002
 """Share of the area: less is not worth a change."""
 _ROUNDS = 2
@@ -47,10 +50,12 @@ def facing_outward(vertices: Float64Array, faces: Int64Array, free: float) -> tu
 
     def inward(turned: BoolArray) -> BoolArray:
         found = np.zeros(len(sizes), bool)
-        found[looked_at] = _look_at_less(vertices, with_turned(turned), drawn, free)
+        found[looked_at] = _before(vertices, with_turned(turned), drawn) < free + INWARD
         return found
 
     turned = _to_turn(inward, len(sizes))
+    for number in turned.nonzero()[0]:
+        turned[number] = _looks_into_itself(vertices, faces[part == number])
     share = float(sizes[turned].sum() / sizes.sum())
     if share <= _FEW:
         return faces, ()
@@ -86,9 +91,14 @@ def _drawn(part: Int64Array, area: Float64Array, looked_at: Int64Array) -> Int64
     return found
 
 
-def _look_at_less(vertices: Float64Array, faces: Int64Array, drawn: Int64Array, free: float) -> BoolArray:
-    """(P,): whether most of the drawn faces (P, K) of a part look at less than free space."""
+def _before(vertices: Float64Array, faces: Int64Array, drawn: Int64Array) -> Float64Array:
+    """(P,): the median winding number before the drawn faces (P, K) of each part."""
     places = places_before(vertices, faces, drawn.reshape(-1), np.random.default_rng(1))
-    before = winding_number(vertices, faces, places).reshape(drawn.shape)
-    found: BoolArray = np.median(before, axis=1) < free + INWARD
-    return found
+    median: Float64Array = np.median(winding_number(vertices, faces, places).reshape(drawn.shape), axis=1)
+    return median
+
+
+def _looks_into_itself(vertices: Float64Array, faces: Int64Array) -> bool:
+    """Whether these faces (F, 3) are a closed part, or nearly so, and look into it."""
+    chosen = np.linspace(0, len(faces) - 1, _PLACES).round().astype(np.int64)
+    return bool(_before(vertices, faces, chosen[None])[0] < _CLOSED)

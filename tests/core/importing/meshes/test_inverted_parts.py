@@ -78,3 +78,19 @@ def test_a_sheet_keeps_its_faces() -> None:
     given = together(sheet, flat)
     found = converted(given)
     assert not any("turned round" in why for why in found.why)
+
+
+def facing(mesh: trimesh.Trimesh, axis: int, sign: int) -> trimesh.Trimesh:
+    """Of a mesh the faces that look along an axis or against it, as a sheet."""
+    kept = mesh.faces[sign * mesh.face_normals[:, axis] > 0.9]
+    return trimesh.Trimesh(mesh.vertices, kept, process=False)
+
+
+def test_sheets_that_face_each_other_keep_their_faces() -> None:
+    """Two boards of a shelf in a scanned room, each seen from the space between them alone."""
+    shell = parts(ROOM)
+    shell.invert()
+    lower, upper = parts([[0.02, 1.0, 0.3], [0.6, 2.0, 0.32]]), parts([[0.02, 1.0, 0.4], [0.6, 2.0, 0.42]])
+    found = converted(together(shell, parts(*TABLE), facing(lower, 2, 1), facing(upper, 2, -1)), **{"as": "scene"})
+    assert not any("turned round" in why for why in found.why)
+    assert distance(found, np.array([[0.3, 1.5, 0.36]]))[0] == pytest.approx(0.04, abs=1e-6)
