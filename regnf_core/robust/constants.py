@@ -403,12 +403,11 @@ class VerdictConstants:
     """Shares for each diameter of noise, less. [main pairs]"""
     unexplained: float = 0.03
     """Share of unexplained surface near the object without noise. [early fits]"""
-    unexplained_per_noise: float = 20.0
-    """Shares for each diameter of noise, in addition: fits to images invent surface that nobody saw. [early fits]"""
     unexplained_observed: float = 0.05
     """The same for scenes with an observation: what was measured is there. [early fits]"""
-    unexplained_observed_per_noise: float = 4.0
-    """The same for scenes with an observation. [early fits]"""
+    unexplained_per_noise: float = 20.0
+    """Shares for each diameter of noise, in addition: fits to images invent surface that nobody saw, and where a map is
+    noisy, what lies on the object cannot be told from a part of another one. [early fits; random worlds]"""
     rough: float = 0.022
     """Normal roughness from which a field counts as rough. [early fits]"""
     rough_score: float = 0.5

@@ -136,8 +136,6 @@ def _of_observed_surface(evidence: Evidence, index: int, options: RobustOptions)
 def _unexplained(evidence: Evidence, index: int, unexplained: float) -> _Criterion:
     """Surface near the object that is no part of it: more is allowed where surface may never have been observed."""
     noise = float(evidence.residual_rms[index])
-    if evidence.partial:
-        allowed = VERDICT.unexplained_observed + VERDICT.unexplained_observed_per_noise * noise
-    else:
-        allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * noise
+    without_noise = VERDICT.unexplained_observed if evidence.partial else VERDICT.unexplained
+    allowed = without_noise + VERDICT.unexplained_per_noise * noise
     return _Criterion("SURFACE_UNEXPLAINED", allowed - unexplained)

@@ -110,8 +110,8 @@ def test_joined_surface_is_allowed_by_the_noise_and_by_what_was_measured() -> No
     assert (outcome.verdict, outcome.reason) == ("rejected", "SURFACE_UNEXPLAINED")
     assert outcome.margin == pytest.approx(0.03 + 20 * 0.002 - 0.1, abs=1e-6)
     seen = replace(found, partial=True)
-    assert verdict_on(seen, unexplained=0.057).verdict == "registered"  # 0.05 + 4 * 0.002
-    assert verdict_on(seen, unexplained=0.059).verdict == "rejected"
+    assert verdict_on(seen, unexplained=0.089).verdict == "registered"  # 0.05 + 20 * 0.002
+    assert verdict_on(seen, unexplained=0.091).verdict == "rejected"
 
 
 def test_joined_surface_is_not_forgiven_for_roughness() -> None:
