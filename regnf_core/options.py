@@ -130,7 +130,7 @@ class RobustOptions:
     seen from one side only. null: unknown."""
     max_scale: _Scale = None
     """Maximum scale factor of T_object_scene; see ``min_scale``. Where both are the same number, the scale is fixed."""
-    held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.3
+    held_out_share: Annotated[float, Gt(0), Le(0.5)] = 0.5
     """Share (0..1) of the samples that are held out from the refinement, for the verdict. More make the verdict more
     reliable and the pose less accurate."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
