@@ -95,6 +95,8 @@ def _fit_mesh(
     if table_log2 is not None:
         options = replace(options, grid=replace(options.grid, log2_table_size=table_log2))
     target = mesh_target(mesh, extent)
+    for done in target.source.get("mesh_faces", ()):
+        err.print(f"{mesh.name}: {done}", markup=False, soft_wrap=True)
     _fit_with_bar(fit_field, target.field, output, options, rest | {"source": target.source})
 
 

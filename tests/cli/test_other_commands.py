@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+import trimesh
 from redis.exceptions import ConnectionError as RedisConnectionError
 
 from regnf_core import __version__
@@ -83,3 +84,16 @@ def test_a_worker_without_its_redis_is_unavailable(run: Run, monkeypatch: pytest
     outcome = run("worker", "--redis-url", "redis://127.0.0.1:9/0")
     assert outcome.code == 3
     assert outcome.stderr.startswith("REDIS_UNAVAILABLE ")
+
+
+def test_a_fit_says_which_faces_it_turned(run: Run, tmp_path: Path) -> None:
+    leg = trimesh.creation.box(bounds=[[-0.2, -0.2, -1.0], [0.2, 0.2, 0.7]])
+    leg.invert()
+    top = trimesh.creation.box(bounds=[[-1.0, -1.0, 0.8], [1.0, 1.0, 1.0]])
+    trimesh.util.concatenate([top, leg]).export(tmp_path / "table.ply")
+    outcome = run(
+        "fit", tmp_path / "table.ply", tmp_path / "field.safetensors", "--iterations", "1", "--table-log2", "10"
+    )
+    assert outcome.code == 0, outcome.stderr
+    assert "table.ply: " in outcome.stderr
+    assert "turned round" in outcome.stderr
