@@ -59,7 +59,7 @@ def load_thing(path: str | os.PathLike[str], T_scene_mesh: ArrayLike | None = No
     import trimesh
 
     matrix = np.eye(4) if T_scene_mesh is None else np.asarray(T_scene_mesh, dtype=np.float64)
-    solid = load_solid(path)[0].transformed(matrix)  # refuses what is malformed
+    solid = load_solid(path, "object")[0].transformed(matrix)  # refuses what is malformed
     scene = trimesh.load_scene(os.fspath(path), process=False)
     meshes = tuple(
         PaintedMesh(

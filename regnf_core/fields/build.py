@@ -105,4 +105,4 @@ def _build_kind(description: FieldDescription, tensors: Mapping[str, Tensor], co
         case VoxelBlocksDescription():
             return build_voxel_blocks(description, tensors, colors.get(VALUES))
         case _:
-            raise NotImplementedError(f"no evaluator for fields of the class {type(description).__name__}")
+            raise TypeError(f"no evaluator for fields of the class {type(description).__name__}")

@@ -126,5 +126,5 @@ def _from_file(rng: np.random.Generator, paths: Sequence[Path]) -> Model:
 
 @lru_cache(maxsize=256)
 def _read(path: Path) -> Mesh:
-    field, _ = load_solid(path)
+    field, _ = load_solid(path, "object")
     return Mesh(field.vertices, field.faces)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from PIL import Image
 
 from benchmarks.simple_meshes import revolved
 from regnf_core.fields.mesh import MeshField
-from regnf_data.mesh_scene import MeshScene, PaintedMesh, Thing, box_thing
+from regnf_data.mesh_scene import MeshScene, PaintedMesh, Thing, box_thing, load_thing
 from regnf_data.paint import TexturePaint, TilePaint, VertexPaint, paint_of, to_linear, to_srgb
 from regnf_data.rendering import Shading, intrinsics_of, render
 from regnf_data.trajectories import look_at
@@ -114,3 +115,15 @@ def test_srgb_there_and_back() -> None:
     every = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(to_srgb(to_linear(every)), every)
     assert to_linear(np.array([188]))[0] == pytest.approx(0.503, abs=1e-3)  # the well-known middle gray of light
+
+
+def test_a_thing_that_is_inside_out_and_holds_another_is_no_room(tmp_path: Path) -> None:
+    """A refrigerator with its faces turned round: free space is outside of it, so cameras may stand there."""
+    parts = [trimesh.creation.box(extents=[size] * 3) for size in (1.0, 0.4)]
+    parts[1].invert()
+    mesh = trimesh.util.concatenate(parts)
+    mesh.invert()
+    mesh.export(tmp_path / "refrigerator.ply")
+    thing = load_thing(tmp_path / "refrigerator.ply")
+    distance = thing.solid.signed_distance(torch.tensor([[0.7, 0.0, 0.0], [0.35, 0.0, 0.0]]))
+    np.testing.assert_allclose(distance, [0.2, -0.15], atol=1e-6)

@@ -23,7 +23,8 @@ _MOST = 300
 _PLACES = 9
 """On each of them, where the winding number is asked for."""
 _CLOSED = -0.9
-"""A part is closed if its faces look at no more than this of their own winding number."""
+"""A part is closed, or nearly so, and looks into itself, if the median winding number of its own faces, at the places
+before them, is below this."""
 _FEW = 0.002
 """Share of the area: less is not worth a change."""
 _ROUNDS = 2
@@ -54,8 +55,11 @@ def facing_outward(vertices: Float64Array, faces: Int64Array, free: float) -> tu
         return found
 
     turned = _to_turn(inward, len(sizes))
-    for number in turned.nonzero()[0]:
-        turned[number] = _looks_into_itself(vertices, faces[part == number])
+    for number, chosen in zip(looked_at, drawn, strict=True):
+        if turned[number]:
+            places = places_before(vertices, faces, chosen, np.random.default_rng(1))
+            own = winding_number(vertices, faces[part == number], places)
+            turned[number] = np.median(own) < _CLOSED
     share = float(sizes[turned].sum() / sizes.sum())
     if share <= _FEW:
         return faces, ()
@@ -96,9 +100,3 @@ def _before(vertices: Float64Array, faces: Int64Array, drawn: Int64Array) -> Flo
     places = places_before(vertices, faces, drawn.reshape(-1), np.random.default_rng(1))
     median: Float64Array = np.median(winding_number(vertices, faces, places).reshape(drawn.shape), axis=1)
     return median
-
-
-def _looks_into_itself(vertices: Float64Array, faces: Int64Array) -> bool:
-    """Whether these faces (F, 3) are a closed part, or nearly so, and look into it."""
-    chosen = np.linspace(0, len(faces) - 1, _PLACES).round().astype(np.int64)
-    return bool(_before(vertices, faces, chosen[None])[0] < _CLOSED)
