@@ -141,10 +141,14 @@ class SupportPlaneConstants:
     """Multiples of the surface's roughness: the same in a rough field. [early fits]"""
     max_thickness: float = 0.03
     """Diagonals. No plane is thicker. [early fits]"""
+    max_share_of_height: float = 0.125
+    """Share of the detection box's height above the plane. No plane is thicker: what lies flat on it would be removed
+    with it. [by hand, on random worlds]"""
     min_normal_cosine: float = 0.9
     """Cosine between a plane's normal and those of its points: 26 degrees. [by hand]"""
     fit_rounds: int = 2
-    """How often a plane in a rough field is fitted to the samples near it. [early fits]"""
+    """How often a plane is fitted to the samples near it: in rough fields, and where only samples outside of the
+    detection box count. [early fits]"""
     fit_thickness: float = 2.5
     """Multiples of the plane's thickness: samples that it is fitted to. [early fits]"""
     fit_min_normal_cosine: float = 0.8

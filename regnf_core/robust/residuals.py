@@ -71,8 +71,8 @@ class Residuals:
     tensor, seen from the other side.
 
     cosines: (H, N + M), between a sample's normal and the other field's gradient where the pose carries the sample ·
-    unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed, or that face such
-    space while the scene's own surface there does not face the same way; None: all of it was observed ·
+    unobserved: (H, N + M) bool, object samples that come to lie where the scene was not observed, and samples of both
+    that face such space while the other surface there does not face the same way; None: all of it was observed ·
     offset: (H,) how much farther out the scene's surface lies than the object's, object units; already subtracted from
     the values · shares: (H, N + M), see :class:`Samples`; the sum of each direction is 1.
     """
@@ -155,7 +155,7 @@ def residuals(surfaces: SurfacePair, T: Sim3, offset: Tensor | None = None) -> R
         torch.cat([J1, J2], 2).mT,
         torch.cat([cosines1, cosines2], 1),
         len(A),
-        None if unobserved is None else torch.cat([torch.zeros_like(r1, dtype=torch.bool), unobserved], 1),
+        None if unobserved is None else torch.cat([_hidden(A, cosines1), unobserved], 1),
         offset,
         None if A.shares is None or B.shares is None else torch.cat([A.shares, B.shares], 1),
     )
@@ -186,6 +186,13 @@ def _object_to_scene(
     places, fronts = _as_points(w), _as_points(R.mT @ B.normals.mT)
     hidden = unobserved.faces_unobserved(places, fronts).reshape(r2.shape) & (cosines < EVIDENCE.min_inlier_cosine)
     return r2, J, cosines, hidden | unobserved.unobserved(places, r2.reshape(-1)).reshape(r2.shape)
+
+
+def _hidden(A: Samples, cosines: Tensor) -> Tensor:
+    """(H, N) bool: which of the scene's samples nobody saw from their front, although the object faces another way."""
+    if A.hidden is None:
+        return torch.zeros_like(cosines, dtype=torch.bool)
+    return A.hidden & (cosines < EVIDENCE.min_inlier_cosine)
 
 
 def _query(model: DistanceModel, places: Tensor) -> tuple[Tensor, Tensor]:

@@ -32,7 +32,8 @@ class Samples:
     """Points near a surface: points (N, 3), the field's value there (N,), its unit normals (N, 3). float32.
 
     unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
-    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same.
+    weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same · hidden: (N,) bool,
+    samples of a scene whose front nobody can have seen; where the object's surface faces another way, they tell nothing.
 
     Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
     """
@@ -42,20 +43,21 @@ class Samples:
     normals: Tensor
     unobserved: UnobservedTest | None = None
     shares: Tensor | None = None
+    hidden: Tensor | None = None
 
     def __len__(self) -> int:
         return int(self.points.shape[-2])
 
     def __getitem__(self, index: Tensor) -> Samples:
-        shares = None if self.shares is None else self.shares[index]
-        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares)
+        shares, hidden = (None if part is None else part[index] for part in (self.shares, self.hidden))
+        return Samples(self.points[index], self.values[index], self.normals[index], self.unobserved, shares, hidden)
 
     def to(self, device: torch.device | str) -> Samples:
         """The same samples on another device."""
         points, values, normals = (part.to(device) for part in (self.points, self.values, self.normals))
-        shares = None if self.shares is None else self.shares.to(device)
+        shares, hidden = (None if part is None else part.to(device) for part in (self.shares, self.hidden))
         unobserved = None if self.unobserved is None else self.unobserved.to(device)
-        return Samples(points, values, normals, unobserved, shares)
+        return Samples(points, values, normals, unobserved, shares, hidden)
 
     def on_surface(self) -> Tensor:
         """The points (N, 3) moved onto the surface along their normals."""

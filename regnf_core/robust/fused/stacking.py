@@ -76,10 +76,12 @@ def _stacked(parts: Sequence[Samples], points: int) -> Samples:
     filled = [one[row] for one, row in zip(parts, rows, strict=True)]
     counts = torch.tensor([[len(one)] for one in parts], device=rows[0].device)
     shares = (torch.arange(points, device=rows[0].device) < counts).float() / counts
+    hidden = [one.hidden for one in filled if one.hidden is not None]
     return Samples(
         torch.stack([one.points for one in filled]),
         torch.stack([one.values for one in filled]),
         torch.stack([one.normals for one in filled]),
         parts[0].unobserved,
         shares,
+        torch.stack(hidden) if len(hidden) == len(parts) else None,
     )

@@ -80,13 +80,13 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
     counted = CountingField(scene)
     sampled = sample_scene_surface(counted, detection, options.scene_samples, generator)
     removed, unobserved = _unobserved_surface(counted, sampled, generator)
-    observed = replace(sampled.samples[~removed], unobserved=unobserved)
+    everything = _with_hidden(replace(sampled.samples, unobserved=unobserved))
+    observed = everything[~removed]
     outside = None if unobserved is None else ~_within(observed, detection)
-    foreground = observed[~support_planes(observed, generator, outside)]
+    edges = detection.rotation.mT * (detection.size / detection.diagonal)[:, None]
+    foreground = observed[~support_planes(observed, generator, edges, outside)]
     if len(foreground) < SCENE.min_foreground:
-        foreground = (
-            observed if len(observed) >= SCENE.min_foreground else replace(sampled.samples, unobserved=unobserved)
-        )
+        foreground = observed if len(observed) >= SCENE.min_foreground else everything
     share = float(removed.float().mean())
     observation = _observation(counted, sampled)
     return SceneView(sampled.frame, detection, foreground, sampled.spacing, share, counted.evaluations, observation)
@@ -95,6 +95,13 @@ def view_scene(scene: SdfField, detection: OrientedBox, options: RobustOptions) 
 def _observation(scene: SdfField, sampled: SampledField) -> WorkingObservation | None:
     observation = observation_of(scene)
     return None if observation is None else WorkingObservation(observation, sampled.frame)
+
+
+def _with_hidden(samples: Samples) -> Samples:
+    """The samples, and which of them nobody can have seen from their front."""
+    if samples.unobserved is None:
+        return samples
+    return replace(samples, hidden=samples.unobserved.faces_unobserved(samples.points, samples.normals))
 
 
 def _unobserved_surface(

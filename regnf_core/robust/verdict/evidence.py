@@ -84,6 +84,8 @@ def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: Ro
     occluded = (~observed | (to_scene < -limit)) & ~inlier[:, n:]
     visible = (~occluded).sum(1).clamp_min(1)
     near = r.scene_to_object.abs() <= EVIDENCE.near
+    if r.unobserved is not None:
+        near &= ~r.unobserved[:, :n]
     coarse, explained_coarsely = _coarse(r, near, observed, EVIDENCE.coarse_distance * limit)
     free = (to_scene > limit) & observed
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)

@@ -67,7 +67,8 @@ def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dic
 def _groups(r: Residuals) -> _Groups:
     r1, r2, n = r.scene_to_object, r.object_to_scene, r.scene_count
     near = r1.abs() <= EVIDENCE.near
-    observed = torch.ones_like(r2, dtype=torch.bool) if r.unobserved is None else ~r.unobserved[:, n:]
+    seen = torch.ones_like(r.values, dtype=torch.bool) if r.unobserved is None else ~r.unobserved
+    near, observed = near & seen[:, :n], seen[:, n:]
     agrees = r2.abs() <= EVIDENCE.agreement
     visible = observed & (agrees | (r2 > 0))
     return _Groups(near, near & (r1.abs() <= EVIDENCE.agreement), visible, observed, agrees & observed)

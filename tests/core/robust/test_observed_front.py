@@ -6,13 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from regnf_core.fields.observation import Observation
+from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.options import RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.samples import Samples
 from regnf_core.robust.scene.occlusion_boundary import SingleView
+from regnf_core.robust.scene.scene_view import view_scene
 from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
+from tests.core.analytic import AnalyticField
 
 COUNT, VOXEL = 20, 0.1
 MIDDLE = COUNT // 2
@@ -111,3 +115,33 @@ def test_the_far_side_of_a_sheet_is_unobserved_and_its_near_side_is_not() -> Non
     found = residuals(SurfacePair(Slab(), Slab(), scene, sheet), Sim3.identity().expand(1))
     assert found.unobserved is not None
     assert found.unobserved[0].tolist() == [False, False, False, True]
+
+
+def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_object_faces_the_same_way() -> None:
+    """The back of a measured sheet, as truncated distances have one: no contradiction to an object that is not there."""
+    points, up = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    view = SingleView(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
+    scene = Samples(points, torch.zeros(3), torch.cat([up, -up, up]), view, hidden=torch.tensor([False, True, True]))
+    sheet = Samples(points[:1], torch.zeros(1), up)
+    found = residuals(SurfacePair(Slab(), Slab(), scene, sheet), Sim3.identity().expand(1))
+    assert found.unobserved is not None
+    assert found.unobserved[0].tolist() == [False, True, False, False]
+    narrower = scene[torch.tensor([2, 1])].to("cpu")
+    assert narrower.hidden is not None
+    assert narrower.hidden.tolist() == [True, True]
+
+
+def test_a_view_knows_which_of_its_samples_nobody_saw_from_their_front() -> None:
+    """A plate, .1 thick, whose upper side alone was seen, within voxels as thick: both sides lie where surface was
+    measured."""
+    plate = AnalyticField(
+        lambda x: torch.maximum((x[:, :2].abs() - 0.6).amax(-1), (x[:, 2] - 0.05).abs() - 0.05), [[-1.0] * 3, [1.0] * 3]
+    )
+    observed = ObservedField(plate, wall_seen_from_above())
+    view = view_scene(observed, OrientedBox.from_corners([-0.7, -0.7, -0.2], [0.7, 0.7, 0.3]), RobustOptions())
+    foreground = view.foreground
+    assert foreground.hidden is not None
+    up, down = foreground.normals[:, 2] > 0.9, foreground.normals[:, 2] < -0.9
+    assert int(down.sum()) > 100
+    assert bool(foreground.hidden[down].all())
+    assert not bool(foreground.hidden[up].any())

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.samples import Samples
 from regnf_core.robust.scene.smoothing import smooth
 from regnf_core.robust.scene.support_planes import support_planes
@@ -94,3 +97,50 @@ def test_normal_roughness_is_the_tilt_of_the_normals_and_thin_parts_keep_their_s
     assert found.normal_roughness == pytest.approx(0.059, abs=0.012)
     assert (found.normals[:2000, 2] > 0.9).float().mean() > 0.99
     assert (found.normals[2000:, 2] < -0.9).float().mean() > 0.99
+
+
+def slab(height: float) -> Samples:
+    """The lid of something that lies flat on z = 0, .6 long."""
+    lid = sheet(600, height, 1.0, 4)
+    return Samples(lid.points * torch.tensor([0.6, 0.6, 1.0]), lid.values, lid.normals)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_lies_flat_on_a_table_is_kept_where_the_box_is_as_flat(turned: bool) -> None:
+    """A keyboard, .015 high, in a box of that height: thinner than what is removed of a table beneath a chair."""
+    table = sheet(1200, 0.0, 1.0, 1)
+    of_slab = torch.arange(1800) >= 1200
+    samples = together(table, slab(0.015))
+    beneath = ~of_slab & (samples.points[:, :2].abs() < 0.3).all(-1)
+    samples, of_slab = samples[~beneath], of_slab[~beneath]
+    edges = torch.diag(torch.tensor([0.7, 0.7, 0.025]))
+    outside = (samples.points[:, :2].abs() > 0.35).any(-1)
+    step = torch.tensor([0.7, -0.4, 1.1, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    R = Sim3.identity().perturb(step).rotation.float()
+    if turned:
+        samples = replace(samples, points=samples.points @ R.T, normals=samples.normals @ R.T)
+        edges = edges @ R.T
+    aside = support_planes(samples, generator(), edges, outside)
+    assert bool(aside[~of_slab].all())
+    assert not bool(aside[of_slab].any())
+    assert bool(support_planes(samples, generator(), outside=outside)[of_slab].all()), (
+        "in a higher box it would go with it"
+    )
+
+
+def test_the_plane_is_where_it_goes_on_outside_of_the_box() -> None:
+    """Most samples lie on the lid, but only the table reaches beyond the box."""
+    table, lid = sheet(700, 0.0, 1.0, 1), slab(0.1)
+    ring = (table.points[:, :2].abs() > 0.3).any(-1)
+    samples = together(table[ring], lid, lid)
+    of_lid = torch.arange(len(samples)) >= int(ring.sum())
+    assert int(of_lid.sum()) > 2 * int(ring.sum())
+    outside = (samples.points[:, :2].abs() > 0.33).any(-1)
+    aside = support_planes(samples, generator(), torch.diag(torch.tensor([0.66, 0.66, 0.12])), outside)
+    assert bool(aside[~of_lid].all())
+    assert not bool(aside[of_lid].any())
+
+
+def test_nothing_outside_of_the_box_leaves_no_plane() -> None:
+    samples = sheet(500, 0.0, 1.0, 1)
+    assert not support_planes(samples, generator(), outside=torch.zeros(500, dtype=torch.bool)).any()
