@@ -33,7 +33,7 @@ class Samples:
 
     unobserved: where the field shows something that was not observed; None: everything was observed · shares: (N,), the
     weight of each sample where the mean over all is taken, their sum 1; None: all weigh the same · hidden: (N,) bool,
-    samples of a scene whose front nobody can have seen; where the object's surface faces another way, they tell nothing.
+    samples of a scene that nobody can have seen from their front; they tell nothing where the object faces another way.
 
     Where each pose of a batch has samples of its own, all tensors have one more dimension in front.
     """

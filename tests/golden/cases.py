@@ -12,6 +12,7 @@ from typing import Any
 from regnf_core import OrientedBox, RegistrationOptions, RegistrationResult, Sim3, WarmStart, open_field, register
 from regnf_core.library import LibraryObject, model_object, search_library
 from tests.core.analytic import chair, chair_box, chair_pose, room, sphere, table
+from tests.core.robust.seen_in_part import UNDER_THE_SEAT, observed, over_closed
 from tests.core.robust.shapes import random_pose, reframed, slab_table, table_room
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "data"
@@ -48,6 +49,7 @@ def cases() -> list[Case]:
         plain("robust-any-orientation", turned_scene, turned_chair, turned_box),
         plain("robust-several-poses", table_room(chair_pose(1.4)), slab_table(), SLAB_BOX),
         plain("robust-wrong-object", chair_room, table(), box),
+        plain("robust-seen-in-part", observed(over_closed(UNDER_THE_SEAT), UNDER_THE_SEAT), chair(), box),
         plain("robust-start-and-up-axis", chair_room, chair(), box, {"up_axis": "z"}, WarmStart(near)),
         plain("paper-right-object", chair_room, chair(), box, PAPER),
         plain("paper-wrong-object", chair_room, table(), box, PAPER),

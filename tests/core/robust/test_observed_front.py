@@ -118,7 +118,7 @@ def test_the_far_side_of_a_sheet_is_unobserved_and_its_near_side_is_not() -> Non
 
 
 def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_object_faces_the_same_way() -> None:
-    """The back of a measured sheet, as truncated distances have one: no contradiction to an object that is not there."""
+    """The back of a measured sheet, as truncated distances have one, does not contradict an object without it."""
     points, up = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]]), torch.tensor([[0.0, 0.0, 1.0]])
     view = SingleView(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
     scene = Samples(points, torch.zeros(3), torch.cat([up, -up, up]), view, hidden=torch.tensor([False, True, True]))
