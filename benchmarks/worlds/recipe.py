@@ -102,13 +102,14 @@ def _some_walk(
 
 
 def _draw_fusion(world: World, bounds: Array, sensor: RandomSensor, rng: np.random.Generator) -> Fusion:
+    """All depths of the sensor are fused: what counts as measured lies in the map."""
     low, high = _VOXELS_M[world.kind]
     voxel = math.exp(rng.uniform(math.log(low), math.log(high)))
     dense = world.kind != "room" and rng.random() < 0.15
-    farthest = min(sensor.farthest_m, rng.uniform(*_FARTHEST_M[world.kind]))
+    rng.random()  # keeps what follows as it was when the map had a farthest depth of its own
     if dense:
         voxel = max(voxel, float((bounds[1] - bounds[0]).max()) / LARGEST_DENSE)
-    return Fusion(voxel, float(rng.uniform(3.0, 8.0)), "dense" if dense else "blocks", farthest)
+    return Fusion(voxel, float(rng.uniform(3.0, 8.0)), "dense" if dense else "blocks", sensor.farthest_m)
 
 
 def _bounds(world: World) -> Array:

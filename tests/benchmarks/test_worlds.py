@@ -85,6 +85,7 @@ def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path:
     make(task)
     told = json.loads((task.home / WORLD).read_text())
     assert (told["sensor"]["principle"], told["drift"], told["scene"]) == ("rendered", 0.0, {"kind": "rendered"})
+    assert told["fusion"]["farthest_m"] == told["sensor"]["farthest_m"], "what counts as measured is in the map"
     for one in cases_of(task.home):
         assert one.case.truth is not None
         assert one.facts["drift_spread"] == 0.0
