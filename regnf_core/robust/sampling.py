@@ -42,8 +42,9 @@ class SampledField:
 def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator) -> SampledField:
     """At most ``limit`` samples of the object; the working frame has the surface's centroid at 0 and diameter 1.
 
-    Of an object that says what was observed of it, surface that nobody measured is left out, unless too little else is
-    there: a scan shows such surface where it ends, beneath the object and behind its walls.
+    Of an object that says what was observed of it, surface that nobody measured, or nobody can have seen from its
+    front, is left out, unless too little else is there: a scan shows such surface where it ends, beneath the object and
+    behind its walls.
     Raises NoSurfaceError (NO_SURFACE_IN_OBJECT), InvalidInputError (FIELD_NOT_FINITE).
     """
     low, high = obj.bounds
@@ -52,9 +53,9 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     low, high = rough.into(low).double(), rough.into(high).double()
     known = observation_of(obj)
     observation = None if known is None else WorkingObservation(known, rough)
-    measured = None if observation is None else observation.measured_extent()
-    if measured is not None:
-        low, high = torch.maximum(low, measured[0]), torch.minimum(high, measured[1])
+    extent = None if observation is None else observation.measured_extent()
+    if extent is not None:
+        low, high = torch.maximum(low, extent[0]), torch.minimum(high, extent[1])
     inner = crop_to_surface(field.value, low, high, SAMPLING.object_base)
     cells, space = surface_cells(field.value, *inner, SAMPLING.object_base, SAMPLING.levels)
     found = _samples_near(field, cells, limit, generator)
@@ -62,8 +63,9 @@ def sample_object_surface(obj: SdfField, limit: int, generator: torch.Generator)
     inside = ((found.points >= low.float()) & (found.points <= high.float())).all(-1)
     found = found[inside]
     if observation is not None:
-        on_surface = observation.on_surface(found.points)
-        found = found[on_surface] if int(on_surface.sum()) >= MIN_POINTS else found
+        measured = observation.on_surface(found.points)
+        measured &= ~observation.faces_unobserved(found.points, found.normals)
+        found = found[measured] if int(measured.sum()) >= MIN_POINTS else found
     require_object_surface(len(found))
     surface = found.on_surface()
     size = diameter(surface)

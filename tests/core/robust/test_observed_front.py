@@ -12,6 +12,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.samples import Samples
+from regnf_core.robust.sampling import sample_object_surface
 from regnf_core.robust.scene.occlusion_boundary import SingleView
 from regnf_core.robust.scene.scene_view import view_scene
 from regnf_core.robust.working_frame import WorkingFrame, WorkingObservation
@@ -131,17 +132,31 @@ def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_obj
     assert narrower.hidden.tolist() == [True, True]
 
 
-def test_a_view_knows_which_of_its_samples_nobody_saw_from_their_front() -> None:
-    """A plate, .1 thick, whose upper side alone was seen, within voxels as thick: both sides lie where surface was
-    measured."""
+def plate_seen_from_above() -> ObservedField:
+    """A plate, .08 thick, whose upper side alone was seen, in voxels of .1: both sides are where surface was measured."""
     plate = AnalyticField(
-        lambda x: torch.maximum((x[:, :2].abs() - 0.6).amax(-1), (x[:, 2] - 0.05).abs() - 0.05), [[-1.0] * 3, [1.0] * 3]
+        lambda x: torch.maximum((x[:, :2].abs() - 0.6).amax(-1), (x[:, 2] - 0.05).abs() - 0.04), [[-1.0] * 3, [1.0] * 3]
     )
-    observed = ObservedField(plate, wall_seen_from_above())
-    view = view_scene(observed, OrientedBox.from_corners([-0.7, -0.7, -0.2], [0.7, 0.7, 0.3]), RobustOptions())
+    return ObservedField(plate, wall_seen_from_above())
+
+
+def test_a_view_knows_which_of_its_samples_nobody_saw_from_their_front() -> None:
+    view = view_scene(
+        plate_seen_from_above(), OrientedBox.from_corners([-0.7, -0.7, -0.2], [0.7, 0.7, 0.3]), RobustOptions()
+    )
     foreground = view.foreground
     assert foreground.hidden is not None
     up, down = foreground.normals[:, 2] > 0.9, foreground.normals[:, 2] < -0.9
-    assert int(down.sum()) > 100
+    assert min(int(up.sum()), int(down.sum())) > 100
     assert bool(foreground.hidden[down].all())
     assert not bool(foreground.hidden[up].any())
+
+
+def test_an_objects_model_has_no_surface_that_nobody_saw_from_its_front() -> None:
+    plate = plate_seen_from_above()
+    whole, seen = (
+        sample_object_surface(one, 2000, torch.Generator().manual_seed(0)).samples for one in (plate.field, plate)
+    )
+    assert int((whole.normals[:, 2] < -0.9).sum()) > 300
+    assert len(seen) > 300
+    assert bool((seen.normals[:, 2] > 0.9).all())
