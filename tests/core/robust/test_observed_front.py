@@ -133,7 +133,7 @@ def test_a_scene_sample_that_nobody_saw_from_its_front_counts_only_where_the_obj
 
 
 def plate_seen_from_above() -> ObservedField:
-    """A plate, .08 thick, whose upper side alone was seen, in voxels of .1: both sides are where surface was measured."""
+    """A plate, .08 thick, whose upper side alone was seen, in voxels of .1: they hold both sides."""
     plate = AnalyticField(
         lambda x: torch.maximum((x[:, :2].abs() - 0.6).amax(-1), (x[:, 2] - 0.05).abs() - 0.04), [[-1.0] * 3, [1.0] * 3]
     )
