@@ -25,7 +25,6 @@ from regnf_data.worlds.detections import draw_box
 from regnf_data.worlds.fusing import fuse
 from regnf_data.worlds.mesh import Array, together
 from regnf_data.worlds.models import read_catalog
-from regnf_data.worlds.placing import Placed
 from regnf_data.worlds.rooms import World, make_world
 from regnf_data.worlds.split import part_of_world
 from regnf_data.worlds.walks import LENGTHS, Length
@@ -36,7 +35,7 @@ from regnf_fit.images.options import ReconstructionOptions
 WORLD, SCENE, CAMERAS = "world.json", "scene.safetensors", "cameras.npz"
 MAX_CASES = 8
 LEAST_SEEN: dict[Length, float] = {"long": 0.3, "short": 0.25, "single": 0.12}
-"""Of an object's surface, measured in some image: what was seen less is no case."""
+"""Of an object's surface, measured in some image from its front: what was seen less is no case."""
 LEAST_VOXELS = 20.0
 """Across an object: what is smaller is no case."""
 _SCALES = (0.05, 20.0)
@@ -90,7 +89,7 @@ def _write(task: Task, world: World, seen: Seen, home: Path) -> dict[str, Any]:
     _write_cameras(seen, home)
     # As many scenes stay in their own frame as do not.
     T_scene_room = similarity(rng, (0.2, 5.0)) if rng.random() < 0.5 else np.eye(4)
-    maker = ObjectMaker(world, seen, home, task.objects)
+    maker = ObjectMaker(world, seen, home, task.objects, LEAST_SEEN[task.length])
     chosen = _chosen(world, seen, task.length, rng)
     cases = [_case(task.scene, maker, case, number, T_scene_room, rng) for case, number in enumerate(chosen)]
     return {
@@ -118,7 +117,7 @@ def _case(
     kind = maker.make(number, case, rng)
     T_fused_room, spread = np.eye(4), 0.0
     if scene in FROM_IMAGES:
-        T_fused_room, spread = seen.taken.carried(number, _in_room(placed))
+        T_fused_room, spread = seen.taken.carried(number, placed.outside[0])
     T_fused_model = T_fused_room @ placed.T_room_model
     box = draw_box(placed.model.surface @ T_fused_model[:3, :3].T + T_fused_model[:3, 3], T_fused_model, rng)
     return {
@@ -215,10 +214,3 @@ def read_cameras(home: Path) -> PinholeCameras:
     """Where the cameras of the walk are thought to have stood, in the world, as :func:`make` has written it."""
     with np.load(home / CAMERAS) as file:
         return PinholeCameras(**{part.name: torch.from_numpy(file[part.name]) for part in fields(PinholeCameras)})
-
-
-def _in_room(placed: Placed) -> Array:
-    assert placed.model is not None
-    T = placed.T_room_model
-    points: Array = placed.model.surface @ T[:3, :3].T + T[:3, 3]
-    return points

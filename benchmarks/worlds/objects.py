@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from benchmarks.worlds.recipe import Seen, orbit_sensor, see
 from regnf_core.errors import RegnfError
@@ -36,10 +37,15 @@ _LARGEST_PART = 160
 
 
 class ObjectMaker:
-    """Makes the objects of one world. wanted: all of one kind; None: of any, as a seed draws."""
+    """Makes the objects of one world. wanted: all of one kind; None: of any, as a seed draws · least_common: the share
+    of the surface that the scene's images and the object's must both have measured: an object that was scanned from
+    above is not found where it lies upside down."""
 
-    def __init__(self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None) -> None:
+    def __init__(
+        self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None, least_common: float = 0.0
+    ) -> None:
         self.world, self.seen, self._home, self._wanted = world, seen, home, wanted
+        self._least_common = least_common
 
     def make(self, thing: int, case: int, rng: np.random.Generator) -> ObjectKind:
         """Write the field of a thing as case number ``case``, and its mesh. Returns which kind it came to be.
@@ -53,13 +59,14 @@ class ObjectMaker:
         path = self._home / f"object-{case}.safetensors"
         kind: ObjectKind = "mesh"
         extra: dict[str, Array] = {}
-        if drawn == "orbit":
-            _fused_orbit(model, rng, path, self.seen.rendered)
+        if drawn == "orbit" and self._common(thing, _fused_orbit(model, rng, path, self.seen.rendered)):
             kind = "orbit"
         elif drawn == "cut":
             bounds = self._cut(thing, path)
             if bounds is not None:
                 kind, extra = "cut", bounds
+        if kind == "mesh":
+            path.unlink(missing_ok=True)
         symmetries = [json.dumps(found) for found in measure_symmetries(model)]
         np.savez(
             self._home / f"object-{case}.npz",
@@ -71,15 +78,20 @@ class ObjectMaker:
         )
         return kind
 
+    def _common(self, thing: int, measured: NDArray[np.int64]) -> bool:
+        """Whether the scene's images show enough of what other ones have measured, of each point how often."""
+        return float(((self.seen.taken.seen[thing] > 0) & (measured > 0)).mean()) >= self._least_common
+
     def _cut(self, thing: int, path: Path) -> dict[str, Array] | None:
         """The thing's part of a map of another walk; None where that saw too little of it."""
         other = self._other
         if other is None or (other.taken.seen[thing] > 0).mean() < _LEAST_SEEN:
             return None
+        if not self._common(thing, other.taken.seen[thing]):
+            return None
         placed = self.world.things[thing]
         assert placed.model is not None
-        points = placed.model.surface @ placed.T_room_model[:3, :3].T + placed.T_room_model[:3, 3]
-        T, _ = other.taken.carried(thing, points)
+        T, _ = other.taken.carried(thing, placed.outside[0])
         T_fused_model = T @ placed.T_room_model
         corners = placed.model.surface @ T_fused_model[:3, :3].T + T_fused_model[:3, 3]
         margin = _MARGIN * placed.model.diameter
@@ -116,14 +128,17 @@ def _write_part(field: SdfField, bounds: Array, voxel: float, path: Path) -> Non
     write_dense(path, values, bounds[0], spacing)
 
 
-def _fused_orbit(model: Model, rng: np.random.Generator, path: Path, rendered: bool) -> None:
-    """The map of the object alone, as a scanner's orbit gives it."""
+def _fused_orbit(model: Model, rng: np.random.Generator, path: Path, rendered: bool) -> NDArray[np.int64]:
+    """The map of the object alone, as a scanner's orbit gives it. Returns of each point of the model's surface in how
+    many images it was measured."""
     mesh = model.mesh
     sensor = orbit_sensor(rng, model.diameter, rendered)
     poses = orbit(mesh.bounds, _FRAMES, half_view(sensor.size, sensor.intrinsics), float(mesh.bounds[0, 2]))
     errors = np.tile(np.eye(4), (len(poses), 1, 1))
-    taken = capture(ExactScene([mesh]), sensor, poses, errors, [], draw_matter(1, rng) * 0, rng)
+    groups = [(0, model.surface, model.normals)]
+    taken = capture(ExactScene([mesh]), sensor, poses, errors, groups, draw_matter(1, rng) * 0, rng)
     voxel = model.diameter / rng.uniform(50.0, 110.0)
     margin = 0.1 * model.diameter
     bounds = np.stack([mesh.bounds[0] - margin, mesh.bounds[1] + margin])
     fuse(taken, Fusion(voxel, 5.0, "blocks", 5.0), bounds, path)
+    return taken.seen[0]

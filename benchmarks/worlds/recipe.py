@@ -74,7 +74,7 @@ def see(world: World, length: Length, rendered: bool = False, again: int = 0) ->
     name, poses = _some_walk(world, scene, (length, frames), rng)
     drift = draw_drift(rng) if length != "single" and not rendered else 0.0
     groups = [
-        (len(world.fixed) + number, placed.model.surface @ placed.T_room_model[:3, :3].T + placed.T_room_model[:3, 3])
+        (len(world.fixed) + number, *placed.outside)
         for number, placed in enumerate(world.things)
         if placed.model is not None
     ]

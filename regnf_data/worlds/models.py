@@ -43,13 +43,22 @@ class Model:
         """Whether it stands on the floor."""
         return float(np.linalg.norm(self.mesh.size)) >= BIG_M
 
-    @cached_property
+    @property
     def surface(self) -> Array:
         """(N, 3): points even over what can be seen from outside; parts that overlap hide some of each other.
 
         Seen is a point from which a ray leaves the mesh, from either side of its face: sheets and parts that are inside
         out are seen as cameras see them.
         """
+        return self._outside[0]
+
+    @property
+    def normals(self) -> Array:
+        """(N, 3) of the faces that the points of the surface lie on."""
+        return self._outside[1]
+
+    @cached_property
+    def _outside(self) -> tuple[Array, Array]:
         rng = np.random.default_rng(0)
         points, normals = self.mesh.sample(_SAMPLES, rng)
         directions = rng.normal(size=(len(points), _RAYS, 3))
@@ -57,8 +66,8 @@ class Model:
         step = _OUTWARD * float(np.linalg.norm(self.mesh.size))
         origins = points[:, None] + step * side * normals[:, None]
         left = ~np.isfinite(self.mesh.cast(origins.reshape(-1, 3), directions.reshape(-1, 3)))
-        seen: Array = points[left.reshape(len(points), _RAYS).any(axis=1)]
-        return seen
+        seen = left.reshape(len(points), _RAYS).any(axis=1)
+        return points[seen], normals[seen]
 
     @cached_property
     def diameter(self) -> float:

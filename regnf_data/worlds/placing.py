@@ -38,6 +38,13 @@ class Placed:
         return contact_points(self.mesh)
 
     @cached_property
+    def outside(self) -> tuple[Array, Array]:
+        """The model's surface that can be seen from outside, and its normals: both (N, 3), in the room."""
+        assert self.model is not None
+        turn, shift = self.T_room_model[:3, :3], self.T_room_model[:3, 3]
+        return self.model.surface @ turn.T + shift, self.model.normals @ turn.T
+
+    @cached_property
     def upward(self) -> Array:
         """(N, 3): points on faces that look up, where other things may stand."""
         points, normals = self.mesh.sample(2 * _POINTS, np.random.default_rng(1))

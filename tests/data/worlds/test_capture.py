@@ -17,7 +17,7 @@ from regnf_data.worlds.capture import Capture, capture
 from regnf_data.worlds.drift import drifted, mean_motion
 from regnf_data.worlds.exact import ExactScene, ExactView
 from regnf_data.worlds.fusing import Fusion, fuse
-from regnf_data.worlds.mesh import Array, ball, box, turned
+from regnf_data.worlds.mesh import Array, Mesh, ball, box, turned
 from regnf_data.worlds.models import Model
 from regnf_data.worlds.sensors import BLACK, GLOSSY, PLAIN, RandomSensor, draw_sensor, rendered_sensor
 from regnf_data.worlds.symmetries import measure_symmetries
@@ -27,6 +27,7 @@ EXACT = RandomSensor(
     "time of flight", SIZE, 60.0, 0.1, 5.0, (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, grazing_deg=89.0
 )
 BALL = ball((0.0, 0.0, 0.3), 0.3, 40)
+SHEET_UP = np.array([[0, 1, 2], [0, 2, 3]])
 FLOOR = box((-1.0, -1.0, -0.1), (1.0, 1.0, 0.0))
 
 
@@ -38,10 +39,11 @@ def ring(count: int = 10) -> Array:
 
 def taken(errors: Array | None = None) -> Capture:
     poses = ring()
-    points, _ = BALL.sample(300, np.random.default_rng(0))
+    points, normals = BALL.sample(300, np.random.default_rng(0))
     errors = np.tile(np.eye(4), (len(poses), 1, 1)) if errors is None else errors
     matter = np.full(2, PLAIN)
-    return capture(ExactScene([FLOOR, BALL]), EXACT, poses, errors, [(1, points)], matter, np.random.default_rng(0))
+    groups = [(1, points, normals)]
+    return capture(ExactScene([FLOOR, BALL]), EXACT, poses, errors, groups, matter, np.random.default_rng(0))
 
 
 @cache
@@ -99,6 +101,18 @@ def test_the_far_half_of_a_ball_is_seen_by_no_single_camera() -> None:
     shows = undisturbed().shows[0] / 300.0
     assert 0.2 < shows.max() < 0.5
     assert (undisturbed().seen[0] > 0).mean() > 0.75
+
+
+def test_the_back_of_an_open_sheet_is_not_seen() -> None:
+    sheet = Mesh(np.array([[-0.3, -0.3, 0.0], [0.3, -0.3, 0.0], [0.3, 0.3, 0.0], [-0.3, 0.3, 0.0]]), SHEET_UP)
+    for faces, least, most in ((SHEET_UP, 0.9, 1.0), (SHEET_UP[:, ::-1], 0.0, 0.0)):
+        turned_sheet = Mesh(sheet.vertices, faces)
+        groups = [(0, *turned_sheet.sample(300, np.random.default_rng(0)))]
+        poses, errors = ring(), np.tile(np.eye(4), (10, 1, 1))
+        rng = np.random.default_rng(0)
+        found = capture(ExactScene([turned_sheet]), EXACT, poses, errors, groups, np.full(1, PLAIN), rng)
+        assert (found.depths > 0.0).any()
+        assert least <= (found.seen[0] > 0).mean() <= most
 
 
 @pytest.mark.parametrize("volume", ["blocks", "dense"])
