@@ -212,7 +212,7 @@ class OcclusionConstants:
 
 _SEARCH_HEAD = (
     Stage(points=48, widths=(), score_width=0.10, keep=500),
-    Stage(points=64, widths=(0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05),
+    Stage(64, (0.15, 0.12, 0.10, 0.08), score_width=0.06, keep=120, min_distance=0.05, keeps_scale=True),
 )
 _SEARCH_CLOSER = Stage(points=128, widths=(0.08, 0.06, 0.05, 0.04), score_width=0.04, keep=60, min_distance=0.05)
 _SEARCH_END = (
@@ -244,9 +244,10 @@ class SearchConstants:
     warm_start_spread: tuple[float, float, float] = (0.17, 0.05, 0.10)
     """Standard deviations of their rotation (radians), translation (diameters) and log scale. [by hand]"""
     stages: tuple[Stage, ...] = (*_SEARCH_HEAD, _SEARCH_CLOSER, *_SEARCH_END)
-    """Successive halving on distance grids. The first stage only ranks the seeds. The last one leaves local minima:
-    thin parts and what is close by hold poses some hundredths of the diameter off. [by hand, the last one on random
-    worlds, docs/worlds.md]"""
+    """Successive halving on distance grids. The first stage only ranks the seeds. The second one, with the widest
+    kernels, keeps their scales: among clutter an object that grows comes nearer to all of it. The last one leaves
+    local minima: thin parts and what is close by hold poses some hundredths of the diameter off. [by hand, the second
+    and the last one on random worlds, docs/worlds.md]"""
     thorough_stages: tuple[Stage, ...] = (
         *_SEARCH_HEAD,
         replace(_SEARCH_CLOSER, copies=6, spread=(0.40, 0.08, 0.15)),

@@ -88,8 +88,11 @@ def _all_refined(
     parts = -(-len(everything) // size)
     settings, found, broken = _settings(ready, stage, everything), [], []
     for part in parts_of(counts, size, everything.scores.device):
-        there = surfaces.of_part(part)
-        some = refined(there.pair, everything[part.rows], stage, _of_part(settings, part), lambda: on_step(1.0 / parts))
+        there, asked = surfaces.of_part(part), everything[part.rows]
+        own_settings = _of_part(settings, part)
+        if stage.keeps_scale:
+            own_settings = replace(own_settings, scale=ScaleBounds.same(asked.T))
+        some = refined(there.pair, asked, stage, own_settings, lambda: on_step(1.0 / parts))
         if not stage.widths:
             on_step(1.0 / parts)
         own = slice(0, size - part.filling)

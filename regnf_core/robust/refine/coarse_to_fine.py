@@ -15,7 +15,7 @@ from regnf_core.robust.refine.levenberg_marquardt import Iteration, Settings, mi
 from regnf_core.robust.refine.loss import disagreement
 from regnf_core.robust.refine.pose_candidates import PoseCandidates, Step
 from regnf_core.robust.residuals import SurfacePair, residuals
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound
+from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound, ScaleBounds
 from regnf_core.robust.stage import Stage
 
 
@@ -61,11 +61,13 @@ def coarse_to_fine(
     """The candidates that are left after all stages, best first."""
     for stage in stages:
         ready = Descent(surfaces, candidates, context).prepared(stage)
-        settings = Settings(stage.widest, context.scale, context.max_offset)
         numbers = torch.arange(len(ready.candidates), device=candidates.scores.device)
         parts = []
         for part in torch.split(numbers, SEARCH.batch):
-            done = refined(ready.surfaces, ready.candidates[part], stage, settings, context.on_step)
+            some = ready.candidates[part]
+            scale = ScaleBounds.same(some.T) if stage.keeps_scale else context.scale
+            settings = Settings(stage.widest, scale, context.max_offset)
+            done = refined(ready.surfaces, some, stage, settings, context.on_step)
             parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
         candidates = PoseCandidates.cat(parts)
         left = survivors(candidates, context.admits(candidates.T), stage, context.extremal_points)

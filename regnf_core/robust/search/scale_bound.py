@@ -61,6 +61,11 @@ class ScaleBounds:
     high: Tensor
     is_open = False
 
+    @classmethod
+    def same(cls, T: Sim3) -> ScaleBounds:
+        """Of poses T (H,) that keep their scales."""
+        return cls(T.scale, T.scale)
+
     def limited_growth(self, scale: Tensor, growth: Tensor) -> Tensor:
         """As that of :class:`ScaleBound`."""
         low, high = ((end / scale).log() for end in (self.low, self.high))
