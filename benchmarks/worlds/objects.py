@@ -41,9 +41,7 @@ class ObjectMaker:
     of the surface that the scene's images and the object's must both have measured: an object that was scanned from
     above is not found where it lies upside down."""
 
-    def __init__(
-        self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None, least_common: float = 0.0
-    ) -> None:
+    def __init__(self, world: World, seen: Seen, home: Path, wanted: ObjectKind | None, least_common: float) -> None:
         self.world, self.seen, self._home, self._wanted = world, seen, home, wanted
         self._least_common = least_common
 

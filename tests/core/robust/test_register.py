@@ -201,11 +201,9 @@ def test_other_seeds_meet_the_same_optimum_at_the_same_place() -> None:
     exact = room(chair_pose())
     bounds = exact.bounds.tolist()
     rough = AnalyticField(lambda points: exact.formula(points) + 0.008 * torch.sin(17.0 * points).prod(-1), bounds)
-    results = [register(rough, chair(), detection(), ROBUST, seed=seed, clouds=False) for seed in range(6)]
-    assert [result.verdict for result in results] == ["registered"] * 6
-    found = torch.stack([result.T_object_scene.matrix() for result in results])
-    assert float((found[0] - torch.eye(4)).abs().max()) > 0.1
-    apart = (found[:, None] - found).abs().amax((-2, -1))
-    assert float(apart.max()) < 5e-4
-    # One in eight seeds meets an optimum beside it.
-    assert int((apart < 5e-5).sum(1).max()) >= 5
+    results = [register(rough, chair(), detection(), ROBUST, seed=seed, clouds=False) for seed in range(8)]
+    assert [result.verdict for result in results] == ["registered"] * 8
+    first, *others = (result.T_object_scene.matrix() for result in results)
+    assert float((first - torch.eye(4)).abs().max()) > 0.1
+    for other in others:
+        torch.testing.assert_close(other, first, atol=5e-5, rtol=0.0)
