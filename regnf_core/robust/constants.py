@@ -300,8 +300,26 @@ class FeatureConstants:
 
 
 _LAST_STAGES = (
-    Stage(700, (0.01, 0.01) + (0.008,) * 5, 0.015, keep=8, min_distance=0.03, margin=1.0, widest=0.04),
-    Stage(700, (0.015, 0.01, 0.01, 0.008, 0.008), 0.015, keep=8, min_distance=0.03, margin=1.0, widest=0.02),
+    Stage(
+        points=700,
+        widths=(0.01, 0.01) + (0.008,) * 5,
+        score_width=0.015,
+        keep=8,
+        min_distance=0.03,
+        margin=1.0,
+        widest=0.04,
+        normals=False,
+    ),
+    Stage(
+        points=700,
+        widths=(0.015, 0.01, 0.01, 0.008, 0.008),
+        score_width=0.015,
+        keep=8,
+        min_distance=0.03,
+        margin=1.0,
+        widest=0.02,
+        normals=False,
+    ),
 )
 
 
@@ -317,8 +335,9 @@ class RefinementConstants:
     kernels. [by hand, the first and the numbers kept on random worlds]"""
     last_stages: tuple[Stage, ...] = _LAST_STAGES
     """On what is left, and the best pose's symmetry equivalents. Wide kernels find the pose among rough surfaces,
-    narrow ones keep what is close by from drawing it away. So many iterations that poses of other seeds meet at the
-    same place before the second. [by hand, the second on random worlds]"""
+    narrow ones keep what is close by from drawing it away. Normals do not count: the cost is smooth without them, and
+    so many iterations bring poses of other seeds to the same place before the second. [by hand, the second on random
+    worlds]"""
     same_pose: float = 0.06
     """Diameters. A symmetry equivalent closer to a pose that is there already is not added. [by hand]"""
     damping_start: float = 1e-2

@@ -116,7 +116,7 @@ def _settings(ready: Sequence[Descent], stage: Stage, everything: PoseCandidates
         )
     )
     is_open = all(one.scale.is_open for one in contexts)
-    return Settings(stage.widest, ANY_SCALE if is_open else ScaleBounds(low, high), most)
+    return Settings(stage.widest, ANY_SCALE if is_open else ScaleBounds(low, high), most, stage.normals)
 
 
 def _of_part(settings: Settings, part: Part) -> Settings:

@@ -84,7 +84,7 @@ def confirm_symmetries(
     if len(proposed.T) == 0:
         return proposed
     few = subsample(B, MODEL.confirming_points, generator)
-    settings = Settings(scale=SAME_SCALE)
+    settings = Settings(scale=SAME_SCALE, normals=False)
     start = proposed.T.on(B.points.device)
     refined = minimize(SurfacePair(obj, obj, few, few), start, MODEL.confirming_widths, settings)
     deviation = (refined.residuals.values.abs() > MODEL.max_deviation).float().mean(1).cpu()

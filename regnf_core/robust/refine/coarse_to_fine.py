@@ -66,7 +66,7 @@ def coarse_to_fine(
         for part in torch.split(numbers, SEARCH.batch):
             some = ready.candidates[part]
             scale = ScaleBounds.same(some.T) if stage.keeps_scale else context.scale
-            settings = Settings(stage.widest, scale, context.max_offset)
+            settings = Settings(stage.widest, scale, context.max_offset, stage.normals)
             done = refined(ready.surfaces, some, stage, settings, context.on_step)
             parts.append(replace(done, scores=done.scores + context.penalty(done.T)))
         candidates = PoseCandidates.cat(parts)

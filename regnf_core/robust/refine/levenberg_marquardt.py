@@ -22,12 +22,13 @@ class Settings:
 
     widest: the widths are lower limits, see :func:`regnf_core.robust.refine.loss.adaptive_width`; 0: they stay as they
     are · scale: what it may be, and is at the start · max_offset: of the surfaces, either way, object diameters, also
-    (H,), one for each pose; 0: the offset stays as it is.
+    (H,), one for each pose; 0: the offset stays as it is · normals: whether the loss counts them.
     """
 
     widest: float = 0.0
     scale: ScaleBound | ScaleBounds = ANY_SCALE
     max_offset: float | Tensor = REFINEMENT.max_offset
+    normals: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +75,12 @@ def minimize(
         step = _step(now, width, damping, T.scale, settings)
         T_tried = T.perturb(step[:, :7])
         tried = residuals(surfaces, T_tried, _moved_offset(now, step, settings))
-        better = robust_cost(tried, width) < robust_cost(now, width)
+        better = robust_cost(tried, width, settings.normals) < robust_cost(now, width, settings.normals)
         T, now = Sim3.where(better, T_tried, T), Residuals.where(better, tried, now)
         damping = _next_damping(damping, better)
         if on_iteration is not None:
-            on_iteration(Iteration(T, now, robust_cost(now, width), lowest))
-    return Refined(T, robust_cost(now, width), now)
+            on_iteration(Iteration(T, now, robust_cost(now, width, settings.normals), lowest))
+    return Refined(T, robust_cost(now, width, settings.normals), now)
 
 
 def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | None:
@@ -96,7 +97,7 @@ def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
 
 def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, settings: Settings) -> Tensor:
     """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset)."""
-    H, b = normal_equations(r, width)
+    H, b = normal_equations(r, width, settings.normals)
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.constants import REFINEMENT
-from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_loss, geman_mcclure_weight
+from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_weight
 from regnf_core.robust.residuals import Residuals
 
 
@@ -40,13 +40,22 @@ def offset_prior(r: Residuals) -> float:
     return REFINEMENT.offset_prior if r.unobserved is None else REFINEMENT.offset_prior_partial
 
 
-def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
-    """(H,): mean over each direction of the Geman-McClure loss, 0..1, the two directions averaged.
+def facing(r: Residuals) -> Tensor:
+    """(H, N + M), 0..1: how well the normals agree: their cosine, 0 where they are more than 90 degrees apart."""
+    return r.cosines.clamp(0.0, 1.0)
 
+
+def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True) -> Tensor:
+    """(H,): mean over each direction of the loss, 0..1, the two directions averaged.
+
+    The loss is the Geman-McClure loss where the normals agree, larger where they do not, as that of
+    :func:`disagreement`: surface that faces another way does not attract, however near it is. ``normals``: whether
+    they count at all.
     A narrower kernel has the same curvature at zero, and so saturates at a lower loss.
     """
     widths = kernel_widths(r, width)
-    loss = geman_mcclure_loss(r.values, widths) * (widths / width) ** 2
+    agreement = geman_mcclure_agreement(r.values, widths)
+    loss = (1.0 - (agreement * facing(r) if normals else agreement)) * (widths / width) ** 2
     of_scene, of_object = r.means(loss)
     cost = 0.5 * (of_scene + of_object)
     if r.offset is None:
@@ -55,12 +64,14 @@ def robust_cost(r: Residuals, width: Tensor | float) -> Tensor:
     return cost + prior
 
 
-def normal_equations(r: Residuals, width: Tensor | float) -> tuple[Tensor, Tensor]:
+def normal_equations(r: Residuals, width: Tensor | float, normals: bool = True) -> tuple[Tensor, Tensor]:
     """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64, summed in the residuals' own precision.
 
-    Each direction has the same total influence. An offset is the eighth unknown.
+    Each direction has the same total influence. An offset is the eighth unknown. The normals' agreement counts as a
+    constant weight: how it changes with the pose is left out, and steps that raise the cost are undone.
     """
-    weights = r.weighted(geman_mcclure_weight(r.values, kernel_widths(r, width)))
+    weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
+    weights = r.weighted(weights * facing(r) if normals else weights)
     J = r.jacobian_with_offset().mT
     weighted = J * weights[:, None]
     H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()
@@ -76,7 +87,7 @@ def disagreement(r: Residuals, width: float) -> Tensor:
     Each direction counts half, however many samples it has. The loss of object samples at places that were not
     observed is limited.
     """
-    loss = 1.0 - geman_mcclure_agreement(r.values, width) * r.cosines.clamp(0.0, 1.0)
+    loss = 1.0 - geman_mcclure_agreement(r.values, width) * facing(r)
     if r.unobserved is not None:
         loss = torch.where(r.unobserved, loss.clamp_max(REFINEMENT.unobserved_loss), loss)
     of_scene, of_object = r.means(loss)

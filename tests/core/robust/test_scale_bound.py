@@ -68,7 +68,8 @@ def test_seeds_of_one_scale_are_not_tried_twice() -> None:
 
 @pytest.mark.parametrize("allowed", [1.0, 1.1])
 def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> None:
-    """From poses of another scale the steps go up to the bound; the minimum there is where steps of fixed scale end."""
+    """From poses of another scale the steps go up to the bound; the minimum there is where steps of fixed scale end.
+    Without normals: the cost is smooth, so there is one minimum."""
     generator = torch.Generator().manual_seed(0)
     target = sample_object_surface(chair(), 600, generator)
     surfaces = SurfacePair(target.field, target.field, target.samples, target.samples)
@@ -76,9 +77,9 @@ def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> 
     start = Sim3.identity().expand(6).perturb(step)
     larger = Sim3(torch.full_like(start.scale, 1.3), start.rotation, start.translation)
     widths = [0.2] * 25
-    from_above = minimize(surfaces, larger, widths, Settings(scale=ScaleBound(allowed, 2.0)))
+    from_above = minimize(surfaces, larger, widths, Settings(scale=ScaleBound(allowed, 2.0), normals=False))
     on_it = Sim3(torch.full_like(start.scale, allowed), start.rotation, start.translation)
-    along = minimize(surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed)))
+    along = minimize(surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed), normals=False))
     torch.testing.assert_close(along.T.scale, torch.full_like(start.scale, allowed))
     torch.testing.assert_close(from_above.T.scale, along.T.scale, atol=1e-4, rtol=0.0)
     torch.testing.assert_close(from_above.costs, along.costs, atol=1e-5, rtol=1e-3)
