@@ -4,8 +4,8 @@ A step subtracts S g / |g|^2, with S the signed distance and g its gradient at t
 the step is long and wrong. So |g| counts as ``min_slope`` at least. Four values are in use:
 
     0.5     MIN_SLOPE: clouds for viewers, an object's bounds
-    0.2     samples for registration (robust/constants.py); shorter gradients are dropped there
-    0.001   the surface beneath a sample (robust/constants.py): only a gradient of zero is left out
+    0.2     samples for registration (robust/constants/); shorter gradients are dropped there
+    0.001   the surface beneath a sample (robust/constants/): only a gradient of zero is left out
     1e-6    the import gate, which bounds the steps' length as well
 """
 

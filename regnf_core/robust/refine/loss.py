@@ -1,6 +1,6 @@
 """The refinement's robust loss: kernel widths, cost, normal equations, and the score that ranks poses.
 
-The kernel itself is in regnf_core/robust/kernel.py, the numbers are REFINEMENT in regnf_core/robust/constants.py.
+The kernel itself is in regnf_core/robust/kernel.py, the numbers are in regnf_core/robust/constants/refinement.py.
 """
 
 from __future__ import annotations

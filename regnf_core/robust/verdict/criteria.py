@@ -3,7 +3,7 @@
 Where the scene's field is rough, the right object does not reach the inlier distance of accurate fields, and normals
 tell little. There, coarse agreement may stand in: the samples that agree at twice the distance, whatever the normals,
 minus the share of the object that lies in free space by more than that. Another object's shape differs by more than the
-roughness. The thresholds are VERDICT in regnf_core/robust/constants.py and the options of the preset.
+roughness. The thresholds are VERDICT in regnf_core/robust/constants/verdict.py and the options of the preset.
 """
 
 from __future__ import annotations
