@@ -85,34 +85,36 @@ def reconstruct(
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
     held_out = prepared.held_out.to(torch_device)
-    pose_shift = None
     if trainer.poses is not None:
         images = trainer.poses.corrected(images)
-        seen = observe(images, options.observation_voxels, prepared.spread)
-        write = replace(write, observation=seen)
+        write = replace(write, observation=observe(images, options.observation_voxels, prepared.spread))
         with torch.no_grad():
             held_out = trainer.poses.correct(held_out)
-        pose_shift = trainer.poses.median_shift()
     chosen = held_out_images(len(images.colors))
     color = _fit_color(trainer, prepared, chosen, seed)
-    write(trainer, files.output, color)
-    if files.pictures:
-        _draw(trainer.averaged, prepared.bounds, files.output.with_suffix(".png"))
-    if files.sdfstudio is not None:
-        write_sdfstudio(trainer.averaged, prepared.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
-    if files.checkpoint is not None:
-        files.checkpoint.unlink(missing_ok=True)
+    _write_all(trainer, files, write, color)
     errors = evaluate(trainer.averaged, held_out, prepared.size)
     alike = None if color is None else likeness(trainer.averaged, color, images, chosen, prepared.size)
     return ReconstructionReport(
         loss=loss,
         psnr=None if alike is None else alike.psnr,
         ssim=None if alike is None else alike.ssim,
-        pose_shift=pose_shift,
+        pose_shift=None if trainer.poses is None else trainer.poses.median_shift(),
         iterations=options.iterations,
         seconds=time.monotonic() - started,
         **asdict(errors),
     )
+
+
+def _write_all(trainer: Trainer, files: FitFiles, write: _Writer, color: SurfaceColor | None) -> None:
+    """Write what the caller asked for. What the fit would have gone on from is no longer needed."""
+    write(trainer, files.output, color)
+    if files.pictures:
+        _draw(trainer.averaged, write.bounds, files.output.with_suffix(".png"))
+    if files.sdfstudio is not None:
+        write_sdfstudio(trainer.averaged, write.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
+    if files.checkpoint is not None:
+        files.checkpoint.unlink(missing_ok=True)
 
 
 def _near(
