@@ -108,3 +108,22 @@ def test_a_folder_is_as_large_as_its_files(tmp_path: Path) -> None:
     (tmp_path / "deep" / "file").write_bytes(os.urandom(MIB))
     assert folder_bytes(tmp_path) >= MIB
     assert folder_bytes(tmp_path / "gone") == 0
+
+
+def test_a_folder_that_goes_while_it_is_looked_at_does_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job removes its folders while the worker measures them: that must not end the worker."""
+    (tmp_path / "stays").write_bytes(os.urandom(MIB))
+    (tmp_path / "goes" / "deeper").mkdir(parents=True)
+    look = os.scandir
+
+    def too_late(folder: str | Path) -> object:
+        if Path(folder).name == "goes":
+            (tmp_path / "goes" / "deeper").rmdir()
+            (tmp_path / "goes").rmdir()
+        return look(folder)
+
+    monkeypatch.setattr(os, "scandir", too_late)
+    assert MIB <= folder_bytes(tmp_path) < 2 * MIB
+    assert not (tmp_path / "goes").exists()
