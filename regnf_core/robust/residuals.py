@@ -2,10 +2,12 @@
 
 With y = T x for scene points x, w = T^-1 z for object points z, g the fields' gradients:
 
-    r1 = S_b(y) - s S_a(x)    dr1 = [ (y-t) x g_b,      g_b,    g_b . (y-t) - s S_a(x)         ]
-    r2 = s S_a(w) - S_b(z)    dr2 = [ -(z-t) x (R g_a), -R g_a, s S_a(w) - (R g_a) . (z-t)     ]
+    r1 = S_b(y) - s S_a(x)    s d(r1/s) = [ (y-t) x g_b,      g_b,    g_b . (y-t) - S_b(y)        ]
+    r2 = s S_a(w) - S_b(z)    s d(r2/s) = [ -(z-t) x (R g_a), -R g_a, S_b(z) - (R g_a) . (z-t)    ]
 
-Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them.
+Both vanish for all points, on the surface or off it, when S_b(T x) = s S_a(x): the scale is part of them. What is
+differentiated is the residual as a length of the scene, r/s: as a length of the object it would fall with s alone, and
+so make every object that is seen from one side too large (docs/adr/0035-residuals-in-scene-units.md).
 
 Fields learned from images are too thick or too thin by about the same amount everywhere. The two surfaces are then an
 offset d apart, S_b(T x) = s S_a(x) + d, and what vanishes is r1 - d and r2 + d.
@@ -65,7 +67,8 @@ class SurfacePair:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7).
+    """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7), at fixed units
+    of the scene: s d(r/s).
 
     Vectors are kept as planes, (H, 3, N) and (H, 7, N), so that all work runs along long rows; the Jacobian is such a
     tensor, seen from the other side.
@@ -166,7 +169,7 @@ def _scene_to_object(obj: DistanceModel, A: Samples, T: Sim3) -> tuple[Tensor, T
     arm = (s[..., None] * R) @ A.points.mT  # y - t, (H, 3, N)
     value, g = _query(obj, arm + t)
     own = s * A.values
-    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(own)), _cosine(g, R @ A.normals.mT)
+    return value - own, _jacobian(arm, g, _dot(g, arm).sub_(value)), _cosine(g, R @ A.normals.mT)
 
 
 def _object_to_scene(
@@ -178,7 +181,7 @@ def _object_to_scene(
     value, g = _query(scene, w)
     turned = R @ g  # R g_a
     scaled = s * value
-    J = _jacobian(arm, -turned, scaled - _dot(turned, arm))
+    J = _jacobian(arm, -turned, B.values - _dot(turned, arm))
     r2 = scaled - B.values
     cosines = _cosine(turned, B.normals.mT)
     if unobserved is None:

@@ -78,6 +78,8 @@ class RefinementConstants:
     unobserved_loss: float = 0.6
     """Score, 0..1. Largest loss of an object sample at an unobserved place. [by hand, on objects known from one
     view]"""
+    min_observed_share: float = 0.25
+    """Share of the object's samples. Where fewer are observed, they weigh no more than if so many were. [by hand]"""
     max_offset: float = 0.04
     """Diameters. Largest offset between the two surfaces. [early fits]"""
     offset_prior: float = 0.02

@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.devices import on_host
-from regnf_core.robust.refine.loss import adaptive_width, normal_equations, robust_cost
+from regnf_core.robust.refine.loss import adaptive_width, normal_equations, observed_weight, robust_cost
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
 from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBound, ScaleBounds
 
@@ -64,23 +64,36 @@ def minimize(
     """Minimize the robust cost of every pose of the batch T (H,), one iteration for each kernel width.
 
     widths: object diameters; falling widths anneal. A step that raises the cost is undone and damped more.
+    A kernel has its width at the start of the minimization, and stays as wide in the scene: in object units, it is wider
+    where the scale is larger.
     offset: (H,) float64 to start from, of one surface outside of the other; None: there is none.
     Each iteration evaluates each field once at each sample. Linear systems are solved in float64.
     """
     now = residuals(surfaces, T, offset)
+    weight, start = observed_weight(now), T.scale
     damping = torch.full_like(T.scale, REFINEMENT.damping_start, dtype=torch.float64)
-    width: Tensor | float = widths[-1]
+    costs = torch.zeros_like(now.values[:, 0])
     for lowest in widths:
-        width = adaptive_width(now, lowest, settings.widest) if settings.widest else lowest
-        step = _step(now, width, damping, T.scale, settings)
+        width = lowest * _rate(T, start, now)
+        if settings.widest:
+            width = adaptive_width(now, width, max(lowest, settings.widest) / lowest * width)
+        step = _step(now, (width, weight), damping, T.scale, settings)
         T_tried = T.perturb(step[:, :7])
         tried = residuals(surfaces, T_tried, _moved_offset(now, step, settings))
-        better = robust_cost(tried, width, settings.normals) < robust_cost(now, width, settings.normals)
+        tried_costs = robust_cost(tried, width * _rate(T_tried, T.scale, now), settings.normals, weight)
+        costs = robust_cost(now, width, settings.normals, weight)
+        better = tried_costs < costs
         T, now = Sim3.where(better, T_tried, T), Residuals.where(better, tried, now)
-        damping = _next_damping(damping, better)
+        costs, damping = torch.where(better, tried_costs, costs), _next_damping(damping, better)
         if on_iteration is not None:
-            on_iteration(Iteration(T, now, robust_cost(now, width, settings.normals), lowest))
-    return Refined(T, robust_cost(now, width, settings.normals), now)
+            on_iteration(Iteration(T, now, costs, lowest))
+    return Refined(T, costs, now)
+
+
+def _rate(T: Sim3, start: Tensor, r: Residuals) -> Tensor:
+    """(H, 1): object units of the poses T (H,) for each one of poses with the scales ``start`` (H,), for lengths that
+    are the same in the scene."""
+    return (T.scale / start).to(r.values)[:, None]
 
 
 def _moved_offset(now: Residuals, step: Tensor, settings: Settings) -> Tensor | None:
@@ -95,9 +108,16 @@ def _next_damping(damping: Tensor, better: Tensor) -> Tensor:
     return torch.where(better, less, more).clamp(*REFINEMENT.damping_range)
 
 
-def _step(r: Residuals, width: Tensor | float, damping: Tensor, scale: Tensor, settings: Settings) -> Tensor:
-    """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset)."""
-    H, b = normal_equations(r, width, settings.normals)
+def _step(
+    r: Residuals,
+    kernel: tuple[Tensor, Tensor | None],
+    damping: Tensor,
+    scale: Tensor,
+    settings: Settings,
+) -> Tensor:
+    """(H, 7) or, with an offset, (H, 8) steps of (omega, dt, log scale, offset). kernel: its width, and what observed
+    object samples weigh."""
+    H, b = normal_equations(r, kernel[0], settings.normals, kernel[1])
     diagonal = H.diagonal(dim1=-2, dim2=-1)
     largest = diagonal.amax(-1, keepdim=True)
     extra = damping[:, None] * diagonal + REFINEMENT.min_damping + REFINEMENT.relative_damping * largest

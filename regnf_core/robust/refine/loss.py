@@ -8,14 +8,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.robust.constants import REFINEMENT
+from regnf_core.robust.constants import EVIDENCE, REFINEMENT
 from regnf_core.robust.kernel import geman_mcclure_agreement, geman_mcclure_weight
 from regnf_core.robust.residuals import Residuals
 
 
-def adaptive_width(r: Residuals, lowest: float, widest: float) -> Tensor:
+def adaptive_width(r: Residuals, lowest: Tensor | float, widest: Tensor | float) -> Tensor:
     """(H, 1) kernel widths: ``lowest``, or up to ``widest`` where the spread of a pose's residuals asks for it. Object
-    diameters.
+    diameters; both are numbers, or (H, 1).
 
     With a fixed narrow kernel, fields with errors everywhere would be fitted at the few places without errors.
     """
@@ -25,7 +25,7 @@ def adaptive_width(r: Residuals, lowest: float, widest: float) -> Tensor:
     else:
         counting = size.masked_fill(r.shares == 0.0, torch.nan)
         spread = torch.nanquantile(counting, REFINEMENT.spread_quantile, dim=1, keepdim=True)
-    return (REFINEMENT.spread_factor * spread).clamp(lowest, max(lowest, widest))
+    return (REFINEMENT.spread_factor * spread).clamp(lowest, widest)  # type: ignore[arg-type]  # two numbers or tensors
 
 
 def kernel_widths(r: Residuals, width: Tensor | float) -> Tensor | float:
@@ -41,12 +41,37 @@ def offset_prior(r: Residuals) -> float:
 
 
 def facing(r: Residuals) -> Tensor:
-    """(H, N + M), 0..1: how well the normals agree: their cosine, 0 where they are more than 90 degrees apart."""
-    return r.cosines.clamp(0.0, 1.0)
+    """(H, N + M), 0..1: how well the normals agree: 1 where they are as close as an inlier's, 0 where they are more
+    than 90 degrees apart. Small things have rough normals: how far within 60 degrees tells little of a pose."""
+    return (r.cosines / EVIDENCE.min_inlier_cosine).clamp(0.0, 1.0)
 
 
-def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True) -> Tensor:
-    """(H,): mean over each direction of the loss, 0..1, the two directions averaged.
+def _weighted(values: Tensor, r: Residuals, weight: Tensor | None) -> Tensor:
+    """Values (H, N + M) of the samples, those of observed object samples times the weight (H, 1)."""
+    if weight is None or r.unobserved is None:
+        return values
+    n = r.scene_count
+    of_object = torch.where(r.unobserved[:, n:], values[:, n:], weight * values[:, n:])
+    return torch.cat([values[:, :n], of_object], 1)
+
+
+def observed_weight(r: Residuals) -> Tensor | None:
+    """(H, 1): what an object sample that was observed weighs: as if all of the object had been. None: all of it was.
+
+    Else the scene, all of whose samples were measured, has more to say the less of the object was seen, and what is near
+    the object makes it too large.
+    """
+    if r.unobserved is None:
+        return None
+    observed = (~r.unobserved[:, r.scene_count :]).to(r.values).mean(1, keepdim=True)
+    return 1.0 / observed.clamp_min(REFINEMENT.min_observed_share)
+
+
+def robust_cost(
+    r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None
+) -> Tensor:
+    """(H,): mean over each direction of the loss, 0..1, the two directions averaged. weight: see
+    :func:`observed_weight`; with it the loss may exceed 1.
 
     The loss is the Geman-McClure loss where the normals agree, larger where they do not, as that of
     :func:`disagreement`: surface that faces another way does not attract, however near it is. ``normals``: whether
@@ -56,7 +81,7 @@ def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True) -> Te
     widths = kernel_widths(r, width)
     agreement = geman_mcclure_agreement(r.values, widths)
     loss = (1.0 - (agreement * facing(r) if normals else agreement)) * (widths / width) ** 2
-    of_scene, of_object = r.means(loss)
+    of_scene, of_object = r.means(_weighted(loss, r, weight))
     cost = 0.5 * (of_scene + of_object)
     if r.offset is None:
         return cost
@@ -64,14 +89,16 @@ def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True) -> Te
     return cost + prior
 
 
-def normal_equations(r: Residuals, width: Tensor | float, normals: bool = True) -> tuple[Tensor, Tensor]:
+def normal_equations(
+    r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64, summed in the residuals' own precision.
 
-    Each direction has the same total influence. An offset is the eighth unknown. The normals' agreement counts as a
+    Each direction has the same total influence, but for ``weight`` (:func:`observed_weight`). An offset is the eighth unknown. The normals' agreement counts as a
     constant weight: how it changes with the pose is left out, and steps that raise the cost are undone.
     """
     weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
-    weights = r.weighted(weights * facing(r) if normals else weights)
+    weights = r.weighted(_weighted(weights * facing(r) if normals else weights, r, weight))
     J = r.jacobian_with_offset().mT
     weighted = J * weights[:, None]
     H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()

@@ -1,4 +1,4 @@
-"""The residuals' derivatives, by two independent routes, in several frames and at several scales."""
+"""The residuals' derivatives as lengths of the scene, by two independent routes, in several frames, at several scales."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_the_jacobian_is_what_autograd_says(scale: float, frame: int) -> None:
 
     def moved(step: Tensor) -> Tensor:
         p = T[None].perturb(step[None])
-        return plain_residuals(scene, obj, A, B, Sim3(p.scale[0], p.rotation[0], p.translation[0]))
+        in_object = plain_residuals(scene, obj, A, B, Sim3(p.scale[0], p.rotation[0], p.translation[0]))
+        return in_object / p.scale[0] * T.scale
 
     expected = torch.autograd.functional.jacobian(moved, torch.full((7,), 1e-12, dtype=torch.float64))
     found = residuals(SurfacePair(scene, obj, A, B), T[None])
@@ -69,8 +70,10 @@ def test_the_jacobian_is_what_finite_differences_say(scale: float, frame: int) -
     for k in range(7):
         step = torch.zeros(1, 7, dtype=torch.float64)
         step[0, k] = h
-        up = residuals(SurfacePair(scene, obj, A, B), T[None].perturb(step)).values[0]
-        down = residuals(SurfacePair(scene, obj, A, B), T[None].perturb(-step)).values[0]
+        up, down = (
+            residuals(SurfacePair(scene, obj, A, B), moved).values[0] * T.scale / moved.scale[0]
+            for moved in (T[None].perturb(step), T[None].perturb(-step))
+        )
         scaled = found[:, k].abs().max().clamp_min(1.0)
         torch.testing.assert_close(found[:, k] / scaled, (up - down) / (2 * h) / scaled, rtol=1e-4, atol=1e-6)
 
