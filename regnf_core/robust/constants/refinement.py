@@ -12,7 +12,7 @@ from regnf_core.robust.stage import Stage
 _LAST_STAGES = (
     Stage(
         points=700,
-        widths=(0.01, 0.01) + (0.008,) * 5,
+        widths=(0.02, 0.02, 0.015, 0.01) + (0.008,) * 3,
         score_width=0.015,
         keep=8,
         min_distance=0.03,
@@ -45,9 +45,9 @@ class RefinementConstants:
     kernels. [by hand, the first and the numbers kept on random worlds]"""
     last_stages: tuple[Stage, ...] = _LAST_STAGES
     """On what is left, and the best pose's symmetry equivalents. Wide kernels find the pose among rough surfaces,
-    narrow ones keep what is close by from drawing it away. Normals do not count: the cost is smooth without them, and
-    so many iterations bring poses of other seeds to the same place before the second. [by hand, the second on random
-    worlds]"""
+    narrow ones keep what is close by from drawing it away. Normals do not count: the cost is smooth without them.
+    The first begins with wider kernels: narrow ones have minima close to each other, in which poses of other seeds
+    would end. [by hand, the second on random worlds]"""
     same_pose: float = 0.06
     """Diameters. A symmetry equivalent closer to a pose that is there already is not added. [by hand]"""
     damping_start: float = 1e-2

@@ -64,8 +64,8 @@ def minimize(
     """Minimize the robust cost of every pose of the batch T (H,), one iteration for each kernel width.
 
     widths: object diameters; falling widths anneal. A step that raises the cost is undone and damped more.
-    A kernel has its width at the start of the minimization, and stays as wide in the scene: in object units, it is wider
-    where the scale is larger.
+    A kernel has its width at the start of the minimization, and stays as wide in the scene: in object units, it is
+    wider where the scale is larger.
     offset: (H,) float64 to start from, of one surface outside of the other; None: there is none.
     Each iteration evaluates each field once at each sample. Linear systems are solved in float64.
     """

@@ -58,8 +58,8 @@ def _weighted(values: Tensor, r: Residuals, weight: Tensor | None) -> Tensor:
 def observed_weight(r: Residuals) -> Tensor | None:
     """(H, 1): what an object sample that was observed weighs: as if all of the object had been. None: all of it was.
 
-    Else the scene, all of whose samples were measured, has more to say the less of the object was seen, and what is near
-    the object makes it too large.
+    Else the scene, all of whose samples were measured, has more to say the less of the object was seen, and what is
+    near the object makes it too large.
     """
     if r.unobserved is None:
         return None
@@ -67,9 +67,7 @@ def observed_weight(r: Residuals) -> Tensor | None:
     return 1.0 / observed.clamp_min(REFINEMENT.min_observed_share)
 
 
-def robust_cost(
-    r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None
-) -> Tensor:
+def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None) -> Tensor:
     """(H,): mean over each direction of the loss, 0..1, the two directions averaged. weight: see
     :func:`observed_weight`; with it the loss may exceed 1.
 
@@ -94,8 +92,9 @@ def normal_equations(
 ) -> tuple[Tensor, Tensor]:
     """J^T W J (H, 7, 7) and J^T W r (H, 7) in float64, summed in the residuals' own precision.
 
-    Each direction has the same total influence, but for ``weight`` (:func:`observed_weight`). An offset is the eighth unknown. The normals' agreement counts as a
-    constant weight: how it changes with the pose is left out, and steps that raise the cost are undone.
+    Each direction has the same total influence, but for ``weight`` (:func:`observed_weight`). An offset is the eighth
+    unknown. The normals' agreement counts as a constant weight: how it changes with the pose is left out, and steps
+    that raise the cost are undone.
     """
     weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
     weights = r.weighted(_weighted(weights * facing(r) if normals else weights, r, weight))

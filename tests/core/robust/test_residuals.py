@@ -1,4 +1,4 @@
-"""The residuals' derivatives as lengths of the scene, by two independent routes, in several frames, at several scales."""
+"""The derivatives of the residuals as lengths of the scene, by two routes, in several frames and at several scales."""
 
 from __future__ import annotations
 

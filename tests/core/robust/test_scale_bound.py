@@ -69,7 +69,8 @@ def test_seeds_of_one_scale_are_not_tried_twice() -> None:
 @pytest.mark.parametrize("allowed", [1.0, 1.1])
 def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> None:
     """From poses of another scale the steps go up to the bound; the minimum there is where steps of fixed scale end.
-    Without normals: the cost is smooth, so there is one minimum."""
+    Without normals: the cost is smooth, so there is one minimum. On the bound the kernels of both are equally wide:
+    widths are those at the start, and stay the same in the scene."""
     generator = torch.Generator().manual_seed(0)
     target = sample_object_surface(chair(), 600, generator)
     surfaces = SurfacePair(target.field, target.field, target.samples, target.samples)
@@ -77,7 +78,8 @@ def test_the_minimum_on_the_bound_is_that_of_the_poses_on_it(allowed: float) -> 
     start = Sim3.identity().expand(6).perturb(step)
     larger = Sim3(torch.full_like(start.scale, 1.3), start.rotation, start.translation)
     widths = [0.2] * 25
-    from_above = minimize(surfaces, larger, widths, Settings(scale=ScaleBound(allowed, 2.0), normals=False))
+    wider = [0.2 * 1.3 / allowed] * 25
+    from_above = minimize(surfaces, larger, wider, Settings(scale=ScaleBound(allowed, 2.0), normals=False))
     on_it = Sim3(torch.full_like(start.scale, allowed), start.rotation, start.translation)
     along = minimize(surfaces, on_it, widths, Settings(scale=ScaleBound(allowed, allowed), normals=False))
     torch.testing.assert_close(along.T.scale, torch.full_like(start.scale, allowed))
