@@ -68,7 +68,8 @@ class SurfacePair:
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Residuals (H, N + M) of H poses, scene samples first, object units; their Jacobian (H, N + M, 7), at fixed units
-    of the scene: s d(r/s).
+    of the scene: s d(r/s). Its column of the scale is that without an offset, whose part is next to nothing where
+    the offset is at its best.
 
     Vectors are kept as planes, (H, 3, N) and (H, 7, N), so that all work runs along long rows; the Jacobian is such a
     tensor, seen from the other side.

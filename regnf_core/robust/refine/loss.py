@@ -63,8 +63,8 @@ def observed_weight(r: Residuals) -> Tensor | None:
     """
     if r.unobserved is None:
         return None
-    observed = (~r.unobserved[:, r.scene_count :]).to(r.values).mean(1, keepdim=True)
-    return 1.0 / observed.clamp_min(REFINEMENT.min_observed_share)
+    _, observed = r.means((~r.unobserved).to(r.values))
+    return 1.0 / observed[:, None].clamp_min(REFINEMENT.min_observed_share)
 
 
 def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None) -> Tensor:
