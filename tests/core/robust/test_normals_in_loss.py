@@ -50,8 +50,8 @@ def test_where_all_was_observed_the_cost_is_the_score() -> None:
 
 
 def test_an_object_is_not_drawn_to_surface_that_faces_it() -> None:
-    """A block beside a wall, 8 % of its diameter away. Without normals it moves by a fortieth of its diameter; by 7 %
-    where the kernels' widths followed the object, which then grew as well."""
+    """A block beside a wall, 8 % of its diameter away. Without normals it moves by 7 %, in six steps with the widest
+    kernel."""
     block = boxes([([-0.2, -0.15, -0.3], [0.2, 0.15, 0.3])])
     wall = boxes([([0.26, -0.3, -0.4], [0.9, 0.3, 0.4])])
     target = sample_object_surface(block, 600, torch.Generator().manual_seed(0))
@@ -61,10 +61,10 @@ def test_an_object_is_not_drawn_to_surface_that_faces_it() -> None:
     truth = target.frame.to_field().inverse() @ scene.frame.to_field()
     off = {}
     for normals in (True, False):
-        found = minimize(surfaces, truth[None], [0.15, 0.12, 0.10, 0.08, 0.08, 0.08], Settings(normals=normals)).T
+        found = minimize(surfaces, truth[None], [0.15] * 6, Settings(normals=normals)).T
         off[normals] = float(displacement(found, truth, target.samples.points)[0])
     assert off[True] < 0.005
-    assert off[False] > 0.02
+    assert off[False] > 0.03
 
 
 def test_the_last_stages_alone_leave_them_out() -> None:
