@@ -16,7 +16,7 @@ from regnf_state.originals import original_key
 from regnf_state.ownership import sha256_of
 from regnf_state.record_store import RecordStore
 from regnf_state.records import FieldRecord, JobRecord
-from tests.ui.fixture_server import field_picture
+from tests.ui.stories import field_picture
 
 _LOOK_S = 0.05
 

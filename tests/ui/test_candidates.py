@@ -8,7 +8,7 @@ from pathlib import Path
 from playwright.sync_api import expect
 
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import CANDIDATES
+from tests.ui.stories import CANDIDATES
 
 
 def test_each_candidate_has_its_picture_and_its_line(visit: Visit, tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from regnf_state.settings import Settings
 from regnf_state.stores import Stores
 from tests.stores import private_stores
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import field_picture
 from tests.ui.pixels import canvas_pixels, colored
+from tests.ui.stories import field_picture
 from tests.ui.synthetic import JOB_ID, Synthetic
 from tests.ui.synthetic_meshes import object_mesh, scene_mesh
 

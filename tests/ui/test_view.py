@@ -1,8 +1,7 @@
-"""The page of a finished job: what is drawn, what moves, which numbers are shown."""
+"""The page of a finished job: what is drawn and what moves."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from pathlib import Path
@@ -12,8 +11,9 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.ui.conftest import Visit
-from tests.ui.fixture_server import LABELS, TOKEN, WEB
+from tests.ui.fixture_server import TOKEN
 from tests.ui.pixels import canvas_pixels, center_of, changed_share, colored, differs, overlap
+from tests.ui.stories import LABELS
 from tests.ui.synthetic import ITERATIONS
 
 pytestmark = pytest.mark.browser
@@ -95,81 +95,6 @@ def test_result_lies_on_the_scene(visit: Visit) -> None:
     assert overlap(chair_in_scene, differs(nothing, canvas_pixels(page))) > 0.8
     seek(visit, 0)
     assert overlap(chair_in_scene, differs(nothing, canvas_pixels(page))) < 0.4
-
-
-def test_numbers_are_the_documents(visit: Visit) -> None:
-    page = visit.open("done")
-    result = visit.server.stage.data.result
-    assert page.locator("#verdict-word").inner_text() == "Registered"
-    assert "SURFACES_AGREE" in page.locator("#verdict-reason").inner_text()
-    cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
-    assert np.allclose(np.reshape(cells, (4, 4)), result["T_object_scene"]["matrix"], atol=5.1e-6)
-    before = page.locator("#matrix").inner_text()
-    page.locator("text=scene ← object").first.click()
-    expect(page.locator("#matrix")).not_to_have_text(before, use_inner_text=True)
-    cells = [float(text.replace("−", "-")) for text in page.locator("#matrix td").all_inner_texts()]
-    assert np.allclose(np.reshape(cells, (4, 4)), result["T_scene_object"]["matrix"], atol=5.1e-6)
-    figures = page.locator("#figures").inner_text()
-    assert "1.6000" in figures
-    assert "93.1 %" in figures
-    assert "0.41 %" in figures
-    assert "12.3 s" in figures
-    assert page.locator("#shares").inner_text().split("\n")[:2] == ["Scene inliers", "96.2 %"]
-    assert page.locator("#time-key li").count() == 6
-    label = page.locator("#distance svg").get_attribute("aria-label")
-    rows = json.loads(visit.server.stage.data.artifacts["trace.json"])
-    end = (rows[-1]["residual_scene"] + 1.6 * rows[-1]["residual_object"]) / 2  # the latter is in the scene's units
-    assert label is not None
-    told = re.fullmatch(r"Mean distance over 40 iterations, from (\S+) to (\S+) object units", label)
-    assert told is not None
-    assert float(told[2]) == pytest.approx(end, rel=0.01)
-    assert float(told[1]) > 5 * float(told[2])
-
-
-def test_fields_are_called_by_their_names(visit: Visit) -> None:
-    page = visit.open("done")
-    expect(page.locator("#job-title")).to_have_text(f"{CHAIR} in {ROOM}")
-    assert page.title() == f"{CHAIR} in {ROOM} – regnf"
-    facts = page.locator("#job-facts").inner_text()
-    assert ROOM in facts
-    assert CHAIR in facts
-    assert "a3" * 32 not in page.locator("body").inner_text()
-    assert page.locator("#job-facts [title]").first.get_attribute("title") == "a3" * 32
-    page.route("**/fields/*", lambda route: route.fulfill(status=404, json={"reason": "FIELD_NOT_FOUND"}))
-    page.reload()
-    expect(page.locator("#job-title")).to_have_text(f"{('7c' * 32)[:12]} in {('a3' * 32)[:12]}")
-
-
-def test_every_metric_has_a_sentence_and_the_time_is_the_whole(visit: Visit) -> None:
-    page = visit.open("done")
-    about = json.loads((WEB / "metrics.json").read_text(encoding="utf-8"))
-    said = page.locator("#agreement").inner_text()
-    names = [name for name in visit.server.stage.data.result["metrics"] if not name.startswith("seconds")]
-    assert [name for name in names if about[name]["meaning"] not in said] == []
-    assert "14.0 s" in page.locator("#figures").inner_text()  # created 20:26:40, finished 20:26:54
-    assert page.locator("#time-total").inner_text() == "12.3 s of 14.0 s from request to result"
-
-
-def test_the_curve_is_in_shares_of_the_diameter_where_that_is_known(visit: Visit) -> None:
-    result = visit.server.stage.data.result
-    metrics = result["metrics"] | {"object_diameter": 0.5}
-    visit.page.route("**/result", lambda route: route.fulfill(status=200, json=result | {"metrics": metrics}))
-    page = visit.open("done")
-    assert page.locator("#distance-note").inner_text() == "of the diameter"
-    label = page.locator("#distance svg").get_attribute("aria-label") or ""
-    end = json.loads(visit.server.stage.data.artifacts["trace.json"])[-1]
-    told = float(label.removesuffix(" of the diameter").split()[-1])
-    assert told == pytest.approx((end["residual_scene"] + 1.6 * end["residual_object"]) / 2 / 0.5, rel=0.01)
-
-
-def test_matrix_is_copied_whole(visit: Visit) -> None:
-    page = visit.page
-    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    visit.open("done")
-    page.locator("#copy-matrix").click()
-    expect(page.locator("#copy-matrix")).to_have_text("Copied")
-    copied = json.loads(page.evaluate("navigator.clipboard.readText()"))
-    assert np.allclose(copied, visit.server.stage.data.T_object_scene, atol=1e-12)
 
 
 def test_residuals_color_the_clouds(visit: Visit) -> None:
@@ -288,14 +213,6 @@ def test_fields_without_a_picture_have_no_card(visit: Visit) -> None:
         page = visit.open("done")
     assert page.locator("#fields").is_hidden()
     assert page.locator("#verdict-word").inner_text() == "Registered"
-
-
-def test_sparse_result_is_shown_without_trace_and_start(visit: Visit) -> None:
-    page = visit.open("bare")
-    assert colored(canvas_pixels(page), "blue").mean() > 0.01
-    assert not page.locator("#timeline").is_visible()
-    assert not page.locator("#before-chip").is_visible()
-    assert not page.locator("#convergence").is_visible()
 
 
 def test_damaged_cloud_leaves_the_numbers(visit: Visit) -> None:

@@ -117,7 +117,7 @@ export async function showJob(names, job, result) {
   const engine = result?.engine ?? job.engine ?? {};
   const named = result?.candidates && result.object ? { 'object found': result.object } : {};
   const texts = Object.entries({ ...job.inputs, ...named }).filter(([, value]) => typeof value === 'string' && value !== '');
-  const inputs = await Promise.all(texts.map(async ([name, value]) => [words(name), await valueOf(names, value)]));
+  const inputs = await Promise.all(texts.map(async ([name, value]) => [words(name), await valueOf(names, name, value)]));
   const title = await names.ofJob(job, result);
   document.title = `${title} – regnf`;
   byId('job-title').textContent = title;
@@ -136,7 +136,10 @@ export async function showJob(names, job, result) {
   show(byId('about'));
 }
 
-const valueOf = async (names, value) => (/^[0-9a-f]{64}$/.test(value)
+/** Of the inputs only fields have names: the digest of the options looks like a field's. */
+const FIELDS = ['scene', 'object', 'object found'];
+
+const valueOf = async (names, name, value) => (FIELDS.includes(name) && /^[0-9a-f]{64}$/.test(value)
   ? el('span', { title: value }, await names.of(value))
   : mono(value));
 

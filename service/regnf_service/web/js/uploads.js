@@ -30,5 +30,5 @@ function describe(file, role) {
   return { ...(label && { label }), ...(OF_NO_SIDE.test(file.name) && { as: role }) };
 }
 
-/** What people call a field: by the library's name, else by its label. */
-export const nameOf = (field) => field.library?.name || field.label || `${field.report?.family ?? 'field'} ${field.sha256.slice(0, 8)}`;
+/** What people call a field: by the library's name, else by its label, else by the one that its file carries. */
+export const nameOf = (field) => field.library?.name || field.label || field.report?.label || `${field.report?.family ?? 'field'} ${field.sha256.slice(0, 8)}`;
