@@ -56,6 +56,12 @@ IN_ITS_FILE = {"7e": "stool"}
 """A label that nobody gave at the upload: the field's file carries it."""
 OPTIONS = "0f" * 32
 """A digest, and not one of a field."""
+INPUTS: dict[str, dict[str, Any]] = {
+    "meshed": MESHED,
+    "labeled": {"object": "7e" * 32},
+    "numbers": {"pictures": False},
+}
+"""What some stories' jobs were asked with."""
 RENDERING = {"links": {"view": "/jobs/rendered/view"}}
 REJECTED = {"title": "Field rejected", "reason": "FIELD_REJECTED", "detail": "the field was rejected: LAYOUT_AMBIGUOUS"}
 CANDIDATES = [
@@ -113,30 +119,25 @@ class Stage:
             "engine": {"version": "0.1.0", "device": "cpu"},
             "error": None,
         }
+        document["inputs"] |= INPUTS.get(story, {})
+        return document | self._what_differs(story)
+
+    def _what_differs(self, story: str) -> dict[str, Any]:
+        """From the document of a job that has ended well."""
         still = {"finished_at": None, "expires_at": None}
-        if story == "running":
-            document |= {"status": "running", "phase": "optimizing", "progress": 0.62, **still}
-            if self.cancelled:
-                document |= {"status": "dismissed"}
-        elif story == "queued":
-            document |= {"status": "accepted", "phase": None, "progress": 0.0, "queue_position": 4, **still}
-        elif story == "failed":
-            document |= {"status": "failed", "phase": "sampling", "progress": 0.2, "error": FAILURE}
-        elif story == "asked":
-            document |= {"status": "failed", "phase": "loading", "progress": 0.0, "error": FAILURE | REJECTED}
-        elif story == "meshed":
-            document["inputs"] |= MESHED
-        elif story == "labeled":
-            document["inputs"] |= {"object": "7e" * 32}
-        elif story == "numbers":
-            document["inputs"] |= {"pictures": False}
-        elif story == "dismissed":
-            document |= {"status": "dismissed"}
-        elif story == "rendered":
-            document |= {"id": story, "kind": "render", "inputs": {"scene": "a3" * 32}} | RENDERING
-        elif story in ("live", "polled"):
-            document |= {"phase": None, "progress": 0.0} | STEPS[self.step]
-        return document
+        running = {"status": "running", "phase": "optimizing", "progress": 0.62, **still}
+        moving = {"phase": None, "progress": 0.0} | STEPS[self.step]
+        different: dict[str, dict[str, Any]] = {
+            "running": running | ({"status": "dismissed"} if self.cancelled else {}),
+            "queued": {"status": "accepted", "phase": None, "progress": 0.0, "queue_position": 4, **still},
+            "failed": {"status": "failed", "phase": "sampling", "progress": 0.2, "error": FAILURE},
+            "asked": {"status": "failed", "phase": "loading", "progress": 0.0, "error": FAILURE | REJECTED},
+            "dismissed": {"status": "dismissed"},
+            "rendered": {"id": story, "kind": "render", "inputs": {"scene": "a3" * 32}} | RENDERING,
+            "live": moving,
+            "polled": moving,
+        }
+        return different.get(story, {})
 
     def rendering(self) -> dict[str, Any]:
         """What the service answers when a rendering is asked for."""
