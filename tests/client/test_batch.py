@@ -16,7 +16,7 @@ import pytest
 from regnf_client import AsyncClient, Client, Pair, PairResult, ServiceError
 from tests.client.conftest import pretended
 from tests.contract.asgi import AppTransport
-from tests.contract.test_batches import Rounds
+from tests.contract.batch_rounds import Rounds
 from tests.contract.world import BOX, RESULT, World
 
 
