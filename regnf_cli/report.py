@@ -38,8 +38,11 @@ def show_result(document: dict[str, Any]) -> None:
     )
     if detail := document.get("verdict_detail"):
         _line("", detail)
-    if (probability := (document.get("metrics") or {}).get("probability")) is not None:
+    metrics = document.get("metrics") or {}
+    if (probability := metrics.get("probability")) is not None:
         _line("probability", f"{100 * probability:.1f} % that the pose is right")
+    if verdict == "ambiguous" and (listed := metrics.get("probability_listed")) is not None:
+        _line("", f"{100 * listed:.1f} % that one of the poses listed is right")
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
     _show_warnings(document.get("fields") or {})

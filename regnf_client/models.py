@@ -172,6 +172,11 @@ class Result(Document):
         """That the pose is right, 0..1; None from the preset `paper`."""
         return self.metrics.get("probability")
 
+    @property
+    def probability_listed(self) -> float | None:
+        """That the pose or one of the alternatives is right, 0..1; None from the preset `paper`."""
+        return self.metrics.get("probability_listed")
+
     def apply(self, points: ArrayLike) -> Floats:
         """Points (N, 3) of the scene in the object's frame."""
         moved: Floats = (

@@ -148,9 +148,9 @@ class RobustOptions:
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only."""
     min_probability: Annotated[float, Gt(0), Le(1)] = 0.9
-    """A pose whose surfaces agree less than the options above ask for is accepted all the same if its probability of
-    being right (0..1), estimated from all evidence together, is at least this. Increase it for fewer wrong poses; at 1
-    no pose is accepted in this way."""
+    """A pose whose surfaces agree less than the options above ask for is accepted all the same if it, or one of those
+    that are listed with it, is right with at least this probability (0..1), estimated from all evidence together.
+    Increase it for fewer wrong poses; at 1 no pose is accepted in this way."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score. Increase it to list less exact symmetry equivalents too."""

@@ -98,7 +98,8 @@ class RegistrationResult:
     object_samples: SurfaceSamples
     metrics: dict[str, float]
     """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
-    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more."""
+    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more
+    (docs/reference/metrics.md)."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
     """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""
@@ -121,3 +122,9 @@ class RegistrationResult:
         """That the pose is right, 0..1: within 5 % of the object's diameter, or equal to that by the object's symmetry.
         None from the preset `paper`."""
         return self.metrics.get("probability")
+
+    @property
+    def probability_listed(self) -> float | None:
+        """That T_object_scene or one of the alternatives is right, 0..1: what the verdict rests on. None from the
+        preset `paper`."""
+        return self.metrics.get("probability_listed")

@@ -24,11 +24,10 @@ from regnf_core.geometry.points import NearestNeighbors, diameter
 from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.verdict.evaluation import Ranking, rival_numbers
+from regnf_core.robust.verdict.answer import choose
 from regnf_core.robust.verdict.evidence import gather_evidence
 from regnf_core.robust.verdict.lead import apart
 from regnf_core.robust.verdict.pose_features import pose_features
-from regnf_core.robust.verdict.probability import pose_odds
 from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
@@ -112,8 +111,7 @@ def _described(
     evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, _OPTIONS.robust)
     errors = _errors(problem, candidates.T, known)
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    ranking = Ranking(evidence.scores.double(), pose_odds().alone.logit(features))
-    rivals = rival_numbers(problem, candidates, ranking, _OPTIONS.robust.rival_margin)
+    rivals = choose(problem, candidates, features, evidence.scores, _OPTIONS.robust.rival_margin).rivals
     for number in range(len(candidates)):
         yield {
             "mssd": errors[number],

@@ -12,7 +12,8 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.constants import EVIDENCE, OCCLUSION
+from regnf_core.robust.clearance import clearance
+from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.devices import on_host
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 
@@ -90,14 +91,14 @@ class VoxelStates:
     """An observation's voxels, looked up in a working frame, or in that of each of H poses.
 
     states: (V,) uint8, z fastest · counts: (3,) int64 · turn: (..., 3, 3) and shift: (..., 3), float32: a point x is in
-    the voxel floor(x turn + shift) · voxel: (...) float32, edge in working units.
+    the voxel floor(x turn + shift) · clearance: (...) float32, working units, see :mod:`regnf_core.robust.clearance`.
     """
 
     states: Tensor
     counts: Tensor
     turn: Tensor
     shift: Tensor
-    voxel: Tensor
+    clearance: Tensor
 
     @classmethod
     def of(cls, observation: Observation) -> VoxelStates:
@@ -109,12 +110,12 @@ class VoxelStates:
             torch.tensor(observation.states.shape),
             (to_cells * T.rotation).float().mT.contiguous(),
             ((T.translation - observation.low) / observation.voxel).float(),
-            (1.0 / to_cells).float(),
+            (clearance(observation) / to_cells).float(),
         )
 
     def to(self, device: torch.device) -> VoxelStates:
         """The same on another device."""
-        parts = (self.states, self.counts, self.turn, self.shift, self.voxel)
+        parts = (self.states, self.counts, self.turn, self.shift, self.clearance)
         return VoxelStates(*(part.to(device) for part in parts))
 
     def at(self, points: Tensor) -> Tensor:
@@ -135,9 +136,8 @@ class VoxelStates:
     def facing_unseen(self, points: Tensor, normals: Tensor) -> Tensor:
         """(..., M) bool: no line of sight passed in front of surface elements at points (..., M, 3) with unit normals
         (..., M, 3)."""
-        step = self.voxel[..., None, None] * normals
-        near, far = (points + count * step for count in OCCLUSION.front_voxels)
-        return (self.at(near) != FREE) & (self.at(far) != FREE)
+        ahead = self.clearance[..., None, None] * normals
+        return (self.at(points + 0.5 * ahead) != FREE) & (self.at(points + ahead) != FREE)
 
 
 class WorkingObservation:

@@ -78,6 +78,7 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     said = outcome.stdout
     assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
     assert VERDICT_REASONS["SEVERAL_POSES_AGREE"] in said
+    assert re.search(r"^ +\d+\.\d % that one of the poses listed is right$", said, flags=re.M)
     assert re.search(r"^ *1 +0\.\d{4} +180 degrees about z", said, flags=re.M)
     assert re.search(r"^1 sigma +rotation( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
     assert re.search(r"^ +translation( [\d.e-]+){3} object units$", said, flags=re.M)

@@ -85,10 +85,20 @@ class OcclusionConstants:
     """What the cameras cannot have seen: where an observation says so (working_frame.py), and the occlusion boundaries
     of a scene seen from one point (scene/occlusion_boundary.py)."""
 
-    front_voxels: tuple[float, float] = (1.0, 2.0)
-    """Voxels of the observation in front of a surface element. One of both places was seen to be free, or nobody saw
-    the element from its front. [derived: the first lies beyond the surface's own voxel; next to a measured surface, a
-    voxel may count as unobserved although it was seen. Compared with one and three voxels on random worlds]"""
+    clearance_quantile: float = 0.9
+    """Of the distances from voxels with a measured surface to the nearest free one. The surface lies within a layer of
+    such voxels, and those at its back are the farthest. [by hand; .75 is too little for fits to a recorded kitchen]"""
+    min_clearance: float = 2.0
+    """Voxels. One of the places at half of the clearance and at all of it in front of a surface element was seen to be
+    free, or nobody saw the element from its front. [derived: the first lies beyond the surface's own voxel; next to a
+    measured surface, a voxel may count as unobserved although it was seen. Compared with one and three voxels on random
+    worlds]"""
+    max_clearance: float = 8.0
+    """Voxels. [by hand]"""
+    voxels_drawn: int = 1 << 17
+    """Voxels of an observation, drawn at random, among which those with a measured surface are taken. [by hand]"""
+    voxels_asked: int = 1000
+    """Of those, at most so many. [by hand]"""
 
     guesses: int = 3000
     """Viewpoints tried: where the tangent planes of three random samples meet. [by hand]"""

@@ -15,6 +15,8 @@ from regnf_core.robust.working_frame import VoxelStates, WorkingObservation
 
 Stacked = VoxelStates | SingleView
 """Of P pairs: with one more dimension in front."""
+_OF_FRAMES = ("turn", "shift", "clearance")
+"""What differs where the same voxels are looked up in several frames."""
 
 
 def stacked_tests(tests: Sequence[UnobservedTest | None], device: torch.device) -> Stacked | None:
@@ -25,16 +27,16 @@ def stacked_tests(tests: Sequence[UnobservedTest | None], device: torch.device) 
     seen = [one.on(device) for one in tests if isinstance(one, WorkingObservation)]
     if not seen:
         return None
-    turn, shift, voxel = (torch.stack([getattr(one, name) for one in seen]) for name in ("turn", "shift", "voxel"))
-    return replace(seen[0], turn=turn, shift=shift, voxel=voxel)
+    turn, shift, clearance = (torch.stack([getattr(one, name) for one in seen]) for name in _OF_FRAMES)
+    return replace(seen[0], turn=turn, shift=shift, clearance=clearance)
 
 
 def of_part(stacked: Stacked, part: Part) -> UnobservedTest:
     """The test for points (H N, 3), N of each pose of the part."""
     if isinstance(stacked, SingleView):
         return _OfPoses(SingleView(stacked.viewpoint[part.pairs][:, None]), len(part.pairs))
-    turn, shift, voxel = (getattr(stacked, name)[part.pairs] for name in ("turn", "shift", "voxel"))
-    return _OfPoses(replace(stacked, turn=turn, shift=shift, voxel=voxel), len(part.pairs))
+    turn, shift, clearance = (getattr(stacked, name)[part.pairs] for name in _OF_FRAMES)
+    return _OfPoses(replace(stacked, turn=turn, shift=shift, clearance=clearance), len(part.pairs))
 
 
 @dataclass(frozen=True, eq=False)

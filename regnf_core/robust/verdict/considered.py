@@ -26,22 +26,22 @@ def considered_poses(
     evidence: Evidence,
     demerits: Tensor,
     unexplained: Tensor,
-    log_odds: Tensor,
+    probability: Tensor,
     options: RobustOptions,
 ) -> Considered:
-    """The best of the candidates that differ, the likeliest first. demerits, unexplained, log_odds: (H,) of each."""
+    """The best of the candidates that differ, the likeliest first. demerits, unexplained, probability: (H,) of each."""
     points = problem.model.extremal_points
     numbers = distinct(candidates.T, demerits, points, VERDICT.rivals_min_distance, len(candidates))[:_MOST].tolist()
     poses = []
     for number in numbers:
-        probability = float(log_odds[number].sigmoid())
+        likely = float(probability[number])
         quality = SceneQuality(problem.view.normal_roughness, float(unexplained[number]))
-        found = evaluate_pose(evidence, number, 0, options, quality, probability)
+        found = evaluate_pose(evidence, number, 0, options, quality, likely)
         if not bool(problem.bound.admits(candidates.T[torch.tensor([number])])[0]):
             reason = "OUTSIDE_DETECTION"
         else:
             reason = found.reason
-        metrics = {**evidence.of(number), "probability": probability}
+        metrics = {**evidence.of(number), "probability": likely}
         metrics["unexplained_share_scene"] = float(unexplained[number])
         poses.append(ConsideredPose(problem.in_field_frames(candidates.T[number]), reason, metrics))
     chosen = torch.tensor(numbers)

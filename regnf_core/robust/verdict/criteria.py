@@ -64,9 +64,9 @@ def evaluate_pose(
 ) -> PoseVerdict:
     """The verdict on pose number ``index`` of the evidence, which ``rivals`` other poses equal.
 
-    probability: that the pose is right, 0..1, by all the evidence together. Where it is high, it stands in for the
-    agreement of the surfaces; where it is low, the pose is rejected although all criteria are met. Written so that a
-    number that is not finite can only lead to a rejection.
+    probability: that the pose or one of its rivals is right, 0..1, by all the evidence together. Where it is high, it
+    stands in for the agreement of the surfaces; where it is low, the pose is rejected although all criteria are met.
+    Written so that a number that is not finite can only lead to a rejection.
     """
     occluded = _Criterion("TOO_LITTLE_SURFACE", options.max_occluded_share - float(evidence.occluded[index]))
     accurate = list(_of_accurate_fields(evidence, index, options))

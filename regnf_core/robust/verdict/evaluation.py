@@ -7,22 +7,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.pose_distance import distinct
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, Considered, Verdict
-from regnf_core.robust.constants import REFINEMENT, VERDICT
+from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
+from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.considered import considered_poses
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_known_scale
 from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
 from regnf_core.robust.verdict.evidence import gather_evidence
-from regnf_core.robust.verdict.lead import apart, merits
 from regnf_core.robust.verdict.pose_features import pose_features
-from regnf_core.robust.verdict.probability import pose_odds
 from regnf_core.robust.verdict.relation import relation
 
 
@@ -41,10 +39,13 @@ class Evaluation:
     alternatives: list[Alternative]
     considered: Considered
 
+    demerit: float
+    """What the best candidates of several objects are compared by, as those of one object are."""
+
     @property
     def rank(self) -> tuple[bool, float]:
-        """Smaller is better: rejections last, then the less likely."""
-        return self.verdict == "rejected", -self.metrics["probability"]
+        """Smaller is better: rejections last, then the larger demerit."""
+        return self.verdict == "rejected", self.demerit
 
 
 def evaluate_candidates(
@@ -59,22 +60,19 @@ def evaluate_candidates(
     features = {name: one.cpu() for name, one in pose_features(problem, candidates.T, candidates.offsets).items()}
     problem.held_out.require_finite()
     problem, candidates = problem.to("cpu"), candidates.to("cpu")
-    elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
-    alone, among = pose_odds().log_odds(features, evidence.scores, elsewhere)
-    ranking = Ranking(evidence.scores.double(), alone)
-    winner = ranking.winner
-    rivals = rival_numbers(problem, candidates, ranking, options.robust.rival_margin)
+    answer = choose(problem, candidates, features, evidence.scores, options.robust.rival_margin)
+    winner, listed = answer.winner, answer.probability_listed
     unexplained = float(features["unexplained"][winner])
-    probability = float(among[winner].sigmoid())
     quality = SceneQuality(problem.view.normal_roughness, unexplained)
-    found = evaluate_pose(evidence, winner, len(rivals), options.robust, quality, probability)
+    found = evaluate_pose(evidence, winner, len(answer.rivals), options.robust, quality, float(listed[winner]))
     if not bool(problem.bound.admits(candidates.T[torch.tensor([winner])])[0]):
         found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
     T = problem.in_field_frames(candidates.T[winner])
-    alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, ranking, rivals, T)
+    alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, answer, T)
     metrics = {
         **evidence.of(winner),
-        "probability": probability,
+        "probability": float(answer.probability[winner]),
+        "probability_listed": float(listed[winner]),
         "unexplained_share_scene": unexplained,
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
@@ -83,51 +81,20 @@ def evaluate_candidates(
         "pose_candidates": float(len(candidates)),
     }
     considered = considered_poses(
-        problem, candidates, evidence, ranking.demerits, features["unexplained"], among, options.robust
+        problem, candidates, evidence, answer.demerits, features["unexplained"], listed, options.robust
     )
-    return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered)
-
-
-@dataclass(frozen=True, eq=False)
-class Ranking:
-    """What candidates are compared by, on held-out samples: scores (H,), smaller is better, and the log odds (H,) of
-    being right, of each alone."""
-
-    scores: Tensor
-    log_odds: Tensor
-
-    @property
-    def demerits(self) -> Tensor:
-        """(H,), smaller is better: see :func:`regnf_core.robust.verdict.lead.merits`."""
-        return -merits(self.log_odds, self.scores)
-
-    @property
-    def winner(self) -> int:
-        """The number of the best one."""
-        return int(self.demerits.argmin())
-
-
-def rival_numbers(
-    problem: RegistrationProblem, candidates: PoseCandidates, ranking: Ranking, rival_margin: float
-) -> list[int]:
-    """Numbers of the other poses that explain the held-out samples as well as the best one, best first."""
-    winner, scores = ranking.winner, ranking.scores
-    best = float(scores[winner])
-    close = scores <= best + rival_margin + VERDICT.rival_margin_per_score * best
-    close &= ranking.log_odds >= ranking.log_odds[winner] - VERDICT.rival_log_odds
-    points = problem.model.extremal_points
-    ranked = distinct(candidates.T, ranking.demerits, points, VERDICT.rivals_min_distance, len(candidates))
-    return [number for number in ranked.tolist() if number != winner and close[number]]
+    demerit = float(answer.demerits[winner])
+    return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered, demerit)
 
 
 def _alternatives(
-    problem: RegistrationProblem, candidates: PoseCandidates, ranking: Ranking, rivals: list[int], T_best: Sim3
+    problem: RegistrationProblem, candidates: PoseCandidates, answer: Answer, T_best: Sim3
 ) -> list[Alternative]:
     axis = problem.model.symmetry.axis
     alternatives = []
-    for number in rivals:
+    for number in answer.rivals:
         T = problem.in_field_frames(candidates.T[number])
-        alternatives.append(Alternative(T, float(ranking.scores[number]), relation(T, T_best, axis)))
+        alternatives.append(Alternative(T, float(answer.scores[number]), relation(T, T_best, axis)))
     return alternatives
 
 

@@ -3,9 +3,13 @@
 Poses are compared by their merits: the log odds say which of them fit at all, the score says which of these fits best.
 A pose that is right stands out among all that a search found. Where an object is not in the box, or the right pose was
 lost, several poses are about as likely.
+
+An answer may list several poses that fit alike, of which one is right. They are no rivals of the answer as a whole.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -27,6 +31,14 @@ def leads(merits: Tensor, apart: Tensor) -> Tensor:
     VERDICT.most_lead, which is also the lead of a pose without any."""
     others = torch.where(apart, merits, -torch.inf).amax(1)
     return (merits - others).clamp(-VERDICT.most_lead, VERDICT.most_lead)
+
+
+def apart_from_answer(apart: Tensor, answer: Sequence[int]) -> Tensor:
+    """(H, H) as ``apart``, but a pose of the ``answer``, given by their numbers, is apart only from poses that are
+    apart from all of them."""
+    joined = apart.clone()
+    joined[list(answer)] = apart[list(answer)].all(0)
+    return joined
 
 
 def apart(T: Sim3, points: Tensor, symmetry: SelfSymmetry) -> Tensor:

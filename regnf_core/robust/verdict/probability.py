@@ -88,14 +88,14 @@ class PoseOdds:
     alone: ProbabilityModel
     among: ProbabilityModel
 
-    def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> tuple[Tensor, Tensor]:
-        """(H,) and (H,): log odds of the candidates alone, and among each other.
+    def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> Tensor:
+        """(H,): log odds of the candidates, each as one among them.
 
         features: each (H,) · scores: (H,), smaller is better · apart: (H, H) bool, which candidates are other answers
         than which.
         """
-        alone = self.alone.logit(features)
-        return alone, self.among.logit({**features, LEAD: leads(merits(alone, scores), apart)})
+        lead = leads(merits(self.alone.logit(features), scores), apart)
+        return self.among.logit({**features, LEAD: lead})
 
 
 @cache

@@ -11,7 +11,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.model.self_symmetry import SelfSymmetry
 from regnf_core.robust.search.rotations import turns_about
-from regnf_core.robust.verdict.lead import apart, leads, merits
+from regnf_core.robust.verdict.lead import apart, apart_from_answer, leads, merits
 
 POINTS = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -69,6 +69,18 @@ def test_leads_by_hand() -> None:
     elsewhere = torch.tensor([[False, False, True], [False, False, True], [True, True, False]])
     found = leads(torch.tensor([2.0, 1.0, 0.5]).double(), elsewhere)
     assert found.tolist() == pytest.approx([1.5, 0.5, -1.5])
+
+
+def test_poses_of_one_answer_lead_over_what_is_apart_from_all_of_them() -> None:
+    """0 and 1 are listed; 2 lies near 1, 3 elsewhere. Only 3 competes with the answer; 2 and 3 have their rivals."""
+    elsewhere = torch.tensor(
+        [[False, True, True, True], [True, False, False, True], [True, False, False, True], [True, True, True, False]]
+    )
+    joined = apart_from_answer(elsewhere, [0, 1])
+    assert joined[:2].tolist() == [[False, False, False, True]] * 2
+    assert joined[2:].tolist() == elsewhere[2:].tolist()
+    found = leads(torch.tensor([2.0, 1.9, 1.8, 0.5]).double(), joined)
+    assert found.tolist() == pytest.approx([1.5, 1.4, -0.2, -1.5])
 
 
 def test_a_single_answer_has_the_largest_lead() -> None:

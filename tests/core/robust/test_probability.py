@@ -64,20 +64,20 @@ def test_the_lead_is_taken_from_the_odds_alone_and_the_scores() -> None:
     elsewhere = torch.tensor([[False, False, True], [False, False, True], [True, True, False]])
     told = {"confirmed": torch.tensor([0.9, 0.7, 0.6]), "free": torch.zeros(3)}
     scores = torch.tensor([0.3, 0.3, 0.3]).double()
-    of_each, of_all = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
-    assert of_each.tolist() == pytest.approx([2.0, 1.5, 1.0])
-    assert of_all.tolist() == pytest.approx([1.0 - 2.0, 1.0 - 2.5, 1.0 - 4.0])  # leads 1, .5 and -1
+    assert alone.logit(told).tolist() == pytest.approx([2.0, 1.5, 1.0])
+    found = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
+    assert found.tolist() == pytest.approx([1.0 - 2.0, 1.0 - 2.5, 1.0 - 4.0])  # leads 1, .5 and -1
     scores[2] += 1.5 / VERDICT.log_odds_per_score
-    of_each, of_all = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
-    assert of_each.tolist() == pytest.approx([2.0, 1.5, 1.0])
-    assert of_all.tolist() == pytest.approx([1.0 - 0.5, 1.0 - 1.0, 1.0 - 4.0], abs=1e-6)  # leads 2.5, 2 and -2.5
+    found = PoseOdds(alone, among).log_odds(told, scores, elsewhere)
+    assert found.tolist() == pytest.approx([1.0 - 0.5, 1.0 - 1.0, 1.0 - 4.0], abs=1e-6)  # leads 2.5, 2 and -2.5
 
 
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
 def test_the_shipped_models_are_monotone(name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
     changed = others | {name: torch.tensor([low, low + step], dtype=torch.float64)}
-    for logits in pose_odds().log_odds(changed, torch.full((2,), 0.3), torch.zeros(2, 2, dtype=torch.bool)):
+    odds, single = pose_odds(), torch.zeros(2, 2, dtype=torch.bool)
+    for logits in (odds.alone.logit(changed), odds.log_odds(changed, torch.full((2,), 0.3), single)):
         less, more = logits.tolist()
         assert more >= less if SPEAKS_FOR[name] else more <= less
 
@@ -89,10 +89,12 @@ def test_the_shipped_models_use_what_they_must() -> None:
     worst = {name: -values for name, values in best.items()}
     single, several = torch.zeros(2, 2, dtype=torch.bool), ~torch.eye(2, dtype=torch.bool)
     alike = torch.full((2,), 0.3)
-    likely = [float(one[0].sigmoid()) for one in pose_odds().log_odds(best, alike, single)]
-    assert likely[1] > 0.98, "among the others: what results tell"
-    assert max(float(one[0].sigmoid()) for one in pose_odds().log_odds(worst, alike, single)) < 1e-4
-    assert float(pose_odds().log_odds(best, alike, several)[1][0].sigmoid()) < likely[1]
+    odds = pose_odds()
+    likely = float(odds.log_odds(best, alike, single)[0].sigmoid())
+    assert likely > 0.98, "among the others: what results tell"
+    for logits in (odds.alone.logit(worst), odds.log_odds(worst, alike, single)):
+        assert float(logits[0].sigmoid()) < 1e-4
+    assert float(odds.log_odds(best, alike, several)[0].sigmoid()) < likely
 
 
 def test_a_perfect_pose_alone_is_as_likely() -> None:
