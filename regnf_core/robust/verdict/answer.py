@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from regnf_core.geometry.pose_distance import distinct
-from regnf_core.robust.constants import VERDICT
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import EVIDENCE, VERDICT
+from regnf_core.robust.model.object_model import ObjectModel
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.verdict.lead import apart, apart_from_answer, merits
@@ -20,8 +22,8 @@ class Answer:
 
     scores: (H,), 0..1, smaller is better · demerits: (H,), what candidates are compared by, smaller is better, see
     :func:`regnf_core.robust.verdict.lead.merits` · probability: (H,), that the candidate is right, where all others
-    that place the object elsewhere compete with it · probability_listed: (H,), the same where the best one and its
-    rivals do not compete with each other: of those, that one of them is right.
+    that place the object elsewhere compete with it · probability_listed: (H,), the same where the best one and those of
+    its rivals that place nearly the same surface do not compete with each other: of those, that one of them is right.
     """
 
     winner: int
@@ -51,5 +53,15 @@ def choose(
     rivals = [number for number in ranked.tolist() if number != winner and close[number]]
     elsewhere = apart(candidates.T, points, problem.model.symmetry)
     likely = odds.log_odds(features, scores, elsewhere).sigmoid()
-    listed = odds.log_odds(features, scores, apart_from_answer(elsewhere, [winner, *rivals])).sigmoid()
+    alike = [number for number in rivals if _places_the_same(problem.model, candidates.T, number, winner)]
+    listed = odds.log_odds(features, scores, apart_from_answer(elsewhere, [winner, *alike])).sigmoid()
     return Answer(winner, rivals, scores, demerits, likely, listed)
+
+
+def _places_the_same(model: ObjectModel, T: Sim3, one: int, other: int) -> bool:
+    """Whether two of the poses T (H,) place nearly the same surface in the scene, as the poses of an object do that
+    looks nearly the same when it is turned. Other poses that fit alike speak against all of them: another object's do.
+    """
+    moved = (T[one] @ T[other].inverse()).apply(model.samples.on_surface().double()).float()
+    distances, _ = model.distance_grid.value_and_gradient(moved)
+    return float((distances.abs() <= EVIDENCE.agreement).float().mean()) >= VERDICT.min_same_surface

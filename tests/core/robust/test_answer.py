@@ -3,45 +3,53 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
 
 from regnf_core.geometry.sim3 import Sim3
-from regnf_core.robust.model.self_symmetry import SelfSymmetry
+from regnf_core.robust.model.object_model import model_object
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
+from tests.core.analytic import boxes
 
-POINTS = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
-UNSYMMETRIC = SelfSymmetry(Sim3.identity()[None][:0], None, torch.zeros(0))
+LONG = ([-0.4, -0.1, -0.1], [0.4, 0.1, 0.1])
+"""A long box: turned half about an upright axis it is the same, moved along its length by .05 nearly so."""
 GOOD = {name: 1.0 if better else 0.0 for name, better in SPEAKS_FOR.items()}
 
 
 def answer(shifts: list[float], scores: list[float], **changed: list[float]) -> Answer:
-    """Poses moved so far along x, all good but for the features that are ``changed``."""
+    """Poses of a long box moved so far along its length, in diameters, all good but for the features that are
+    ``changed``."""
     count = len(shifts)
     moved = torch.tensor([[shift, 0.0, 0.0] for shift in shifts]).double()
     T = Sim3(torch.ones(count).double(), torch.eye(3).double().expand(count, 3, 3), moved)
     features = {name: torch.full((count,), value).double() for name, value in GOOD.items()}
     features |= {name: torch.tensor(values).double() for name, values in changed.items()}
-    problem: Any = SimpleNamespace(model=SimpleNamespace(extremal_points=POINTS, symmetry=UNSYMMETRIC))
-    return choose(problem, cast(PoseCandidates, PoseCandidates.start(T)), features, torch.tensor(scores), 0.05)
+    problem: Any = SimpleNamespace(model=model_object(boxes([LONG])))
+    return choose(problem, PoseCandidates.start(T), features, torch.tensor(scores), 0.05)
 
 
-def test_poses_that_fit_alike_are_listed_and_do_not_compete_in_their_answer() -> None:
-    """Two poses fit alike; a third, elsewhere, fits worse than the margin allows."""
-    found = answer([0.0, 0.5, 1.0], [0.2, 0.21, 0.5])
-    single = answer([0.0, 1.0], [0.2, 0.5])
+def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> None:
+    """Two poses an eighth of the diameter apart fit alike; a third, elsewhere, fits worse than the margin allows."""
+    found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
+    single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
     assert float(found.probability[0]) < float(found.probability_listed[0]) - 0.02
     assert float(found.probability_listed[0]) == pytest.approx(float(single.probability[0])), "as if it were alone"
     assert float(found.probability_listed[2]) == pytest.approx(float(found.probability[2])), "it is not listed"
 
 
+def test_poses_that_place_other_surface_compete_though_both_are_listed() -> None:
+    found = answer([0.0, 0.6], [0.2, 0.21])
+    assert (found.winner, found.rivals) == (0, [1])
+    assert torch.equal(found.probability, found.probability_listed)
+
+
 def test_without_rivals_both_probabilities_are_the_same() -> None:
-    found = answer([0.0, 0.03, 1.0], [0.2, 0.21, 0.5])
+    found = answer([0.0, 0.03, 0.6], [0.2, 0.21, 0.5])
     assert found.rivals == []
     assert torch.equal(found.probability, found.probability_listed)
 
