@@ -7,7 +7,10 @@ surface element was seen from its front must look beyond both.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
+from torch.nn.functional import normalize
 
 from regnf_core.fields.observation import Observation
 from regnf_core.robust.constants import OCCLUSION
@@ -21,19 +24,16 @@ def clearance(observation: Observation) -> float:
 
     2 for exact depths, more for noisy ones. The same for every call.
     """
-    generator = fixed_generator()
     states = observation.states
-    drawn = torch.randint(states.numel(), (OCCLUSION.voxels_drawn,), generator=generator)
-    cells = torch.stack(torch.unravel_index(drawn[states.view(-1)[drawn] == SURFACE], states.shape), -1)
-    if len(cells) == 0:
+    drawn = torch.randint(states.numel(), (OCCLUSION.voxels_drawn,), generator=fixed_generator())
+    measured = drawn[states.view(-1)[drawn] == SURFACE][: OCCLUSION.voxels_asked]
+    if len(measured) == 0:
         return OCCLUSION.min_clearance
-    centers = cells[: OCCLUSION.voxels_asked, None] + 0.5
+    centers = torch.stack(torch.unravel_index(measured, states.shape), -1)[:, None] + 0.5
     directions = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * 3)
-    directions = torch.nn.functional.normalize(directions[directions.any(1)])
-    limits = torch.tensor(states.shape)
+    directions = normalize(directions[directions.any(1)])
+    grid = replace(observation, low=torch.zeros(3).double(), voxel=1.0, T_grid_frame=None)
     nearest = torch.full((len(centers),), OCCLUSION.max_clearance)
     for step in range(int(OCCLUSION.max_clearance), 0, -1):
-        x, y, z = (places := (centers + step * directions).floor().long()).clamp_min(0).minimum(limits - 1).unbind(-1)
-        within = ((places >= 0) & (places < limits)).all(-1)
-        nearest[((states[x, y, z] == FREE) & within).any(1)] = float(step)
+        nearest[(grid.at(centers + step * directions) == FREE).any(1)] = float(step)
     return max(OCCLUSION.min_clearance, float(nearest.quantile(OCCLUSION.clearance_quantile)))
