@@ -167,7 +167,7 @@ def field_document(sha256: str) -> dict[str, Any]:
     """The scene was asked about, the object is ready."""
     if not sha256.startswith("a3"):
         links = {"mesh": f"/fields/{sha256}/mesh.glb"} if sha256 in MESHED.values() else {}
-        said = {"label": LABELS.get(sha256[:2]), "report": {"label": IN_ITS_FILE.get(sha256[:2]), "family": "regnf"}}
+        said = {"label": LABELS.get(sha256[:2]), "report": {"label": IN_ITS_FILE.get(sha256[:2])}}
         return {"sha256": sha256, "state": "ready", **said, "links": links, "error": None}
     return {
         "sha256": sha256,
