@@ -124,6 +124,6 @@ class RegistrationResult:
 
     @property
     def probability_listed(self) -> float | None:
-        """That T_object_scene or one of the alternatives is right, 0..1: what the verdict rests on. None from the
-        preset `paper`."""
+        """That T_object_scene, or one of the alternatives that place nearly the same surface, is right, 0..1: what the
+        verdict rests on. None from the preset `paper`."""
         return self.metrics.get("probability_listed")

@@ -100,7 +100,7 @@ class VerdictConstants:
     """Diameters. Poses closer together are one answer with its uncertainty. [by hand]"""
     min_same_surface: float = 0.8
     """Share of the object's samples that come to lie on its own surface when it is moved from one pose to another.
-    Poses that agree in so many place nearly the same surface. [random worlds]"""
+    Poses that agree in so many place nearly the same surface. [random worlds; wrong objects on clean fields]"""
     rival_log_odds: float = 3.0
     """Log odds. A pose that is less likely than the best one by more, a factor of 20, is told apart from it, however
     near its score. [by hand]"""
