@@ -174,7 +174,7 @@ class Result(Document):
 
     @property
     def probability_listed(self) -> float | None:
-        """That the pose, or an alternative that places nearly the same surface, is right, 0..1. None: preset `paper`."""
+        """That the pose, or an alternative that places nearly the same surface, is right, 0..1; None from `paper`."""
         return self.metrics.get("probability_listed")
 
     def apply(self, points: ArrayLike) -> Floats:
