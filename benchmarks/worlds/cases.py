@@ -24,9 +24,10 @@ from regnf_core.fields.observation import ObservedField, stored_observation
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.symmetry import Symmetries
 
-ObservedBy = Literal["images", "cameras", "map"]
-"""What tells what was seen of a scene: the walk's images, where its cameras stood alone, or the map's own file."""
-OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map")
+ObservedBy = Literal["images", "cameras", "map", "nothing"]
+"""What tells what was seen of a scene: the walk's images, where its cameras stood alone, the map's own file, or
+nothing."""
+OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map", "nothing")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +109,8 @@ def _observed(home: Path, field: SdfField, by: ObservedBy) -> SdfField:
     """The scene's field, in the room's frame, with what was seen of it."""
     if by == "map":
         return field
+    if by == "nothing":
+        return ObservedField(field, None)
     if by == "cameras":
         return ObservedField(field, observation_of_cameras(field, read_cameras(home)))
     grid, words = read_observation_grid(home)

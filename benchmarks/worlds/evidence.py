@@ -49,7 +49,7 @@ def evidence_of_world(
     ]
     rows: list[Row] = []
     for number, case in enumerate(list(cases_of(home, by))[:limit]):
-        facts = {**case.facts, "observed": by != "map"}
+        facts = {**case.facts, "observed": by in ("images", "cameras"), "observed_by": by}
         rows += [{**facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
         other = _another(case, others, draw)
         if other is not None:

@@ -78,14 +78,14 @@ class Observed(Protocol):
 
 
 class ObservedField:
-    """A field with an observation."""
+    """A field with another observation than its own; with None, one that nothing is known of."""
 
     color: ColorFunction
     """Only where the field has color."""
 
-    def __init__(self, field: SdfField, observation: Observation) -> None:
+    def __init__(self, field: SdfField, observation: Observation | None) -> None:
         self.field = field
-        self.observation: Observation | None = observation
+        self.observation = observation
         if has_color(field):
             self.color = field.color
 
@@ -106,7 +106,6 @@ class ObservedField:
 
     def to(self, device: torch.device | str) -> ObservedField:
         """The same field with its parameters on another device; the observation stays on the CPU."""
-        assert self.observation is not None
         return ObservedField(self.field.to(device), self.observation)
 
     def signed_distance(self, points: Tensor) -> Tensor:

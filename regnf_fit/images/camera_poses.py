@@ -2,7 +2,8 @@
 
 As Wang et al. (2021, "NeRF--: Neural Radiance Fields Without Known Camera Parameters") and Azinovic et al. (2022,
 "Neural RGB-D Surface Reconstruction"), but held to the poses that are given by a prior of the size that the images'
-own contradictions have: a correction is a rotation about the camera and a shift of it.
+own contradictions have: a correction is a rotation about the camera and a shift of it. Their mean is zero, so that the
+frame is that of all the given poses: that of one image would have the errors of that image.
 """
 
 from __future__ import annotations
@@ -40,18 +41,19 @@ def expected_errors(spread: DepthSpread, size: float) -> PoseErrors:
 
 
 class CameraPoses(nn.Module):
-    """A correction for each of N images; the first one's pose stays as it is given: it holds the frame."""
+    """A correction for each of N images."""
 
     def __init__(self, images: int, errors: PoseErrors) -> None:
         super().__init__()
-        self.steps = nn.Parameter(torch.zeros(max(images - 1, 0), 6))
-        """Rotation vectors and shifts (N - 1, 6) in world axes, in the deviations that are expected."""
+        self.steps = nn.Parameter(torch.zeros(images, 6))
+        """Rotation vectors and shifts (N, 6) in world axes, in the deviations that are expected. Their mean does not
+        count."""
         unit = torch.tensor([errors.turn] * 3 + [errors.shift] * 3, dtype=torch.float32)
         self.register_buffer("unit", unit)
 
     def corrections(self) -> tuple[Tensor, Tensor]:
         """Rotations (N, 3, 3) about the cameras and their shifts (N, 3), world axes."""
-        steps = torch.cat((self.steps.new_zeros(1, 6), self.steps)) * self.get_buffer("unit")
+        steps = (self.steps - self.steps.mean(0)) * self.get_buffer("unit")
         return rotation_exp(steps[:, :3]), steps[:, 3:]
 
     def correct(self, rays: PixelRays) -> PixelRays:
@@ -67,7 +69,7 @@ class CameraPoses(nn.Module):
 
     def prior(self) -> Tensor:
         """Mean square of the corrections in the deviations that are expected."""
-        return self.steps.square().mean() if self.steps.numel() else self.steps.sum()
+        return self.steps.square().mean()
 
     @torch.no_grad()
     def corrected(self, images: PosedImages) -> PosedImages:

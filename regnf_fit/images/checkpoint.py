@@ -11,7 +11,7 @@ import torch
 from regnf_core.errors import InvalidInputError
 from regnf_core.files import atomic_path
 
-_VERSION = 3
+_VERSION = 4
 
 
 def write_checkpoint(path: Path, state: dict[str, Any], key: str) -> None:

@@ -94,6 +94,10 @@ def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path:
         assert seen is not None
         off = one.case.scene.signed_distance(placed[seen.at(placed) == SURFACE]).abs() * float(one.case.truth.scale)
         assert float(off.median()) < 0.01 * float(torch.pdist(one.points[::20]).max())
+    weighed, bare = (next(cases_of(task.home, by)).case.scene for by in ("map", "nothing"))
+    assert observation_of(weighed) is not None
+    assert observation_of(bare) is None
+    assert torch.equal(weighed.signed_distance(placed), bare.signed_distance(placed))
 
 
 @pytest.mark.parametrize("scene", SCENES)
