@@ -5,7 +5,7 @@
     python -m benchmarks.worlds report runs.jsonl [--output report.md]
     python -m benchmarks.worlds worst FOLDER runs.jsonl --output worst.png
     python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
-    python -m benchmarks.worlds train evidence.jsonl --output probability.json --table calibration.md
+    python -m benchmarks.worlds train evidence.jsonl --output model.json --table calibration.md
 
 One seed is one world; a world is made once and kept. The part `test` is for reporting: choose nothing on it.
 """
@@ -35,6 +35,7 @@ from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
 from benchmarks.worlds.running import Way, register_world  # noqa: E402
 from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
+from regnf_core.robust.verdict.probability import ProbabilityModel  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
 from regnf_data.worlds.walks import LENGTHS  # noqa: E402
 
@@ -111,7 +112,8 @@ def _evidence(arguments: argparse.Namespace) -> None:
 
 def _train(arguments: argparse.Namespace) -> None:
     rows = [json.loads(line) for path in arguments.rows for line in _text(path).splitlines()]
-    model, table = training.trained(rows, arguments.left_out)
+    given = arguments.alone and ProbabilityModel.from_dict(json.loads(arguments.alone.read_text())["alone"])
+    model, table = training.trained(rows, arguments.left_out, arguments.calibrated_on, given)
     arguments.output.write_text(json.dumps(model, indent=1) + "\n")
     if arguments.table is not None:
         arguments.table.write_text(
@@ -188,6 +190,8 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
+    learning.add_argument("--calibrated-on", choices=training.CALIBRATED_ON, default="all", help="poses")
+    learning.add_argument("--alone", type=Path, help="a model's file that says by which odds poses are chosen")
     showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
     showing.add_argument("folder", type=Path, help="of the worlds")
     showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")

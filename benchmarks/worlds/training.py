@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
@@ -27,11 +28,13 @@ from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.recipe import parts_of_name
 from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
-from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG
+from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
 
 Array = NDArray[np.float64]
 LeftOut = Literal["world", "part"]
 LEFT_OUT: tuple[LeftOut, ...] = ("world", "part")
+CalibratedOn = Literal["all", "chosen"]
+CALIBRATED_ON: tuple[CalibratedOn, ...] = ("all", "chosen")
 
 PIECES = 5
 """Ramps for each feature, between its quantiles."""
@@ -46,21 +49,24 @@ OF_OTHERS = 0.5
 @dataclass(frozen=True, eq=False)
 class Evidence:
     """Poses with what is known of them: features (N, F), of the ``names`` · right (N,) 0 or 1 · weight (N,): of the
-    pose in the training; 0: none · group (N,): the room or the part, by which poses belong together."""
+    pose in the training; 0: none · group (N,): the room or the part, by which poses belong together · calibrated (N,)
+    bool: the poses that the probability is to be right of on average, of those that are trained with."""
 
     names: tuple[str, ...]
     features: Array
     right: Array
     weight: Array
     group: NDArray[Any]
+    calibrated: NDArray[np.bool_]
 
     def __getitem__(self, index: Any) -> Evidence:
-        return Evidence(self.names, self.features[index], self.right[index], self.weight[index], self.group[index])
+        rows = (self.features, self.right, self.weight, self.group, self.calibrated)
+        return Evidence(self.names, *(one[index] for one in rows))
 
     def with_feature(self, name: str, values: Array, counts: NDArray[np.bool_]) -> Evidence:
         """The same with one more feature (N,), trained with where ``counts`` (N,)."""
         features = np.column_stack([self.features, values])
-        return Evidence((*self.names, name), features, self.right, self.weight * counts, self.group)
+        return replace(self, names=(*self.names, name), features=features, weight=self.weight * counts)
 
     @property
     def signs(self) -> Array:
@@ -92,7 +98,7 @@ class Ramps:
         return replace(self, weights=slope * self.weights, bias=slope * self.bias + shift)
 
     def to_dict(self) -> dict[str, Any]:
-        """As ``probability.json`` keeps it: features that do not count are left out."""
+        """As the model's file keeps it: features that do not count are left out."""
         terms = {}
         for name, knots, weights in zip(self.names, self.knots, self.weights, strict=True):
             if weights.sum() < 1e-3:
@@ -104,27 +110,47 @@ class Ramps:
         return {"bias": round(self.bias, 4), "terms": terms}
 
 
-def trained(rows: Sequence[dict[str, Any]], left_out: LeftOut = "world") -> tuple[dict[str, Any], str]:
+def trained(
+    rows: Sequence[dict[str, Any]],
+    left_out: LeftOut = "world",
+    calibrated_on: CalibratedOn = "all",
+    alone: ProbabilityModel | None = None,
+) -> tuple[dict[str, Any], str]:
     """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
     the probabilities hold in worlds that were left out.
 
-    left_out: one world at a time, or a part with all of its meshes, which no other part has.
+    left_out: one world at a time, or a part with all of its meshes, which no other part has · calibrated_on: the poses
+    that the probabilities are to be right of on average, all or those that registrations chose · alone: the model of a
+    pose alone, by which poses are chosen and lead; None: that is made too. Of the features those count that all rows
+    have: some rows are older than a feature.
     """
-    alike = np.array([row["model"] == LOOK_ALIKE for row in rows])
+    names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
+    alike, chosen = np.array([(row["model"] == LOOK_ALIKE, row["winner"]) for row in rows]).T
     counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
     evidence = Evidence(
-        tuple(SPEAKS_FOR),
-        np.array([[row["features"][name] for name in SPEAKS_FOR] for row in rows]),
+        names,
+        np.array([[row["features"][name] for name in names] for row in rows]),
         np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
-        np.where([row["winner"] for row in rows], 1.0, OF_OTHERS) * counts,
+        np.where(chosen, 1.0, OF_OTHERS) * counts,
         np.array([_group(row, left_out) for row in rows]),
+        chosen | (calibrated_on == "all"),
     )
-    alone, odds = train(evidence)
+    models, odds = ({}, _odds(rows, alone)) if alone is not None else _named("alone", train(evidence))
     found = np.array([row["found"] for row in rows])
-    among, odds_among = train(evidence.with_feature(LEAD, _leads(rows, odds), found))
+    among, odds_among = _named("among", train(evidence.with_feature(LEAD, _leads(rows, odds), found)))
     table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], odds_among[counts])
     table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], odds_among[alike])
-    return {"alone": alone.to_dict(), "among": among.to_dict()}, table
+    return models | among, table
+
+
+def _named(name: str, found: tuple[Ramps, Array]) -> tuple[dict[str, Any], Array]:
+    return {name: found[0].to_dict()}, found[1]
+
+
+def _odds(rows: Sequence[dict[str, Any]], model: ProbabilityModel) -> Array:
+    """(N,) log odds that a model, made of other rows, gives each."""
+    features = {term.feature: torch.tensor([row["features"][term.feature] for row in rows]) for term in model.terms}
+    return np.asarray(model.logit(features))
 
 
 def _group(row: dict[str, Any], left_out: LeftOut) -> str | int:
@@ -149,7 +175,7 @@ def train(evidence: Evidence) -> tuple[Ramps, Array]:
     for group in np.unique(evidence.group):
         of_group = evidence.group == group
         left_out[of_group] = _fit(evidence[~of_group].counted).logit(evidence.features[of_group])
-    slope, shift = _platt(left_out, evidence)
+    slope, shift = _platt(left_out[evidence.calibrated], evidence[evidence.calibrated])
     return _fit(evidence.counted).scaled(slope, shift), slope * left_out + shift
 
 

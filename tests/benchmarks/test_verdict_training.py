@@ -24,7 +24,7 @@ def drawn(count: int, seed: int) -> tuple[Evidence, np.ndarray]:
     features = draw.uniform(0.0, 1.0, (count, len(NAMES)))
     logit = 6.0 * features[:, NAMES.index("confirmed")] - 4.0 * features[:, NAMES.index("free")] - 1.0
     right = (draw.uniform(size=count) < 1.0 / (1.0 + np.exp(-logit))).astype(float)
-    return Evidence(tuple(NAMES), features, right, np.ones(count), np.arange(count) % 7), logit
+    return Evidence(tuple(NAMES), features, right, np.ones(count), np.arange(count) % 7, np.ones(count, bool)), logit
 
 
 def test_a_known_law_is_found_again() -> None:
@@ -35,6 +35,19 @@ def test_a_known_law_is_found_again() -> None:
     assert spearmanr(found, logit).statistic > 0.97
     assert abs(float(np.mean(1 / (1 + np.exp(-found)))) - float(fresh.right.mean())) < 0.03
     assert abs(float(np.mean(1 / (1 + np.exp(-left_out)))) - float(evidence.right.mean())) < 0.005
+
+
+def test_the_poses_that_count_are_right_on_average() -> None:
+    """Every third pose is right less often than the law says; calibrated on these, that is what is said of them."""
+    evidence, _ = drawn(3000, 5)
+    rarer = (np.arange(3000) % 3 == 0) & (np.random.default_rng(6).uniform(size=3000) < 0.5)
+    evidence = replace(evidence, right=np.where(rarer, 0.0, evidence.right))
+    third = np.arange(3000) % 3 == 0
+    _, by_all = train(evidence)
+    _, by_third = train(replace(evidence, calibrated=third))
+    said_by_all, said = (float(np.mean(1 / (1 + np.exp(-one[third])))) for one in (by_all, by_third))
+    assert abs(said - float(evidence.right[third].mean())) < 0.005
+    assert said_by_all > said + 0.1
 
 
 def test_the_stored_model_says_the_same() -> None:
@@ -99,6 +112,55 @@ def test_a_lead_over_other_answers_counts() -> None:
     assert LEAD in models["among"]["terms"]
     assert LEAD not in models["alone"]["terms"]
     assert float(table.split("AUROC ")[1].split(",")[0]) > 0.95
+
+
+def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
+    rows = [
+        {
+            "features": dict.fromkeys(NAMES, 0.5)
+            | {"confirmed": 0.9 if number % 2 else 0.2, "offset": 0.01 * (number % 2)},
+            "model": "chair",
+            "mssd": 0.6 if number % 2 else 0.01,
+            "listed_mssd": 0.6 if number % 2 else 0.01,
+            "winner": True,
+            "found": True,
+            "others": [],
+            "score": 0.3,
+            "world": f"tsdf-{number % 5}-long",
+        }
+        for number in range(100)
+    ]
+    assert "offset" in trained(rows)[0]["alone"]["terms"]
+    del rows[7]["features"]["offset"]
+    assert "offset" not in trained(rows)[0]["alone"]["terms"]
+
+
+def test_leads_may_be_by_the_odds_of_a_model_that_is_given() -> None:
+    """Pairs of candidates of which ``tail`` says which one is right; the model that is given knows it, so the lead says
+    it too, and no model of a pose alone is made."""
+    draw = np.random.default_rng(7)
+    rows = []
+    for number in range(300):
+        right = number % 2 == 0
+        for step in (1, -1):
+            good = right and step == 1
+            rows.append(
+                {
+                    "features": dict.fromkeys(NAMES, 0.5) | {"tail": draw.uniform(0.0, 0.2) + 0.5 * (not good)},
+                    "model": "chair",
+                    "mssd": 0.01 if good else 0.6,
+                    "listed_mssd": 0.01 if good else 0.6,
+                    "winner": step == 1,
+                    "found": True,
+                    "others": [step],
+                    "score": 0.3,
+                    "world": f"tsdf-{number % 5}-long",
+                }
+            )
+    given = {"bias": 0.0, "terms": {"tail": {"knots": [0.0, 1.0], "values": [0.0, -5.0]}}}
+    models, _ = trained(rows, alone=ProbabilityModel.from_dict(given))
+    assert set(models) == {"among"}
+    assert models["among"]["terms"][LEAD]["knots"][-1] <= 5.0 * 0.7, "leads are differences of what the model says"
 
 
 def test_look_alikes_are_told_apart_in_the_table_alone() -> None:

@@ -33,6 +33,10 @@ class EvidenceConstants:
     """Diameters. What lies so far within the object's hull touches it from inside. [by hand]"""
     min_core: float = 0.002
     """Diameters. Smallest core of residuals that the tail is compared with: exact fields have a core of 0. [by hand]"""
+    min_confirmed_in_patch: float = 0.3
+    """Share of a patch's samples that are confirmed where the patch counts as confirmed. [by hand]"""
+    min_samples_in_patch: int = 5
+    """Scene samples near a patch that it takes to cover it. [by hand]"""
     min_slope: float = 1e-3
     """Length of the gradient. A shorter one has no direction. [derived]"""
     facing_cosine: float = -0.25

@@ -42,7 +42,7 @@ def choose(
     rival_margin: float,
 ) -> Answer:
     """The answer from the candidates' features, each (H,), and scores (H,), all on the CPU."""
-    odds = pose_odds()
+    odds = pose_odds(problem.view.observation is not None)
     alone, scores = odds.alone.logit(features), scores.double()
     demerits = -merits(alone, scores)
     winner = int(demerits.argmin())

@@ -15,6 +15,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.residuals import Residuals, residuals
+from regnf_core.robust.verdict.coverage import coverage
 from regnf_core.robust.verdict.unexplained_surface import unexplained_samples
 
 SPEAKS_FOR = {
@@ -24,6 +25,8 @@ SPEAKS_FOR = {
     "scene_agrees_coarsely": True,
     "hull_explained": True,
     "confirmed": True,
+    "confirmed_patches": True,
+    "covered_patches": True,
     "normals_agree_object": True,
     "normals_agree_scene": True,
     "stiffness": True,
@@ -35,6 +38,7 @@ SPEAKS_FOR = {
     "hidden": False,
     "noise": False,
     "tail": False,
+    "offset": False,
 }
 """The features by name: whether more of it makes the pose more likely (True) or less (False)."""
 
@@ -42,13 +46,14 @@ SPEAKS_FOR = {
 @dataclass(frozen=True, eq=False)
 class _Groups:
     """Which samples (H, N) or (H, M) belong to what: those of the scene near the object and those that agree there; of
-    the object's those that are visible, observed, in agreement."""
+    the object's those that are visible, observed, in agreement, and in agreement with the normal that the scene has."""
 
     near: Tensor
     scene_agrees: Tensor
     visible: Tensor
     observed: Tensor
     object_agrees: Tensor
+    confirmed: Tensor
 
 
 def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dict[str, Tensor]:
@@ -59,6 +64,7 @@ def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dic
     r = residuals(problem.held_out, T, offsets)
     groups = _groups(r)
     found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _normals(r, groups) | _spread(r, groups)
+    found |= _coverage(problem, T, groups) | {"offset": offsets.abs()}
     stiffness = _stiffness(problem, T, r, groups)
     found |= {"stiffness": stiffness[:, 0], "second_stiffness": stiffness[:, 1]}
     return {name: found[name].double() for name in SPEAKS_FOR}
@@ -71,20 +77,21 @@ def _groups(r: Residuals) -> _Groups:
     near, observed = near & seen[:, :n], seen[:, n:]
     agrees = r2.abs() <= EVIDENCE.agreement
     visible = observed & (agrees | (r2 > 0))
-    return _Groups(near, near & (r1.abs() <= EVIDENCE.agreement), visible, observed, agrees & observed)
+    agrees &= observed
+    confirmed = agrees & (r.cosines[:, n:] >= EVIDENCE.min_inlier_cosine)
+    return _Groups(near, near & (r1.abs() <= EVIDENCE.agreement), visible, observed, agrees, confirmed)
 
 
 def _agreement(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
     """Shares of what was seen of both surfaces that agrees, at two distances."""
     r1, r2 = r.scene_to_object.abs(), r.object_to_scene.abs()
     close, far = EVIDENCE.close, EVIDENCE.coarse
-    good_normals = r.cosines[:, r.scene_count :] >= EVIDENCE.min_inlier_cosine
     return {
         "object_agrees": _share((r2 <= close) & groups.visible, groups.visible),
         "object_agrees_coarsely": _share((r2 <= far) & groups.visible, groups.visible),
         "scene_agrees": _share((r1 <= close) & groups.near, groups.near),
         "scene_agrees_coarsely": _share((r1 <= far) & groups.near, groups.near),
-        "confirmed": (groups.object_agrees & good_normals).double().mean(1),
+        "confirmed": groups.confirmed.double().mean(1),
         "hidden": (~groups.visible).double().mean(1),
     }
 
@@ -109,6 +116,12 @@ def _conflict(problem: RegistrationProblem, T: Sim3, r: Residuals, groups: _Grou
         "free": _share(free, groups.visible),
         "seen_through": _share(seen_through, groups.visible),
     }
+
+
+def _coverage(problem: RegistrationProblem, T: Sim3, groups: _Groups) -> dict[str, Tensor]:
+    """Shares of the patches about the object's outermost points that are confirmed, and that scene surface is near."""
+    A, B = problem.held_out.scene_samples.points, problem.held_out.object_samples.points
+    return coverage(problem.model.extremal_points, B, T.to(A).apply(A), groups.confirmed, groups.near)
 
 
 def _normals(r: Residuals, groups: _Groups) -> dict[str, Tensor]:

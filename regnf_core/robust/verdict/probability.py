@@ -7,8 +7,9 @@ feature is the pose's lead, how far its log odds alone, less the score's share, 
 (:mod:`.lead`).
 
 "Right" means within 5 % of the object's diameter of the true pose, or of one that the object's symmetries make equal.
-The functions are data: ``probability.json``, made by ``python -m benchmarks.worlds train`` from random worlds
-(docs/verdict.md).
+The functions are data, made by ``python -m benchmarks.worlds train`` from random worlds (docs/verdict.md). The second
+sum has two models: one for scenes of which it is known what was seen, one for the others. What a feature tells depends
+on that: a field has surface that nobody saw, and only an observation says which it is.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
-_FILE = "probability.json"
+_ALONE = "probability.json"
+_AMONG = {True: "probability.json", False: "probability-unobserved.json"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,7 @@ def _worst_if_nan(term: Term, x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PoseOdds:
-    """Both models of the file."""
+    """The two sums."""
 
     alone: ProbabilityModel
     among: ProbabilityModel
@@ -99,7 +101,10 @@ class PoseOdds:
 
 
 @cache
-def pose_odds() -> PoseOdds:
-    """The models that are shipped."""
-    stored = json.loads(files(__package__).joinpath(_FILE).read_text())
-    return PoseOdds(*(ProbabilityModel.from_dict(stored[name]) for name in ("alone", "among")))
+def pose_odds(observed: bool) -> PoseOdds:
+    """The models that are shipped. observed: whether it is known what was seen of the scene."""
+    return PoseOdds(_stored(_ALONE, "alone"), _stored(_AMONG[observed], "among"))
+
+
+def _stored(name: str, model: str) -> ProbabilityModel:
+    return ProbabilityModel.from_dict(json.loads(files(__package__).joinpath(name).read_text())[model])

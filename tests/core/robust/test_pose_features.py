@@ -41,18 +41,19 @@ def truth(problem: RegistrationProblem) -> Sim3:
 
 def test_the_right_pose_agrees_in_all_respects(problem: RegistrationProblem) -> None:
     found = features_at(problem, truth(problem))
-    for name in ("object_agrees", "object_agrees_coarsely", "confirmed", "hull_explained"):
+    for name in ("object_agrees", "object_agrees_coarsely", "confirmed", "hull_explained", "confirmed_patches"):
         assert found[name] > 0.95, name  # normals are arbitrary at edges
     for name in ("seen_through", "free", "matter_inside", "unexplained", "hidden"):
         assert found[name] < 0.01, name
     assert found["noise"] < 0.005
+    assert found["covered_patches"] == 1.0
 
 
 def test_every_feature_gets_worse_far_away(problem: RegistrationProblem) -> None:
     """The object a third of its diameter beside its place."""
     right, T = features_at(problem, truth(problem)), truth(problem)
     wrong = features_at(problem, replace(T, translation=T.translation + torch.tensor([0.33, 0.0, 0.0]).double()))
-    for name in ("object_agrees", "scene_agrees", "confirmed", "free", "seen_through", "noise"):
+    for name in ("object_agrees", "scene_agrees", "confirmed", "confirmed_patches", "free", "seen_through", "noise"):
         assert (wrong[name] < right[name]) == SPEAKS_FOR[name], name
 
 
@@ -68,6 +69,12 @@ def test_shares_by_a_slow_count(problem: RegistrationProblem) -> None:
     assert found["hidden"] == pytest.approx(1 - len(visible) / len(to_scene))
     assert found["free"] == pytest.approx(sum(value > 0.04 for value in visible) / len(visible))
     assert found["object_agrees"] == pytest.approx(sum(abs(value) <= 0.02 for value in visible) / len(visible))
+
+
+def test_an_offset_counts_either_way(problem: RegistrationProblem) -> None:
+    T = truth(problem)[None]
+    for offset in (-0.02, 0.02):
+        assert float(pose_features(problem, T, torch.tensor([offset], dtype=torch.float64))["offset"][0]) == 0.02
 
 
 def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:

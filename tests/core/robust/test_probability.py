@@ -72,24 +72,29 @@ def test_the_lead_is_taken_from_the_odds_alone_and_the_scores() -> None:
     assert found.tolist() == pytest.approx([1.0 - 0.5, 1.0 - 1.0, 1.0 - 4.0], abs=1e-6)  # leads 2.5, 2 and -2.5
 
 
+OBSERVED = pytest.mark.parametrize("observed", [True, False])
+
+
+@OBSERVED
 @given(name=st.sampled_from(sorted(SPEAKS_FOR)), low=st.floats(-3.0, 3.0), step=st.floats(0.0, 3.0))
-def test_the_shipped_models_are_monotone(name: str, low: float, step: float) -> None:
+def test_the_shipped_models_are_monotone(observed: bool, name: str, low: float, step: float) -> None:
     others = {feature: torch.full((2,), 0.5, dtype=torch.float64) for feature in SPEAKS_FOR}
     changed = others | {name: torch.tensor([low, low + step], dtype=torch.float64)}
-    odds, single = pose_odds(), torch.zeros(2, 2, dtype=torch.bool)
+    odds, single = pose_odds(observed), torch.zeros(2, 2, dtype=torch.bool)
     for logits in (odds.alone.logit(changed), odds.log_odds(changed, torch.full((2,), 0.3), single)):
         less, more = logits.tolist()
         assert more >= less if SPEAKS_FOR[name] else more <= less
 
 
-def test_the_shipped_models_use_what_they_must() -> None:
+@OBSERVED
+def test_the_shipped_models_use_what_they_must(observed: bool) -> None:
     """A pose that is perfect in all respects is likely; one in free space, or without any agreement, is not; one of two
     perfect poses is less likely than a single one."""
     best = {name: torch.tensor([1e3 if better else -1e3] * 2).double() for name, better in SPEAKS_FOR.items()}
     worst = {name: -values for name, values in best.items()}
     single, several = torch.zeros(2, 2, dtype=torch.bool), ~torch.eye(2, dtype=torch.bool)
     alike = torch.full((2,), 0.3)
-    odds = pose_odds()
+    odds = pose_odds(observed)
     likely = float(odds.log_odds(best, alike, single)[0].sigmoid())
     assert likely > 0.98, "among the others: what results tell"
     for logits in (odds.alone.logit(worst), odds.log_odds(worst, alike, single)):
@@ -97,6 +102,7 @@ def test_the_shipped_models_use_what_they_must() -> None:
     assert float(odds.log_odds(best, alike, several)[0].sigmoid()) < likely
 
 
-def test_a_perfect_pose_alone_is_as_likely() -> None:
+@OBSERVED
+def test_a_perfect_pose_alone_is_as_likely(observed: bool) -> None:
     best = {name: torch.tensor([1e3 if better else -1e3]).double() for name, better in SPEAKS_FOR.items()}
-    assert float(pose_odds().alone.logit(best)[0].sigmoid()) > 0.98
+    assert float(pose_odds(observed).alone.logit(best)[0].sigmoid()) > 0.98
