@@ -31,7 +31,7 @@ export function offerConsidered(api, result, names, onChoose) {
   byId('considered-list').replaceChildren(el('legend', { className: 'unseen' }, 'Pose that was judged'), ...poses.map((one, i) => {
     const input = el('input', { type: 'radio', name: 'considered', value: String(i), onchange: () => choose(i) });
     const words = one.reason === AGREES ? 'The surfaces agree.' : one.detail || one.reason;
-    const sure = el('span', { className: 'mono' }, percent(one.metrics?.probability, 0));
+    const sure = el('span', { className: 'mono' }, percent(one.metrics?.probability));
     return el('label', { title: one.reason }, input, el('span', {}, words), sure);
   }));
   show(byId('considered'), poses.length > 0);
