@@ -190,8 +190,13 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
     learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
-    learning.add_argument("--calibrated-on", choices=training.CALIBRATED_ON, default="all", help="poses")
-    learning.add_argument("--alone", type=Path, help="a model's file that says by which odds poses are chosen")
+    learning.add_argument(
+        "--calibrated-on",
+        choices=training.CALIBRATED_ON,
+        default="all",
+        help="on which poses the probability must be right on average: all, or those that registrations chose",
+    )
+    learning.add_argument("--alone", type=Path, help="a model that is there: its odds of a pose alone choose and lead")
     showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
     showing.add_argument("folder", type=Path, help="of the worlds")
     showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")

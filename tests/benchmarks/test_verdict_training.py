@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,26 @@ from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
 
 NAMES = list(SPEAKS_FOR)
+
+
+def row(
+    number: int, error: float, winner: bool = True, others: tuple[int, ...] = (), **features: float
+) -> dict[str, Any]:
+    """A pose of one of five worlds with this error; features that are not named are .5."""
+    return {
+        "features": dict.fromkeys(NAMES, 0.5) | features,
+        "model": "chair",
+        "mssd": error,
+        "listed_mssd": error,
+        "winner": winner,
+        "found": True,
+        "others": list(others),
+        "score": 0.3,
+        "world": f"tsdf-{number % 5}-long",
+    }
+
+
+RIGHT, WRONG = 0.01, 0.6
 
 
 def drawn(count: int, seed: int) -> tuple[Evidence, np.ndarray]:
@@ -67,22 +88,12 @@ def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
 
 
 def test_ambiguity_is_no_error_of_the_probability() -> None:
-    rows = [
-        {
-            "features": dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3)),
-            "model": "chair",
-            "mssd": 0.01 if number % 3 else 0.6,
-            "listed_mssd": 0.01,
-            "winner": True,
-            "found": True,
-            "others": [],
-            "score": 0.3,
-            "world": f"tsdf-{number % 4}-long",
-        }
-        for number in range(30)
-    ]
-    _, table = trained([*rows, {**rows[0], "listed_mssd": 0.6, "world": "tsdf-9-long"}])
-    assert table.startswith("21 registrations of 5 worlds, 20 with a right pose.")
+    rows = []
+    for number in range(30):
+        values = dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3))
+        rows.append(row(number, RIGHT if number % 3 else WRONG, **values) | {"listed_mssd": RIGHT})
+    _, table = trained([*rows, {**rows[0], "listed_mssd": WRONG, "world": "tsdf-9-long"}])
+    assert table.startswith("21 registrations of 6 worlds, 20 with a right pose.")
 
 
 def test_a_lead_over_other_answers_counts() -> None:
@@ -91,48 +102,13 @@ def test_a_lead_over_other_answers_counts() -> None:
     rows = []
     for number in range(400):
         ahead = number % 2 == 0
-        for step, confirmed in (
-            (1, draw.uniform(0.6, 0.9)),
-            (-1, draw.uniform(0.1, 0.3) if ahead else draw.uniform(0.6, 0.9)),
-        ):
-            rows.append(
-                {
-                    "features": dict.fromkeys(NAMES, 0.5) | {"confirmed": confirmed},
-                    "model": "chair",
-                    "mssd": 0.01 if ahead and step == 1 else 0.6,
-                    "listed_mssd": 0.01 if ahead and step == 1 else 0.6,
-                    "winner": step == 1,
-                    "found": True,
-                    "others": [step],
-                    "score": 0.3,
-                    "world": f"tsdf-{number % 5}-long",
-                }
-            )
+        first, second = draw.uniform(0.6, 0.9), draw.uniform(0.1, 0.3) if ahead else draw.uniform(0.6, 0.9)
+        rows.append(row(number, RIGHT if ahead else WRONG, True, (1,), confirmed=first))
+        rows.append(row(number, WRONG, False, (-1,), confirmed=second))
     models, table = trained(rows)
     assert LEAD in models["among"]["terms"]
     assert LEAD not in models["alone"]["terms"]
     assert float(table.split("AUROC ")[1].split(",")[0]) > 0.95
-
-
-def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
-    rows = [
-        {
-            "features": dict.fromkeys(NAMES, 0.5)
-            | {"confirmed": 0.9 if number % 2 else 0.2, "offset": 0.01 * (number % 2)},
-            "model": "chair",
-            "mssd": 0.6 if number % 2 else 0.01,
-            "listed_mssd": 0.6 if number % 2 else 0.01,
-            "winner": True,
-            "found": True,
-            "others": [],
-            "score": 0.3,
-            "world": f"tsdf-{number % 5}-long",
-        }
-        for number in range(100)
-    ]
-    assert "offset" in trained(rows)[0]["alone"]["terms"]
-    del rows[7]["features"]["offset"]
-    assert "offset" not in trained(rows)[0]["alone"]["terms"]
 
 
 def test_leads_may_be_by_the_odds_of_a_model_that_is_given() -> None:
@@ -142,43 +118,24 @@ def test_leads_may_be_by_the_odds_of_a_model_that_is_given() -> None:
     rows = []
     for number in range(300):
         right = number % 2 == 0
-        for step in (1, -1):
-            good = right and step == 1
-            rows.append(
-                {
-                    "features": dict.fromkeys(NAMES, 0.5) | {"tail": draw.uniform(0.0, 0.2) + 0.5 * (not good)},
-                    "model": "chair",
-                    "mssd": 0.01 if good else 0.6,
-                    "listed_mssd": 0.01 if good else 0.6,
-                    "winner": step == 1,
-                    "found": True,
-                    "others": [step],
-                    "score": 0.3,
-                    "world": f"tsdf-{number % 5}-long",
-                }
-            )
+        rows.append(row(number, RIGHT if right else WRONG, True, (1,), tail=draw.uniform(0.0, 0.2) + 0.5 * (not right)))
+        rows.append(row(number, WRONG, False, (-1,), tail=draw.uniform(0.5, 0.7)))
     given = {"bias": 0.0, "terms": {"tail": {"knots": [0.0, 1.0], "values": [0.0, -5.0]}}}
     models, _ = trained(rows, alone=ProbabilityModel.from_dict(given))
     assert set(models) == {"among"}
     assert models["among"]["terms"][LEAD]["knots"][-1] <= 5.0 * 0.7, "leads are differences of what the model says"
 
 
+def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
+    rows = [row(number, WRONG if number % 2 else RIGHT, offset=0.01 * (number % 2)) for number in range(100)]
+    assert "offset" in trained(rows)[0]["alone"]["terms"]
+    del rows[7]["features"]["offset"]
+    assert "offset" not in trained(rows)[0]["alone"]["terms"]
+
+
 def test_look_alikes_are_told_apart_in_the_table_alone() -> None:
-    rows = [
-        {
-            "features": dict.fromkeys(NAMES, 0.5) | {"confirmed": 0.9 if number % 2 else 0.2},
-            "model": "chair",
-            "mssd": 0.01 if number % 2 else 0.6,
-            "listed_mssd": 0.01 if number % 2 else 0.6,
-            "winner": True,
-            "found": True,
-            "others": [],
-            "score": 0.3,
-            "world": f"tsdf-{number % 5}-long",
-        }
-        for number in range(100)
-    ]
-    alike = [{**row, "model": LOOK_ALIKE, "mssd": 9.0, "listed_mssd": 9.0} for row in rows[1::2]]
+    rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
+    alike = [{**one, "model": LOOK_ALIKE, "mssd": 9.0, "listed_mssd": 9.0} for one in rows[1::2]]
     models, table = trained(rows)
     with_alike, longer = trained([*rows, *alike])
     assert with_alike == models
