@@ -5,7 +5,7 @@
     python -m benchmarks.worlds report runs.jsonl [--output report.md]
     python -m benchmarks.worlds worst FOLDER runs.jsonl --output worst.png
     python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
-    python -m benchmarks.worlds train evidence.jsonl --output model.json --table calibration.md
+    python -m benchmarks.worlds train evidence.jsonl --output model.json --diagram reliability.svg
 
 One seed is one world; a world is made once and kept. The part `test` is for reporting: choose nothing on it.
 """
@@ -113,13 +113,14 @@ def _evidence(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     rows = [json.loads(line) for path in arguments.rows for line in _text(path).splitlines()]
     given = arguments.alone and ProbabilityModel.from_dict(json.loads(arguments.alone.read_text())["alone"])
-    model, table = training.trained(rows, arguments.left_out, arguments.calibrated_on, given)
-    arguments.output.write_text(json.dumps(model, indent=1) + "\n")
+    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given)
+    arguments.output.write_text(json.dumps(found.model, indent=1) + "\n")
     if arguments.table is not None:
-        arguments.table.write_text(
-            f"# The verdict's probability in {arguments.left_out}s that were left out\n\n{table}"
-        )
-    _say(table)
+        title = f"# The verdict's probability in {arguments.left_out}s that were left out"
+        arguments.table.write_text(f"{title}\n\n{found.table}")
+    if arguments.diagram is not None:
+        arguments.diagram.write_text(found.diagram)
+    _say(found.table)
 
 
 def _worst(arguments: argparse.Namespace) -> None:
@@ -189,6 +190,7 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
     learning.add_argument("--output", type=Path, required=True, help="the model, JSON")
     learning.add_argument("--table", type=Path, help="how well it is calibrated on worlds left out, Markdown")
+    learning.add_argument("--diagram", type=Path, help="the same as a picture, the reliability diagram, SVG")
     learning.add_argument("--left-out", choices=training.LEFT_OUT, default="world", help="what is left out in turn")
     learning.add_argument(
         "--calibrated-on",
@@ -196,7 +198,9 @@ def _parser() -> argparse.ArgumentParser:
         default="all",
         help="on which poses the probability must be right on average: all, or those that registrations chose",
     )
-    learning.add_argument("--alone", type=Path, help="a model that is there: its odds of a pose alone choose and lead")
+    learning.add_argument(
+        "--alone", type=Path, help="the model of a pose alone, by which poses lead: make the model of one among others"
+    )
     showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
     showing.add_argument("folder", type=Path, help="of the worlds")
     showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")

@@ -34,7 +34,7 @@ def calibration_table(rows: Sequence[dict[str, Any]], logits: Array) -> str:
         "| probability said | registrations | mean said | right |",
         "|---|---|---|---|",
     ]
-    for within, low, high in _binned(probability):
+    for within, low, high in binned(probability):
         said = f"{probability[within].mean():.3f}" if within.any() else ""
         share = f"{right[within].mean():.3f}" if within.any() else ""
         lines.append(f"| {low} to {high} | {int(within.sum())} | {said} | {share} |")
@@ -79,12 +79,12 @@ def _calibration_error(probability: Array, right: NDArray[np.bool_]) -> float:
     """Mean difference between what was said and what was right over the bins, weighted by their registrations."""
     return sum(
         float(within.mean() * abs(probability[within].mean() - right[within].mean()))
-        for within, _, _ in _binned(probability)
+        for within, _, _ in binned(probability)
         if within.any()
     )
 
 
-def _binned(probability: Array) -> list[tuple[NDArray[np.bool_], float, float]]:
+def binned(probability: Array) -> list[tuple[NDArray[np.bool_], float, float]]:
     """Which registrations lie in each bin, and its ends."""
     return [
         ((probability >= low) & ((probability < high) | (high == 1.0)), low, high)

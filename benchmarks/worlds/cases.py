@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from benchmarks.worlds.observing import observation_of_cameras
 from regnf_core import OrientedBox, SdfField, Sim3
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
-from regnf_core.fields.observation import ObservedField, stored_observation
+from regnf_core.fields.observation import ObservedField, observation_of, stored_observation
 from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.symmetry import Symmetries
 
@@ -32,9 +32,10 @@ OBSERVED_BY: tuple[ObservedBy, ...] = ("images", "cameras", "map", "nothing")
 
 @dataclass(frozen=True, eq=False)
 class WorldCase:
-    """A registration with what is known of it. facts: what tables group by · points: (N, 3) of the object's
+    """A registration with what is known of it.
 
-    true surface, its frame · near: symmetries, with those that nearly hold.
+    facts: what tables group by · points: (N, 3) of the object's true surface, its frame · near: symmetries, with those
+    that nearly hold.
     """
 
     case: Case
@@ -50,8 +51,10 @@ def cases_of(home: Path, by: ObservedBy = "images") -> Iterator[WorldCase]:
         _observed(home, _scene(home, world), by), Sim3.from_matrix(world["T_scene_room"]).inverse()
     )
     T_scene_room = Sim3.from_matrix(world["T_scene_room"])
+    told = {"observed": observation_of(scene) is not None, "observed_by": by}
     for number, known in enumerate(world["cases"]):
-        yield _case(home, number, (world, known), scene, T_scene_room)
+        case = _case(home, number, (world, known), scene, T_scene_room)
+        yield replace(case, facts=case.facts | told)
 
 
 def _case(

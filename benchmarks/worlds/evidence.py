@@ -49,15 +49,14 @@ def evidence_of_world(
     ]
     rows: list[Row] = []
     for number, case in enumerate(list(cases_of(home, by))[:limit]):
-        facts = {**case.facts, "observed": by in ("images", "cameras"), "observed_by": by}
-        rows += [{**facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
+        rows += [{**case.facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
         other = _another(case, others, draw)
         if other is not None:
-            rows += [{**facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
+            rows += [{**case.facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
         if number % look_alikes_every:
             continue
         alike = look_alike(home, case, np.random.default_rng(draw.getrandbits(32)))
-        rows += [{**facts, "model": LOOK_ALIKE, **row} for row in _rows(case, alike)]
+        rows += [{**case.facts, "model": LOOK_ALIKE, **row} for row in _rows(case, alike)]
     return rows
 
 

@@ -47,8 +47,7 @@ def _run(world_case: WorldCase, way: Way) -> Run:
     case = world_case.case
     assert case.truth is not None
     options = way.options(case.truth)
-    told = {"observed": way.observed_by in ("images", "cameras"), "observed_by": way.observed_by}
-    facts: Run = {**world_case.facts, **told, "seed": way.seed, "known_scale": way.known_scale}
+    facts: Run = {**world_case.facts, "seed": way.seed, "known_scale": way.known_scale}
     with recorded() as kept:
         begun = time.process_time()
         try:

@@ -7,8 +7,8 @@ that it does not know; what it says of them is then made right on average (Platt
 Look-alikes are measured, not trained with: in a noisy map the right object cannot be told from one that differs by a
 part, so how probable it is would be a matter of how many such objects the training has.
 
-This is done twice: with the features of each pose alone, and with one more, the lead that these left-out log odds give
-a pose over the other answers among the same candidates.
+A model knows a pose alone, or it is given such a model and knows one feature more: the lead that those log odds give a
+pose over the other answers among the same candidates.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.calibration import calibration_table, look_alike_line
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.recipe import parts_of_name
+from benchmarks.worlds.reliability import reliability_diagram
 from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
@@ -110,19 +111,28 @@ class Ramps:
         return {"bias": round(self.bias, 4), "terms": terms}
 
 
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """model: as its file keeps it, by its name · table, diagram: how well the probabilities hold in worlds that were
+    left out, Markdown and SVG."""
+
+    model: dict[str, Any]
+    table: str
+    diagram: str
+
+
 def trained(
     rows: Sequence[dict[str, Any]],
     left_out: LeftOut = "world",
     calibrated_on: CalibratedOn = "all",
     alone: ProbabilityModel | None = None,
-) -> tuple[dict[str, Any], str]:
-    """The models from the rows of :mod:`benchmarks.worlds.evidence`, as their file keeps them, and a table of how well
-    the probabilities hold in worlds that were left out.
+) -> Trained:
+    """A model from the rows of :mod:`benchmarks.worlds.evidence`.
 
-    left_out: one world at a time, or a part with all of its meshes, which no other part has · calibrated_on: the poses
-    that the probabilities are to be right of on average, all or those that registrations chose · alone: the model of a
-    pose alone, by which poses are chosen and lead; None: that is made too. Of the features those count that all rows
-    have: some rows are older than a feature.
+    alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
+    its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
+    which no other part has · calibrated_on: the poses that the probabilities are to be right of on average, all or
+    those that registrations chose. Of the features those count that all rows have: some rows are older than a feature.
     """
     names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
     alike, chosen = np.array([(row["model"] == LOOK_ALIKE, row["winner"]) for row in rows]).T
@@ -135,16 +145,15 @@ def trained(
         np.array([_group(row, left_out) for row in rows]),
         chosen | (calibrated_on == "all"),
     )
-    models, odds = ({}, _odds(rows, alone)) if alone is not None else _named("alone", train(evidence))
-    found = np.array([row["found"] for row in rows])
-    among, odds_among = _named("among", train(evidence.with_feature(LEAD, _leads(rows, odds), found)))
-    table = calibration_table([row for row, used in zip(rows, counts, strict=True) if used], odds_among[counts])
-    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], odds_among[alike])
-    return models | among, table
-
-
-def _named(name: str, found: tuple[Ramps, Array]) -> tuple[dict[str, Any], Array]:
-    return {name: found[0].to_dict()}, found[1]
+    if alone is not None:
+        found = np.array([row["found"] for row in rows])
+        evidence = evidence.with_feature(LEAD, _leads(rows, _odds(rows, alone)), found)
+    model, odds = train(evidence)
+    used = [row for row, one in zip(rows, counts, strict=True) if one]
+    table = calibration_table(used, odds[counts])
+    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], odds[alike])
+    named = {"alone" if alone is None else "among": model.to_dict()}
+    return Trained(named, table, reliability_diagram(used, odds[counts]))
 
 
 def _odds(rows: Sequence[dict[str, Any]], model: ProbabilityModel) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +14,7 @@ from scipy.stats import spearmanr
 
 from benchmarks.worlds.calibration import auroc, calibration_table
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
+from benchmarks.worlds.reliability import reliability_diagram
 from benchmarks.worlds.training import Evidence, train, trained
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
@@ -92,8 +95,8 @@ def test_ambiguity_is_no_error_of_the_probability() -> None:
     for number in range(30):
         values = dict.fromkeys(NAMES, 0.5 + 0.1 * (number % 3))
         rows.append(row(number, RIGHT if number % 3 else WRONG, **values) | {"listed_mssd": RIGHT})
-    _, table = trained([*rows, {**rows[0], "listed_mssd": WRONG, "world": "tsdf-9-long"}])
-    assert table.startswith("21 registrations of 6 worlds, 20 with a right pose.")
+    found = trained([*rows, {**rows[0], "listed_mssd": WRONG, "world": "tsdf-9-long"}])
+    assert found.table.startswith("21 registrations of 6 worlds, 20 with a right pose.")
 
 
 def test_a_lead_over_other_answers_counts() -> None:
@@ -103,17 +106,23 @@ def test_a_lead_over_other_answers_counts() -> None:
     for number in range(400):
         ahead = number % 2 == 0
         first, second = draw.uniform(0.6, 0.9), draw.uniform(0.1, 0.3) if ahead else draw.uniform(0.6, 0.9)
-        rows.append(row(number, RIGHT if ahead else WRONG, True, (1,), confirmed=first))
-        rows.append(row(number, WRONG, False, (-1,), confirmed=second))
-    models, table = trained(rows)
-    assert LEAD in models["among"]["terms"]
-    assert LEAD not in models["alone"]["terms"]
-    assert float(table.split("AUROC ")[1].split(",")[0]) > 0.95
+        for error, step, confirmed in ((RIGHT if ahead else WRONG, 1, first), (WRONG, -1, second)):
+            noise = dict(zip(NAMES, draw.uniform(0.4, 0.6, len(NAMES)), strict=True))
+            rows.append(row(number, error, step == 1, (step,), **noise | {"confirmed": confirmed}))
+    alone = trained(rows)
+    among = trained(rows, alone=ProbabilityModel.from_dict(alone.model["alone"]))
+    assert LEAD in among.model["among"]["terms"]
+    assert LEAD not in alone.model["alone"]["terms"]
+    assert _auroc_of(among.table) > 0.95 > _auroc_of(alone.table)
 
 
-def test_leads_may_be_by_the_odds_of_a_model_that_is_given() -> None:
+def _auroc_of(table: str) -> float:
+    return float(table.split("AUROC ")[1].split(",")[0])
+
+
+def test_leads_are_by_the_odds_of_the_model_that_is_given() -> None:
     """Pairs of candidates of which ``tail`` says which one is right; the model that is given knows it, so the lead says
-    it too, and no model of a pose alone is made."""
+    it too."""
     draw = np.random.default_rng(7)
     rows = []
     for number in range(300):
@@ -121,26 +130,25 @@ def test_leads_may_be_by_the_odds_of_a_model_that_is_given() -> None:
         rows.append(row(number, RIGHT if right else WRONG, True, (1,), tail=draw.uniform(0.0, 0.2) + 0.5 * (not right)))
         rows.append(row(number, WRONG, False, (-1,), tail=draw.uniform(0.5, 0.7)))
     given = {"bias": 0.0, "terms": {"tail": {"knots": [0.0, 1.0], "values": [0.0, -5.0]}}}
-    models, _ = trained(rows, alone=ProbabilityModel.from_dict(given))
+    models = trained(rows, alone=ProbabilityModel.from_dict(given)).model
     assert set(models) == {"among"}
     assert models["among"]["terms"][LEAD]["knots"][-1] <= 5.0 * 0.7, "leads are differences of what the model says"
 
 
 def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
     rows = [row(number, WRONG if number % 2 else RIGHT, offset=0.01 * (number % 2)) for number in range(100)]
-    assert "offset" in trained(rows)[0]["alone"]["terms"]
+    assert "offset" in trained(rows).model["alone"]["terms"]
     del rows[7]["features"]["offset"]
-    assert "offset" not in trained(rows)[0]["alone"]["terms"]
+    assert "offset" not in trained(rows).model["alone"]["terms"]
 
 
 def test_look_alikes_are_told_apart_in_the_table_alone() -> None:
     rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
     alike = [{**one, "model": LOOK_ALIKE, "mssd": 9.0, "listed_mssd": 9.0} for one in rows[1::2]]
-    models, table = trained(rows)
-    with_alike, longer = trained([*rows, *alike])
-    assert with_alike == models
-    assert longer.startswith(table)
-    assert "accepted of 50: 50 at 0.8" in longer
+    without, with_alike = trained(rows), trained([*rows, *alike])
+    assert with_alike.model == without.model
+    assert with_alike.table.startswith(without.table)
+    assert "accepted of 50: 50 at 0.8" in with_alike.table
 
 
 def test_the_table_counts_what_was_chosen() -> None:
@@ -158,3 +166,21 @@ def test_the_table_counts_what_was_chosen() -> None:
 @pytest.mark.parametrize(("scores", "expected"), [([1.0, 2.0, 3.0, 4.0], 1.0), ([4.0, 1.0, 1.0, 2.0], 0.375)])
 def test_auroc_by_hand(scores: list[float], expected: float) -> None:
     assert auroc(np.array(scores), np.array([False, False, True, True])) == pytest.approx(expected)
+
+
+def test_the_diagram_shows_what_was_said_over_what_was_right() -> None:
+    """Four poses of .75, three of them right; one that no registration chose is not drawn."""
+    rows = [{"winner": True, "mssd": RIGHT if number else WRONG, "world": "a"} for number in range(4)]
+    logits = np.full(5, math.log(3.0))
+    drawn = reliability_diagram([*rows, {"winner": False, "mssd": RIGHT, "world": "a"}], logits)
+    picture = ElementTree.fromstring(drawn)
+    square, *points = picture.findall(".//{*}rect[@class='frame']") + picture.findall(".//{*}circle")
+    assert len(points) == 1
+    left, top, edge = (float(square.attrib[name]) for name in ("x", "y", "width"))
+    assert (float(points[0].attrib["cx"]) - left) / edge == pytest.approx(0.75, abs=1e-3)
+    assert 1.0 - (float(points[0].attrib["cy"]) - top) / edge == pytest.approx(0.75, abs=1e-3)
+    bounds = picture.find(".//{*}line[@class='bounds']")
+    assert bounds is not None
+    low, high = (1.0 - (float(bounds.attrib[name]) - top) / edge for name in ("y1", "y2"))
+    assert low == pytest.approx(0.249, abs=1e-3)  # the p of which 3 or 4 of 4 have a chance of 5 %
+    assert high == pytest.approx(0.987, abs=1e-3)  # 0.95 ** (1 / 4): of which 4 of 4 have a chance of 95 %

@@ -70,7 +70,9 @@ def test_what_cameras_saw_is_told_by_where_they_stood_alone(tmp_path: Path, mesh
     assert surfaces > 100
     assert len(torch.cat(before)) > 100
     assert float((torch.cat(before) == FREE).float().mean()) > 0.95
-    assert observation_of(next(cases_of(task.home, "map")).case.scene) is None
+    by_map = next(cases_of(task.home, "map"))
+    assert observation_of(by_map.case.scene) is None
+    assert not by_map.facts["observed"]
 
 
 def _within(seen: Observation, places: Tensor) -> Tensor:
@@ -94,7 +96,9 @@ def test_a_world_of_rendered_images_has_no_drift_and_a_field_of_depths(tmp_path:
         assert seen is not None
         off = one.case.scene.signed_distance(placed[seen.at(placed) == SURFACE]).abs() * float(one.case.truth.scale)
         assert float(off.median()) < 0.01 * float(torch.pdist(one.points[::20]).max())
-    weighed, bare = (next(cases_of(task.home, by)).case.scene for by in ("map", "nothing"))
+    by_map, by_nothing = (next(cases_of(task.home, by)) for by in ("map", "nothing"))
+    assert [one.facts["observed"] for one in (by_map, by_nothing)] == [True, False], "its weights tell what was seen"
+    weighed, bare = by_map.case.scene, by_nothing.case.scene
     assert observation_of(weighed) is not None
     assert observation_of(bare) is None
     assert torch.equal(weighed.signed_distance(placed), bare.signed_distance(placed))

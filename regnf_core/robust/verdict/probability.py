@@ -28,8 +28,8 @@ from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 
 LEAD = "lead"
 SPEAKS_FOR_AMONG = {**SPEAKS_FOR, LEAD: True}
-_ALONE = "probability.json"
-_AMONG = {True: "probability.json", False: "probability-unobserved.json"}
+_ALONE = "probability-alone.json"
+_AMONG = {True: "probability-observed.json", False: "probability-unobserved.json"}
 
 
 @dataclass(frozen=True, eq=False)
