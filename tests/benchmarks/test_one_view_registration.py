@@ -31,6 +31,7 @@ def test_it_is_found(position: tuple[float, float, float]) -> None:
     scene = OneViewField(image, torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]).double())
     result = register(scene, chair(), detection(), ROBUST)
     assert result.verdict == "registered"
+    assert result.metrics["probability"] > 0.9, "what was hidden does not speak against it"
     assert placement_error(result, chair_pose()) < 0.02
     assert result.metrics["occlusion_boundary_share_scene"] > 0.2
     assert result.metrics["occluded_share_object"] > 0.15

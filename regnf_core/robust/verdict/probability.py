@@ -23,6 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.lead import leads, merits
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 
@@ -85,10 +86,15 @@ def _worst_if_nan(term: Term, x: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PoseOdds:
-    """The two sums."""
+    """The two sums. among_hidden: the second one where the object is mostly hidden at the best pose; None: the same.
+
+    A field of one depth image is solid behind what was seen, so it says itself what was hidden, as an observation does.
+    The scenes of which nothing is known, from which their model has learned, show surface on most sides of an object.
+    """
 
     alone: ProbabilityModel
     among: ProbabilityModel
+    among_hidden: ProbabilityModel | None = None
 
     def log_odds(self, features: dict[str, Tensor], scores: Tensor, apart: Tensor) -> Tensor:
         """(H,): log odds of the candidates, each as one among them.
@@ -96,14 +102,18 @@ class PoseOdds:
         features: each (H,) · scores: (H,), smaller is better · apart: (H, H) bool, which candidates are other answers
         than which.
         """
-        lead = leads(merits(self.alone.logit(features), scores), apart)
-        return self.among.logit({**features, LEAD: lead})
+        compared = merits(self.alone.logit(features), scores)
+        model = self.among
+        if self.among_hidden is not None and float(features["hidden"][compared.argmax()]) > VERDICT.mostly_hidden:
+            model = self.among_hidden
+        return model.logit({**features, LEAD: leads(compared, apart)})
 
 
 @cache
 def pose_odds(observed: bool) -> PoseOdds:
     """The models that are shipped. observed: whether it is known what was seen of the scene."""
-    return PoseOdds(_stored(_ALONE, "alone"), _stored(_AMONG[observed], "among"))
+    among = _stored(_AMONG[observed], "among")
+    return PoseOdds(_stored(_ALONE, "alone"), among, None if observed else _stored(_AMONG[True], "among"))
 
 
 def _stored(name: str, model: str) -> ProbabilityModel:

@@ -72,6 +72,20 @@ def test_the_lead_is_taken_from_the_odds_alone_and_the_scores() -> None:
     assert found.tolist() == pytest.approx([1.0 - 0.5, 1.0 - 1.0, 1.0 - 4.0], abs=1e-6)  # leads 2.5, 2 and -2.5
 
 
+@pytest.mark.parametrize(("hidden", "as_if_observed"), [(0.45, False), (0.55, True)])
+def test_what_is_mostly_hidden_at_the_best_pose_is_known_to_be(hidden: float, as_if_observed: bool) -> None:
+    """Two candidates; at the better one half of the object is hidden, as the field of one depth image says. The patches
+    that are hidden must not speak against it then, nor against the other, whose own share is not asked."""
+    told = {name: torch.full((2,), 0.5).double() for name in SPEAKS_FOR} | {"hidden": torch.tensor([hidden, 0.1])}
+    told |= {"confirmed": torch.tensor([0.6, 0.1])}
+    scores, apart = torch.tensor([0.2, 0.4]), ~torch.eye(2, dtype=torch.bool)
+    found = pose_odds(False).log_odds(told, scores, apart)
+    known = pose_odds(True).log_odds(told, scores, apart)
+    assert torch.equal(found, known) is as_if_observed
+    fewer = {**told, "confirmed_patches": torch.zeros(2)}
+    assert torch.equal(pose_odds(False).log_odds(fewer, scores, apart), found) is as_if_observed
+
+
 OBSERVED = pytest.mark.parametrize("observed", [True, False])
 
 
