@@ -90,9 +90,10 @@ class VerdictConstants:
     """Probability of being right that a pose needs even where it meets all criteria. [random worlds: worlds left out of
     the parts train and validation, docs/verdict.md]"""
     mostly_hidden: float = 0.5
-    """Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, probabilities
-    are those of scenes of which it is known: the field says what was hidden. Of the 282 right poses that the other model
-    is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth image]"""
+    """Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
+    itself says what was hidden, and probabilities are those of scenes of which it is known. Of the 282 right poses that
+    the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth
+    image]"""
     apart: float = 0.05
     """Diameters. Poses farther apart cannot both be right. [derived: right is within 5 % of the truth]"""
     axis_turns: int = 72
