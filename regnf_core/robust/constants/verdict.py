@@ -94,6 +94,9 @@ class VerdictConstants:
     itself says what was hidden, and probabilities are those of scenes of which it is known. Of the 282 right poses that
     the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth
     image]"""
+    max_hidden: float = 0.95
+    """Share of the object's samples that may be hidden, wherever they lie: of 696 right poses of scenes of which it is
+    known none has more than .935, so the probability knows nothing of poses beyond. [random worlds]"""
     apart: float = 0.05
     """Diameters. Poses farther apart cannot both be right. [derived: right is within 5 % of the truth]"""
     axis_turns: int = 72

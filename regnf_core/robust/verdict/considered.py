@@ -25,24 +25,25 @@ def considered_poses(
     candidates: PoseCandidates,
     evidence: Evidence,
     demerits: Tensor,
-    unexplained: Tensor,
+    features: dict[str, Tensor],
     probability: Tensor,
     options: RobustOptions,
 ) -> Considered:
-    """The best of the candidates that differ, the likeliest first. demerits, unexplained, probability: (H,) of each."""
+    """The best of the candidates that differ, the likeliest first. demerits, features, probability: (H,) of each."""
     points = problem.model.extremal_points
     numbers = distinct(candidates.T, demerits, points, VERDICT.rivals_min_distance, len(candidates))[:_MOST].tolist()
     poses = []
     for number in numbers:
         likely = float(probability[number])
-        quality = SceneQuality(problem.view.normal_roughness, float(unexplained[number]))
+        unexplained, hidden = (float(features[name][number]) for name in ("unexplained", "hidden"))
+        quality = SceneQuality(problem.view.normal_roughness, unexplained, hidden)
         found = evaluate_pose(evidence, number, 0, options, quality, likely)
         if not bool(problem.bound.admits(candidates.T[torch.tensor([number])])[0]):
             reason = "OUTSIDE_DETECTION"
         else:
             reason = found.reason
         metrics = {**evidence.of(number), "probability": likely}
-        metrics["unexplained_share_scene"] = float(unexplained[number])
+        metrics["unexplained_share_scene"] = unexplained
         poses.append(ConsideredPose(problem.in_field_frames(candidates.T[number]), reason, metrics))
     chosen = torch.tensor(numbers)
     scene, obj = problem.held_out.scene_samples, problem.held_out.object_samples

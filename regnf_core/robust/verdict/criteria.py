@@ -22,10 +22,12 @@ from regnf_core.robust.verdict.evidence import Evidence
 class SceneQuality:
     """Of the scene near one pose. normal_roughness: of its surface, see :mod:`regnf_core.robust.scene.smoothing` ·
     unexplained: share of the surface near the object that is no part of it, see
-    :mod:`regnf_core.robust.verdict.unexplained_surface`."""
+    :mod:`regnf_core.robust.verdict.unexplained_surface` · hidden: share of the object that is occluded or was not
+    observed, wherever it lies."""
 
     normal_roughness: float = 0.0
     unexplained: float = 0.0
+    hidden: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -69,17 +71,18 @@ def evaluate_pose(
     Written so that a number that is not finite can only lead to a rejection.
     """
     occluded = _Criterion("TOO_LITTLE_SURFACE", options.max_occluded_share - float(evidence.occluded[index]))
+    hidden = _Criterion("TOO_LITTLE_SURFACE", VERDICT.max_hidden - quality.hidden)
     accurate = list(_of_accurate_fields(evidence, index, options))
     unexplained = _unexplained(evidence, index, quality.unexplained)
     rough = _smallest_slack(_of_rough_fields(evidence, index, options, quality.normal_roughness))
     observed = _smallest_slack(_of_observed_surface(evidence, index, options))
     likely = -1.0 if probability is None else probability - options.min_probability
     agreement = max(_smallest_slack(accurate), rough, observed, likely)
-    margin = min(_smallest_slack([occluded, unexplained]), agreement)
+    margin = min(_smallest_slack([occluded, hidden, unexplained]), agreement)
     if not margin >= 0.0:
-        relevant = [occluded, unexplained]
+        relevant = [occluded, hidden, unexplained]
         if not agreement >= 0.0:
-            relevant = [occluded, accurate[0], unexplained, *accurate[1:]]
+            relevant = [occluded, hidden, accurate[0], unexplained, *accurate[1:]]
         return PoseVerdict("rejected", next(one.reason for one in relevant if not one.met), margin)
     if probability is not None and not probability >= VERDICT.min_probability:
         return PoseVerdict("rejected", "LOW_PROBABILITY", probability - VERDICT.min_probability)

@@ -63,7 +63,7 @@ def evaluate_candidates(
     answer = choose(problem, candidates, features, evidence.scores, options.robust.rival_margin)
     winner, listed = answer.winner, answer.probability_listed
     unexplained = float(features["unexplained"][winner])
-    quality = SceneQuality(problem.view.normal_roughness, unexplained)
+    quality = SceneQuality(problem.view.normal_roughness, unexplained, float(features["hidden"][winner]))
     found = evaluate_pose(evidence, winner, len(answer.rivals), options.robust, quality, float(listed[winner]))
     if not bool(problem.bound.admits(candidates.T[torch.tensor([winner])])[0]):
         found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
@@ -80,9 +80,7 @@ def evaluate_candidates(
         "iterations": float(len(candidates.history)),
         "pose_candidates": float(len(candidates)),
     }
-    considered = considered_poses(
-        problem, candidates, evidence, answer.demerits, features["unexplained"], listed, options.robust
-    )
+    considered = considered_poses(problem, candidates, evidence, answer.demerits, features, listed, options.robust)
     demerit = float(answer.demerits[winner])
     return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered, demerit)
 

@@ -43,5 +43,5 @@ def test_what_nobody_saw_gives_no_verdict() -> None:
     box = detection()
     seen = observed(scene, everything)
     result = register(seen, chair(), box, ROBUST, clouds=False)
-    assert result.verdict == "rejected"
+    assert (result.verdict, result.verdict_reason) == ("rejected", "TOO_LITTLE_SURFACE")
     assert isinstance(result.T_object_scene, Sim3)
