@@ -41,7 +41,7 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
     found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
     single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
-    assert float(found.probability[0].logit()) < float(found.probability_listed[0].logit()) - 1.0
+    assert float(found.probability[0].logit()) < float(found.probability_listed[0].logit()) - 2.0
     assert float(found.probability_listed[0]) == pytest.approx(float(single.probability[0])), "as if it were alone"
     assert float(found.probability_listed[2]) == pytest.approx(float(found.probability[2])), "it is not listed"
 

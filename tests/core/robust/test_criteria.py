@@ -65,6 +65,15 @@ def test_matter_around_the_object_is_no_free_space() -> None:
     assert float(evidence_of([0.0] * 10, [0.0] * 8 + [-0.2] * 2).coarse[0]) == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize(("hidden", "verdict"), [(0.94, "registered"), (0.96, "rejected"), (float("nan"), "rejected")])
+def test_where_nearly_nothing_was_observed_no_probability_helps(hidden: float, verdict: str) -> None:
+    """All samples agree, at places that nobody saw."""
+    found = evidence_of([0.0] * 10, [0.0] * 10)
+    judged = evaluate_pose(found, 0, 0, RobustOptions(), SceneQuality(hidden=hidden), 0.99)
+    assert judged.verdict == verdict
+    assert (judged.reason == "TOO_LITTLE_SURFACE") is (verdict == "rejected")
+
+
 def test_roughness_is_forgiven_on_rough_fields_alone() -> None:
     found = evidence_of([0.005] * 4 + [0.02] * 5 + [-0.02] * 1, [0.005] * 4 + [0.02] * 3 + [-0.02] * 3)
     assert verdict_on(found).verdict == "rejected"
