@@ -25,7 +25,8 @@ HINTS: dict[str, str] = {
     "SURFACE_UNEXPLAINED": "Most often the object is a similar one, for example a chair without its cushion. If "
     "something lies on it, try a tighter box.",
     "FREE_SPACE_VIOLATED": "Most often it is another object, or the scene's field lacks parts of this one.",
-    "LOW_PROBABILITY": "Most often it is another object, or one of another shape of the same kind.",
+    "LOW_PROBABILITY": "Most often it is another object, or one of another shape of the same kind. Otherwise try more "
+    "views of it.",
     "OUTSIDE_DETECTION": "Most often it is another object. Around a part of the object, increase the option "
     "robust.box_tolerance.",
     "TOO_LITTLE_SURFACE": "Too little of the object was observed. Fit the scene's field to more views, or use a box "

@@ -11,7 +11,7 @@ VERDICT_REASONS: dict[str, str] = {
     "SURFACE_UNEXPLAINED": "Next to the object the scene has surface that does not belong to it: the object is a"
     " similar one, or something is attached to it.",
     "SCENE_UNEXPLAINED": "The object explains too little of the surface in the box.",
-    "LOW_PROBABILITY": "Each criterion is met, but all the evidence together makes the pose unlikely.",
+    "LOW_PROBABILITY": "The pose is unlikely: most often because the object fits about as well elsewhere in the box.",
     "OUTSIDE_DETECTION": "At the best pose the object reaches far beyond the detection box, or is far smaller than it.",
     "TOO_LITTLE_SURFACE": "Too much of the object would be occluded or unobserved: the rest is too little to check the"
     " pose.",

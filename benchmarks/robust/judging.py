@@ -30,6 +30,8 @@ _METRICS = (
     "residual_rms",
     "coarse_agreement",
     "unexplained_share_scene",
+    "probability",
+    "probability_listed",
     "verdict_margin",
     "surface_offset",
     "field_evaluations",

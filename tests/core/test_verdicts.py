@@ -15,5 +15,5 @@ def test_the_table_holds_the_reasons_of_both_presets_and_no_others() -> None:
     verdict = CORE / "robust" / "verdict"
     for source in (CORE / "paper" / "verification.py", verdict / "criteria.py", verdict / "evaluation.py"):
         text = source.read_text(encoding="utf-8")
-        given |= set(re.findall(r'(?:"(?:registered|ambiguous|rejected)", |return |_Criterion\()"([A-Z_]+)"', text))
+        given |= set(re.findall(r'(?:"(?:registered|ambiguous|rejected)", |return |_Limit\()"([A-Z_]+)"', text))
     assert given == set(VERDICT_REASONS)

@@ -45,58 +45,29 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class VerdictConstants:
-    """Thresholds of the verdict (verdict/criteria.py, verdict/evaluation.py).
+    """Of the verdict (verdict/criteria.py, verdict/evaluation.py). The probability that a pose needs is an option."""
 
-    "Noise" is the root mean square of the inliers' residuals, diameters. Limits that depend on it: where the inliers
-    agree to a thousandth of the diameter, a tenth of the surface that does not agree is another thing (a chair without
-    its cushion); where they agree to a hundredth, it may be the fields' errors.
-    """
-
-    clean_violations: float = 0.05
-    """Share of object samples in free space that a field without noise may have. [main pairs]"""
-    violations_per_noise: float = 20.0
-    """Shares for each diameter of noise, in addition. [main pairs]"""
-    clean_inlier_share: float = 0.89
-    """Share of the scene samples near the object that agree in a field without noise. [main pairs]"""
-    inlier_share_per_noise: float = 45.0
-    """Shares for each diameter of noise, less. [main pairs]"""
-    unexplained: float = 0.03
-    """Share of unexplained surface near the object without noise. [early fits]"""
-    unexplained_observed: float = 0.05
-    """The same for scenes with an observation: what was measured is there. [early fits]"""
+    unexplained: float = 0.05
+    """Share of unexplained surface near the object without noise, where it is known what was seen: what was measured is
+    there. [early fits]"""
     unexplained_per_noise: float = 20.0
-    """Shares for each diameter of noise, in addition: fits to images invent surface that nobody saw, and where a map is
-    noisy, what lies on the object cannot be told from a part of another one. [early fits; random worlds]"""
-    rough: float = 0.022
-    """Normal roughness from which a field counts as rough. [early fits]"""
-    rough_score: float = 0.5
-    """Largest score of a rough field at that roughness. [early fits]"""
-    score_per_normal_roughness: float = 12.0
-    """Score for each unit of normal roughness beyond, in addition. [early fits]"""
-    max_tail_ratio: float = 5.5
-    """Tail ratio: 3 for normal errors that are alike everywhere. Another object's residuals are small where it is alike
-    and large elsewhere. [early fits]"""
-    min_coarse: float = 0.68
-    """Coarse agreement of a rough field. [early fits]"""
-    min_coarse_partial: float = 0.72
-    """The same where part of the scene is known not to have been observed. [early fits]"""
-    min_coarse_observed: float = 0.78
-    """The same for smooth fields of such scenes. [early fits]"""
-    max_occluded: float = 0.6
-    """Share of occluded object samples with which coarse agreement is enough. [early fits]"""
-    max_offset: float = 0.015
-    """Diameters. Surface offset with which coarse agreement is enough in a smooth field. [early fits]"""
-    min_probability: float = 0.7
-    """Probability of being right that a pose needs even where it meets all criteria. [random worlds: worlds left out of
-    the parts train and validation, docs/verdict.md]"""
+    """Shares for each diameter of noise (root mean square of the inliers' residuals), in addition: where a map is
+    noisy, what lies on the object cannot be told from a part of another one. [random worlds]"""
     mostly_hidden: float = 0.5
     """Share of the object's samples. Where nothing says what was seen and more is hidden at the best pose, the field
-    itself says what was hidden, and probabilities are those of scenes of which it is known. Of the 282 right poses that
+    itself says what was hidden, and the verdict is that of scenes of which it is known. Of the 282 right poses that
     the other model is trained on 2 have more; of one depth image they have .6 to .9. [random worlds; one depth
     image]"""
     max_hidden: float = 0.95
     """Share of the object's samples that may be hidden, wherever they lie: of 696 right poses of scenes of which it is
     known none has more than .935, so the probability knows nothing of poses beyond. [random worlds]"""
+    told_violations: float = 0.1
+    """Share of object samples in free space. Where an improbable pose has more, that is the reason that is told; so it
+    is with the next two and ``unexplained``. They decide nothing. [by hand]"""
+    told_overlap: float = 0.6
+    """Share of inliers, the smaller one of both directions. [by hand]"""
+    told_explained: float = 0.4
+    """Share of the scene samples that the object explains. [by hand]"""
     apart: float = 0.05
     """Diameters. Poses farther apart cannot both be right. [derived: right is within 5 % of the truth]"""
     axis_turns: int = 72

@@ -18,7 +18,7 @@ from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.considered import considered_poses
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_known_scale
-from regnf_core.robust.verdict.criteria import PoseVerdict, SceneQuality, evaluate_pose
+from regnf_core.robust.verdict.criteria import PoseVerdict, evaluate_pose
 from regnf_core.robust.verdict.evidence import gather_evidence
 from regnf_core.robust.verdict.pose_features import pose_features
 from regnf_core.robust.verdict.relation import relation
@@ -62,9 +62,8 @@ def evaluate_candidates(
     problem, candidates = problem.to("cpu"), candidates.to("cpu")
     answer = choose(problem, candidates, features, evidence.scores, options.robust.rival_margin)
     winner, listed = answer.winner, answer.probability_listed
-    unexplained = float(features["unexplained"][winner])
-    quality = SceneQuality(problem.view.normal_roughness, unexplained, float(features["hidden"][winner]))
-    found = evaluate_pose(evidence, winner, len(answer.rivals), options.robust, quality, float(listed[winner]))
+    of_winner, likely = {name: float(one[winner]) for name, one in features.items()}, float(listed[winner])
+    found = evaluate_pose(evidence, winner, len(answer.rivals), options.robust, of_winner, likely)
     if not bool(problem.bound.admits(candidates.T[torch.tensor([winner])])[0]):
         found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
     T = problem.in_field_frames(candidates.T[winner])
@@ -72,15 +71,15 @@ def evaluate_candidates(
     metrics = {
         **evidence.of(winner),
         "probability": float(answer.probability[winner]),
-        "probability_listed": float(listed[winner]),
-        "unexplained_share_scene": unexplained,
+        "probability_listed": likely,
+        "unexplained_share_scene": of_winner["unexplained"],
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
         "occlusion_boundary_share_scene": problem.view.occlusion_boundary_share,
         "iterations": float(len(candidates.history)),
         "pose_candidates": float(len(candidates)),
     }
-    considered = considered_poses(problem, candidates, evidence, answer.demerits, features, listed, options.robust)
+    considered = considered_poses(problem, candidates, evidence, answer, features, options.robust)
     demerit = float(answer.demerits[winner])
     return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered, demerit)
 

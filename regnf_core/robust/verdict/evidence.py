@@ -40,10 +40,6 @@ class Evidence:
     coarse: Tensor
     """Coarse agreement: the share of samples, the smaller one of both directions, that agree at twice the inlier
     distance, whatever the normals, minus the share in free space."""
-    tail_ratio: Tensor
-    """How long the tail of the residuals is: 3 for normal errors that are alike everywhere."""
-    explained_coarsely: Tensor
-    """Scene samples, near or not, that the object explains at twice the inlier distance."""
     offsets: Tensor
     """How much farther out the scene's surface lies than the object's."""
     scene_signs: Tensor
@@ -86,7 +82,6 @@ def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: Ro
     near = r.scene_to_object.abs() <= EVIDENCE.near
     if r.unobserved is not None:
         near &= ~r.unobserved[:, :n]
-    coarse, explained_coarsely = _coarse(r, near, observed, EVIDENCE.coarse_distance * limit)
     free = (to_scene > limit) & observed
     squares = torch.where(inlier, r.values.square(), 0.0).sum(1)
     return Evidence(
@@ -97,9 +92,7 @@ def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: Ro
         occluded=occluded.float().mean(1),
         violations=free.sum(1) / visible,
         residual_rms=(squares / inlier.sum(1).clamp_min(1)).sqrt(),
-        coarse=coarse,
-        tail_ratio=_tail_ratio(r),
-        explained_coarsely=explained_coarsely,
+        coarse=_coarse(r, near, observed, EVIDENCE.coarse_distance * limit),
         offsets=offsets,
         scene_signs=_signs((~inlier[:, :n] & near, 1), (~inlier[:, :n] & ~near, 2)),
         object_signs=_signs((~inlier[:, n:], 3), (occluded, 2), (free, 1)),
@@ -115,8 +108,8 @@ def _signs(*marked: tuple[Tensor, int]) -> Tensor:
     return signs
 
 
-def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> tuple[Tensor, Tensor]:
-    """``coarse`` and ``explained_coarsely`` of the evidence, (H,) each.
+def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> Tensor:
+    """``coarse`` of the evidence, (H,).
 
     near: (H, N) scene samples near the object · observed: (H, M) object samples at places that were observed.
     """
@@ -125,11 +118,5 @@ def _coarse(r: Residuals, near: Tensor, observed: Tensor, distance: float) -> tu
     of_near = explained.sum(1) / near.sum(1).clamp_min(1)
     of_object = (observed & (to_scene.abs() <= distance)).sum(1) / observed.sum(1).clamp_min(1)
     free = (observed & (to_scene > distance)).sum(1) / (observed & (to_scene >= -distance)).sum(1).clamp_min(1)
-    return torch.minimum(of_near, of_object) - free, explained.float().mean(1)
-
-
-def _tail_ratio(r: Residuals) -> Tensor:
-    values = r.values if r.unobserved is None else r.values.masked_fill(r.unobserved, torch.nan)
-    core, tail = torch.nanquantile(values.abs(), values.new_tensor(EVIDENCE.tail_quantiles), dim=1)
-    ratio: Tensor = tail / core.clamp_min(1e-9)
-    return ratio
+    agreement: Tensor = torch.minimum(of_near, of_object) - free
+    return agreement
