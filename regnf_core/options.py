@@ -116,7 +116,8 @@ class RobustOptions:
     about it. Increase it when an obvious pose was missed; the search takes longer in proportion."""
     feature_draws: Annotated[int, Ge(0), Le(64)] = 4
     """Feature matches (FPFH and RANSAC, at any scale) that a second search starts from, when the first one ends in a
-    rejection. Each takes about a tenth of a second. More help in heavy clutter; 0 turns the second search off."""
+    rejection or in an answer that is less likely than 0.95. Each takes about a tenth of a second. More help in heavy
+    clutter; 0 turns the second search off."""
     scene_samples: Annotated[int, Ge(200), Le(100_000)] = 4000
     """Maximum number of samples of the scene's surface in the detection box. Increase it for an object that is small in
     its box."""

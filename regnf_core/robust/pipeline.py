@@ -200,10 +200,11 @@ def _best_attempt(
     T_start: Sim3 | None,
 ) -> Evaluation:
     """Around a given start, else from the shapes, else thoroughly and from feature matches too: slower ways where
-    others fail. What earlier attempts found stays among the candidates: a pose is compared with all of them."""
+    others fail or leave doubt. What earlier attempts found stays among the candidates: a pose is compared with all of
+    them."""
     starts = starts_of(problem, options, seed, generator, T_start)
     best = _attempt(problem, next(starts), [], options, run, generator)
-    while best.verdict == "rejected" and (start := next(starts, None)) is not None:
+    while best.doubtful and (start := next(starts, None)) is not None:
         best = _attempt(problem, start, [best], options, run, generator)
     return best
 

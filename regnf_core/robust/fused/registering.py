@@ -57,7 +57,7 @@ class _Lane:
     @property
     def waits(self) -> bool:
         """Whether another attempt is worth it."""
-        return self.error is None and (not self.found or self.found[-1].verdict == "rejected")
+        return self.error is None and (not self.found or self.found[-1].doubtful)
 
 
 def register_together(

@@ -10,7 +10,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.result import Alternative, Considered, Verdict
-from regnf_core.robust.constants import REFINEMENT
+from regnf_core.robust.constants import REFINEMENT, VERDICT
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.loss import adaptive_width
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
@@ -41,6 +41,11 @@ class Evaluation:
 
     demerit: float
     """What the best candidates of several objects are compared by, as those of one object are."""
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a further attempt is worth its time: it may find a better pose, or one that speaks against this."""
+        return self.verdict == "rejected" or self.metrics["probability_listed"] < VERDICT.doubtful
 
     @property
     def rank(self) -> tuple[bool, float]:
