@@ -19,7 +19,6 @@ Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "use_attribute_docstrings": True}
 _Ratio = Annotated[float, Gt(0), Le(1)]
-_OptionalRatio = _Ratio | None
 _Scale = Annotated[float, Ge(1e-6), Le(1e6)] | None
 
 
@@ -137,22 +136,22 @@ class RobustOptions:
     reliable and the pose less accurate."""
     inlier_distance: Annotated[float, Gt(0), Le(0.2)] = 0.015
     """Maximum |residual| of an inlier, object diameters. Increase it for coarse or noisy fields."""
-    min_probability: _Ratio = 0.8
-    """Minimum probability (0..1) that the pose, or one of those that are listed with it, is right, estimated from all
-    evidence together; below it the pose is rejected. Increase it for fewer wrong poses, decrease it to miss fewer right
-    ones."""
+    min_probability: _Ratio = 0.9
+    """Probability (0..1) of the pose, or of one of those that are listed with it, from which it is accepted without
+    regard to the three limits that follow, estimated from all evidence together. Below it, down to 0.7, the limits
+    must be kept. Increase it for fewer wrong poses."""
+    min_inlier_share: _Ratio = 0.6
+    """Minimum share (0..1) of inliers, in each direction; below it: LOW_OVERLAP. Decrease it where the object in the
+    scene is damaged or covered."""
+    min_explained_share: _Ratio = 0.4
+    """Minimum share (0..1) of the surface in the box that the object explains; below it: SCENE_UNEXPLAINED. Decrease it
+    for boxes that hold other objects too."""
+    max_free_space_violations: _Ratio = 0.2
+    """Maximum share (0..1) of the object's surface in the scene's free space; above it: FREE_SPACE_VIOLATED. Increase
+    it where the scene's field lacks parts of the object."""
     max_occluded_share: _Ratio = 0.85
     """Maximum share (0..1) of the object's surface that is occluded or unobserved; above it: TOO_LITTLE_SURFACE.
     Increase it for objects that were observed from one side only."""
-    min_inlier_share: _OptionalRatio = None
-    """Minimum share (0..1) of inliers, in each direction; below it: LOW_OVERLAP, however probable the pose is. null: no
-    such limit."""
-    min_explained_share: _OptionalRatio = None
-    """Minimum share (0..1) of the surface in the box that the object explains; below it: SCENE_UNEXPLAINED, however
-    probable the pose is. null: no such limit."""
-    max_free_space_violations: _OptionalRatio = None
-    """Maximum share (0..1) of the object's surface in the scene's free space; above it: FREE_SPACE_VIOLATED, however
-    probable the pose is. null: no such limit."""
     rival_margin: Annotated[float, Ge(0), Le(1)] = 0.05
     """Other poses are listed as equally good if their score (0..1) exceeds the best score by at most this plus 0.15
     times the best score. Increase it to list less exact symmetry equivalents too."""

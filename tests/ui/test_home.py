@@ -190,7 +190,7 @@ def test_run_again_and_compare(visit: Visit, files: tuple[Path, Path]) -> None:
         page.goto(f"{address}/jobs")
         page.get_by_role("button", name="Run again").click()
         page.get_by_label("Seed").fill("7")
-        page.get_by_label("Least probability of being right").fill("0.5")
+        page.get_by_label("Least share of inliers").fill("0.5")
         page.click("#again-start")
         page.wait_for_url("**/view")
         page.goto(f"{address}/jobs")

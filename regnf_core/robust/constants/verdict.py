@@ -45,8 +45,10 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class VerdictConstants:
-    """Of the verdict (verdict/criteria.py, verdict/evaluation.py). The probability that a pose needs is an option."""
+    """Of the verdict (verdict/criteria.py, verdict/evaluation.py). What is enough by itself is an option."""
 
+    min_probability: float = 0.7
+    """Probability that a pose needs even where it keeps the limits of the shares. [random worlds]"""
     unexplained: float = 0.05
     """Share of unexplained surface near the object without noise, where it is known what was seen: what was measured is
     there. [early fits]"""
@@ -65,13 +67,6 @@ class VerdictConstants:
     """Probability below which a further attempt at the search is made, even where the pose is accepted: it may find a
     better pose, or one as good that makes this less likely. Of 113 poses of .8 to .95, 95 instead of 90 are right after
     it, and 11 instead of 17 answers are wrong. [random worlds]"""
-    told_violations: float = 0.1
-    """Share of object samples in free space. Where an improbable pose has more, that is the reason that is told; so it
-    is with the next two and ``unexplained``. They decide nothing. [by hand]"""
-    told_overlap: float = 0.6
-    """Share of inliers, the smaller one of both directions. [by hand]"""
-    told_explained: float = 0.4
-    """Share of the scene samples that the object explains. [by hand]"""
     apart: float = 0.05
     """Diameters. Poses farther apart cannot both be right. [derived: right is within 5 % of the truth]"""
     axis_turns: int = 72

@@ -1,13 +1,12 @@
 """The verdict on a pose: whether it is probable enough, and where it is not, what is wrong with it in words.
 
-The probability (:mod:`.probability`) holds all the evidence together, so it decides. In addition
+The probability (:mod:`.probability`) holds all the evidence together. It decides where it is high or low. Between, a
+pose has to keep the limits of three shares too, which are options: another object of the same kind, a chair in another
+chair's place, may be as probable, but little of its surface agrees, or much of it stands in free space. In addition
 
 - little of the object may be left that was seen: of such poses the probability knows nothing;
 - the scene may have surface within the object's hull that belongs to another, similar object. It fits as well, so this
-  is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface;
-- the options may limit single shares.
-
-The reason of an improbable pose is the first of a few plain facts that holds: it decides nothing.
+  is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface.
 """
 
 from __future__ import annotations
@@ -62,8 +61,8 @@ def evaluate_pose(
         _Limit("TOO_LITTLE_SURFACE", options.max_occluded_share - float(evidence.occluded[index])),
         _Limit("TOO_LITTLE_SURFACE", VERDICT.max_hidden - features["hidden"]),
         *_of_a_similar_object(evidence, index, features),
-        *_of_the_options(evidence, index, options),
-        _Limit(_improbable(evidence, index, features), probability - options.min_probability),
+        *_of_the_shares(evidence, index, options, probability),
+        _Limit("LOW_PROBABILITY", probability - min(VERDICT.min_probability, options.min_probability)),
     ]
     margin = min(-1.0 if math.isnan(one.slack) else one.slack for one in limits)
     broken = next((one for one in limits if not one.kept), None)
@@ -81,25 +80,11 @@ def _of_a_similar_object(evidence: Evidence, index: int, features: Mapping[str, 
     yield _Limit("SURFACE_UNEXPLAINED", allowed - features["unexplained"])
 
 
-def _of_the_options(evidence: Evidence, index: int, options: RobustOptions) -> Iterable[_Limit]:
-    """Those that are off unless they are given."""
-    if (most := options.max_free_space_violations) is not None:
-        yield _Limit("FREE_SPACE_VIOLATED", most - float(evidence.violations[index]))
-    if (least := options.min_inlier_share) is not None:
-        yield _Limit("LOW_OVERLAP", float(evidence.share_object[index]) - least)
-        yield _Limit("LOW_OVERLAP", float(evidence.share_scene[index]) - least)
-    if (least := options.min_explained_share) is not None:
-        yield _Limit("SCENE_UNEXPLAINED", float(evidence.share_explained[index]) - least)
-
-
-def _improbable(evidence: Evidence, index: int, features: Mapping[str, float]) -> str:
-    """The reason that an improbable pose is told to have."""
-    if float(evidence.violations[index]) > VERDICT.told_violations:
-        return "FREE_SPACE_VIOLATED"
-    if min(float(evidence.share_object[index]), float(evidence.share_scene[index])) < VERDICT.told_overlap:
-        return "LOW_OVERLAP"
-    if float(evidence.share_explained[index]) < VERDICT.told_explained:
-        return "SCENE_UNEXPLAINED"
-    if features["unexplained"] > VERDICT.unexplained:
-        return "SURFACE_UNEXPLAINED"
-    return "LOW_PROBABILITY"
+def _of_the_shares(evidence: Evidence, index: int, options: RobustOptions, probability: float) -> Iterable[_Limit]:
+    """None where the pose is probable enough without."""
+    if probability >= options.min_probability:
+        return
+    yield _Limit("FREE_SPACE_VIOLATED", options.max_free_space_violations - float(evidence.violations[index]))
+    yield _Limit("LOW_OVERLAP", float(evidence.share_object[index]) - options.min_inlier_share)
+    yield _Limit("LOW_OVERLAP", float(evidence.share_scene[index]) - options.min_inlier_share)
+    yield _Limit("SCENE_UNEXPLAINED", float(evidence.share_explained[index]) - options.min_explained_share)

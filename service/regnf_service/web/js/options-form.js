@@ -8,7 +8,9 @@ const NUMBERS = [
   ['rotations', 'Rotations to start from', 600, 24, 20000],
   ['box_tolerance', 'How far the object may reach beyond the box, of its edge', 1, 0, 10],
   ['inlier_distance', 'Largest residual of an inlier, diameters', 0.015, 0.0001, 0.2],
-  ['min_probability', 'Least probability of being right', 0.8, 0.01, 1],
+  ['min_probability', 'Probability that is enough by itself', 0.9, 0.01, 1],
+  ['min_inlier_share', 'Least share of inliers', 0.6, 0.01, 1],
+  ['min_explained_share', 'Least share of the box that is explained', 0.4, 0.01, 1],
   ['max_occluded_share', 'Most of the object that is not seen', 0.85, 0.01, 1],
 ];
 
