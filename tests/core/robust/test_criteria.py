@@ -87,7 +87,7 @@ def test_from_the_probability_of_the_options_on_shares_do_not_count(enough: floa
     assert verdict_on(FREE, probability=enough - 0.01, min_probability=enough).verdict == "rejected"
 
 
-def test_below_it_a_pose_has_to_keep_the_limits_and_be_likelier_than_not() -> None:
+def test_below_it_a_pose_has_to_keep_the_limits_and_be_likely_enough() -> None:
     assert verdict_on(probability=0.7).verdict == "registered"
     assert verdict_on(probability=0.7).margin == 0.0
     less = verdict_on(probability=0.69)
