@@ -46,8 +46,9 @@ ITERATIONS = sum(len(stage.widths) for stage in (*REFINEMENT.stages, *REFINEMENT
 class WarmStart:
     """What is known before a registration with the preset `robust`.
 
-    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection ·
-    object_model: what ``model_object`` made of the object's field earlier; saves making it again.
+    T_object_scene: its neighborhood is searched first, everything else only if that ends in a rejection or in an answer
+    less likely than 0.95 · object_model: what ``model_object`` made of the object's field earlier; saves making it
+    again.
     """
 
     T_object_scene: Sim3 | None = None

@@ -92,7 +92,8 @@ class RegistrationSpec(Incoming):
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="The same seed gives the same result.")] = 0
     initial_transform: Similarity | None = Field(
         None,
-        description="A T_object_scene to look at first; everything else is searched only if that is rejected. "
+        description="A T_object_scene to look at first; everything else is searched only if that is rejected "
+        "or less likely than 0.95. "
         "For the preset `robust`.",
     )
     ground_truth: GroundTruth | None = None
