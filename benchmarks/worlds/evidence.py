@@ -1,16 +1,17 @@
 """Poses with what the held-out samples tell of them, and whether they are right: what the verdict's model learns from.
 
 For every case of a world: the poses that a registration chose among, the best pose that a refinement from the truth
-leads to, and, for two other objects registered in the same box, the poses that they chose among, which are all wrong:
-one of another world, and a look-alike of the right one.
+leads to, and, for three other objects registered in the same box, the poses that they chose among, which are all wrong:
+one of another world, one of a similar shape, and a look-alike of the right one.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ import torch
 from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.look_alikes import LOOK_ALIKE, look_alike
 from benchmarks.worlds.recipe import parts_of_name
+from benchmarks.worlds.similar_objects import similar_object
 from benchmarks.worlds.stages import NearestTruth, Recording, recorded
 from regnf_core import RegistrationOptions, RegnfError, Sim3, register
 from regnf_core.geometry.points import NearestNeighbors, diameter
@@ -31,33 +33,52 @@ from regnf_core.robust.verdict.pose_features import pose_features
 from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
+Asked = Literal["right", "other", "look-alike", "similar"]
+ASKED: tuple[Asked, ...] = ("right", "other", "look-alike", "similar")
+"""Whose pose is looked for in a case's box: the right object's, that of one of another kind, of one that differs from
+the right one by a part, of one of a similar shape."""
 _OPTIONS = RegistrationOptions(preset="robust")
 _POINTS = 4000
 _SAME_SHAPE = 0.03
 """Diameters. An object whose surface lies that close to the right one's, nearly everywhere, is no wrong object."""
 
 
-def evidence_of_world(
-    home: Path, known: Sequence[Path], by: ObservedBy, limit: int, look_alikes_every: int = 1
-) -> list[Row]:
-    """The rows of the first ``limit`` cases of a world's folder. known: all folders; wrong objects come from the other
-    worlds of its part. by: what tells what was seen of the scene. look_alikes_every: of so many cases the first has a
-    look-alike."""
+@dataclass(frozen=True)
+class Gathering:
+    """by: what tells what was seen of the scenes · cases: of each world, at most, the first ones · asked: the objects
+    that are looked for in each case's box · look_alikes_every: of so many cases the first has a look-alike."""
+
+    by: ObservedBy = "images"
+    cases: int = 8
+    asked: tuple[Asked, ...] = ASKED
+    look_alikes_every: int = 1
+
+
+def evidence_of_world(home: Path, known: Sequence[Path], gathering: Gathering) -> list[Row]:
+    """The rows of a world's folder. known: all folders; wrong objects come from the other worlds of its part."""
     draw = random.Random(home.name)
     others = [
         one for one in known if _seed(one) != _seed(home) and part_of_world(_seed(one)) == part_of_world(_seed(home))
     ]
     rows: list[Row] = []
-    for number, case in enumerate(list(cases_of(home, by))[:limit]):
-        rows += [{**case.facts, "model": case.facts["object"], **row} for row in _rows(case, case)]
-        other = _another(case, others, draw)
-        if other is not None:
-            rows += [{**case.facts, "model": other.facts["object"], **row} for row in _rows(case, other)]
-        if number % look_alikes_every:
-            continue
-        alike = look_alike(home, case, np.random.default_rng(draw.getrandbits(32)))
-        rows += [{**case.facts, "model": LOOK_ALIKE, **row} for row in _rows(case, alike)]
+    for number, case in enumerate(list(cases_of(home, gathering.by))[: gathering.cases]):
+        for asked in gathering.asked:
+            if asked == "look-alike" and number % gathering.look_alikes_every:
+                continue
+            model = _asked(asked, home, case, others, draw)
+            if model is not None:
+                rows += [{**case.facts, "model": model.facts["object"], **row} for row in _rows(case, model)]
     return rows
+
+
+def _asked(asked: Asked, home: Path, case: WorldCase, others: Sequence[Path], draw: random.Random) -> WorldCase | None:
+    """The case whose object is looked for in the box of ``case``; None where there is none."""
+    if asked == "right":
+        return case
+    if asked == "other":
+        return _another(case, others, draw)
+    rng = np.random.default_rng(draw.getrandbits(32))
+    return look_alike(home, case, rng) if asked == "look-alike" else similar_object(home, case, others, rng)
 
 
 def _seed(home: Path) -> int:

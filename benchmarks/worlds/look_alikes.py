@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from benchmarks.worlds.cases import WorldCase
-from benchmarks.worlds.making import WORLD
+from benchmarks.worlds.making import WORLD, read_object_mesh
 from regnf_core import Sim3
 from regnf_core.fields.mesh import MeshField
 from regnf_data.worlds.mesh import Array, Mesh, block, together
@@ -30,8 +30,7 @@ _POINTS = 4000
 def look_alike(home: Path, known: WorldCase, rng: np.random.Generator) -> WorldCase:
     """The case with another object in place of the right one. home: the world's folder."""
     number = known.facts["case"]
-    with np.load(home / f"object-{number}.npz") as file:
-        mesh = Mesh(file["vertices"], file["faces"])
+    mesh = read_object_mesh(home, number)
     altered = _without_a_part(mesh, rng) if rng.random() < 0.5 else None
     altered = altered or _with_a_block(mesh, rng)
     T_object_model = Sim3.from_matrix(json.loads((home / WORLD).read_text())["cases"][number]["T_object_model"])

@@ -23,7 +23,7 @@ from regnf_core.schema.observation_grid import ObservationGrid
 from regnf_data.posed_images import PosedImages
 from regnf_data.worlds.detections import draw_box
 from regnf_data.worlds.fusing import fuse
-from regnf_data.worlds.mesh import Array, together
+from regnf_data.worlds.mesh import Array, Mesh, together
 from regnf_data.worlds.models import read_catalog
 from regnf_data.worlds.rooms import World, make_world
 from regnf_data.worlds.split import part_of_world
@@ -214,3 +214,9 @@ def read_cameras(home: Path) -> PinholeCameras:
     """Where the cameras of the walk are thought to have stood, in the world, as :func:`make` has written it."""
     with np.load(home / CAMERAS) as file:
         return PinholeCameras(**{part.name: torch.from_numpy(file[part.name]) for part in fields(PinholeCameras)})
+
+
+def read_object_mesh(home: Path, number: int) -> Mesh:
+    """The mesh of the object of case number ``number``, in the model's frame, as :func:`make` has written it."""
+    with np.load(home / f"object-{number}.npz") as file:
+        return Mesh(file["vertices"], file["faces"])
