@@ -39,7 +39,11 @@ def nearest_center(points: Tensor, centers: Tensor) -> Tensor:
     return torch.stack([(points - center).square().sum(-1) for center in centers]).argmin(0)
 
 
+def sum_by_patch(values: Tensor, patch: Tensor, patches: int) -> Tensor:
+    """(H, K): sums of the values (H, N) of each patch; patch: (H, N), the samples' patches by number."""
+    return values.new_zeros(len(values), patches).scatter_add_(1, patch, values)
+
+
 def _count(mask: Tensor, patch: Tensor, patches: int) -> Tensor:
     """(H, K): how many of the samples that ``mask`` (H, N) names belong to each patch; patch: (H, N), their numbers."""
-    counts = torch.zeros(len(mask), patches, dtype=torch.long, device=mask.device)
-    return counts.scatter_add_(1, patch, mask.long())
+    return sum_by_patch(mask.long(), patch, patches)

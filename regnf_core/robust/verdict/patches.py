@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from regnf_core.robust.constants import EVIDENCE
-from regnf_core.robust.verdict.coverage import nearest_center
+from regnf_core.robust.verdict.coverage import nearest_center, sum_by_patch
 
 
 def disagreement(centers: Tensor, points: Tensor, values: Tensor, compared: Tensor, free: Tensor) -> dict[str, Tensor]:
@@ -25,12 +24,17 @@ def disagreement(centers: Tensor, points: Tensor, values: Tensor, compared: Tens
     residuals of exact fields, below ``EVIDENCE.min_core``, show none · ``worst_patch_free``: the largest share of a
     patch that stands in free space.
     """
-    members = one_hot(nearest_center(points, centers), len(centers)).to(values)  # (M, K)
+    mine = nearest_center(points, centers).expand(values.shape)
+    count = len(centers)
+    size = sum_by_patch(torch.ones_like(values), mine, count)
+    of_free = sum_by_patch(free.to(values), mine, count)
     weight = compared.to(values)
-    held, total, of_free = (one @ members for one in (weight, weight * values, free.to(values)))
+    held = sum_by_patch(weight, mine, count)
+    total = sum_by_patch(weight * values, mine, count)
+    square = (weight * values.square()).sum(1)
     between = (total.square() / (held + EVIDENCE.prior_samples)).sum(1)
-    square = (weight * (values.square() + EVIDENCE.min_core**2)).sum(1)
+    floor = EVIDENCE.min_core**2 * weight.sum(1)
     return {
-        "coherence": between / square.clamp_min(torch.finfo(values.dtype).tiny),
-        "worst_patch_free": (of_free / (members.sum(0) + EVIDENCE.prior_samples)).amax(1),
+        "coherence": between / (square + floor).clamp_min(torch.finfo(values.dtype).tiny),
+        "worst_patch_free": (of_free / (size + EVIDENCE.prior_samples)).amax(1),
     }
