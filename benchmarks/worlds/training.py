@@ -49,12 +49,9 @@ OF_OTHERS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Poses with what is known of them.
-
-    features: (N, F), of the ``names``; NaN where a row is older than a feature · right (N,) 0 or 1 · weight (N,): of
-    the pose in the training; 0: none · group (N,): the room or the part, by which poses belong together · calibrated
-    (N,) bool: the poses that the probability is to be right of on average, of those that are trained with.
-    """
+    """Poses with what is known of them: features (N, F), of the ``names``, NaN where a row is older than a feature · right (N,) 0 or 1 · weight (N,): of the
+    pose in the training; 0: none · group (N,): the room or the part, by which poses belong together · calibrated (N,)
+    bool: the poses that the probability is to be right of on average, of those that are trained with."""
 
     names: tuple[str, ...]
     features: Array
