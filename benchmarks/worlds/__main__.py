@@ -109,7 +109,7 @@ def _evidence(arguments: argparse.Namespace) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     rows = [json.loads(line) for path in arguments.rows for line in _text(path).splitlines()]
     given = arguments.alone and ProbabilityModel.from_dict(json.loads(arguments.alone.read_text())["alone"])
-    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given, arguments.common_features)
+    found = training.trained(rows, arguments.left_out, arguments.calibrated_on, given)
     arguments.output.write_text(json.dumps(found.model, indent=1) + "\n")
     if arguments.table is not None:
         title = f"# The verdict's probability in {arguments.left_out}s that were left out"
@@ -194,9 +194,6 @@ def _parser() -> argparse.ArgumentParser:
         choices=training.CALIBRATED_ON,
         default="all",
         help="on which poses the probability must be right on average: all, or those that registrations chose",
-    )
-    learning.add_argument(
-        "--common-features", action="store_true", help="leave out the features that some rows are older than"
     )
     learning.add_argument(
         "--alone", type=Path, help="the model of a pose alone, by which poses lead: make the model of one among others"

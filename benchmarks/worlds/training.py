@@ -49,7 +49,7 @@ OF_OTHERS = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Poses with what is known of them: features (N, F), of the ``names``, NaN where a row is older than a feature · right (N,) 0 or 1 · weight (N,): of the
+    """Poses with what is known of them: features (N, F), of the ``names`` · right (N,) 0 or 1 · weight (N,): of the
     pose in the training; 0: none · group (N,): the room or the part, by which poses belong together · calibrated (N,)
     bool: the poses that the probability is to be right of on average, of those that are trained with."""
 
@@ -83,23 +83,20 @@ class Evidence:
 @dataclass(frozen=True, eq=False)
 class Ramps:
     """signs: (F,), see :class:`Evidence` · knots: (F, K) of each feature, turned so that more is better · weights:
-    (F, K - 1) at least 0 · absent: (F,) what counts in place of a feature that a row is too old for; no file keeps it.
-    """
+    (F, K - 1) at least 0."""
 
     names: tuple[str, ...]
     signs: Array
     knots: Array
     weights: Array
-    absent: Array
     bias: float
 
     def logit(self, features: Array) -> Array:
         """(N,) log odds of rows (N, F)."""
-        spoken = _design(features * self.signs, self.knots) @ self.weights.ravel()
-        return np.asarray(self.bias + spoken + np.isnan(features) @ self.absent)
+        return self.bias + np.asarray(_design(features * self.signs, self.knots) @ self.weights.ravel())
 
     def scaled(self, slope: float, shift: float) -> Ramps:
-        return replace(self, weights=slope * self.weights, absent=slope * self.absent, bias=slope * self.bias + shift)
+        return replace(self, weights=slope * self.weights, bias=slope * self.bias + shift)
 
     def to_dict(self) -> dict[str, Any]:
         """As the model's file keeps it: features that do not count are left out."""
@@ -129,23 +126,20 @@ def trained(
     left_out: LeftOut = "world",
     calibrated_on: CalibratedOn = "all",
     alone: ProbabilityModel | None = None,
-    common_features: bool = False,
 ) -> Trained:
     """A model from the rows of :mod:`benchmarks.worlds.evidence`.
 
     alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
     its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
     which no other part has · calibrated_on: the poses that the probabilities are to be right of on average, all or
-    those that registrations chose · common_features: leave out what some rows are too old for; otherwise such rows
-    teach what the other features tell.
+    those that registrations chose. Of the features those count that all rows have: some rows are older than a feature.
     """
-    kept = all if common_features else any
-    names = tuple(name for name in SPEAKS_FOR if kept(name in row["features"] for row in rows))
+    names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
     alike, chosen = np.array([(row["model"] == LOOK_ALIKE, row["winner"]) for row in rows]).T
     counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
     evidence = Evidence(
         names,
-        np.array([[row["features"].get(name, np.nan) for name in names] for row in rows]),
+        np.array([[row["features"][name] for name in names] for row in rows]),
         np.array([float(row["mssd"] <= SUCCESS) for row in rows]),
         np.where(chosen, 1.0, OF_OTHERS) * counts,
         np.array([_group(row, left_out) for row in rows]),
@@ -197,12 +191,11 @@ def train(evidence: Evidence) -> tuple[Ramps, Array]:
 def _fit(evidence: Evidence) -> Ramps:
     turned = evidence.features * evidence.signs
     knots = np.stack([_knots(column) for column in turned.T])
-    ramps = _design(turned, knots)
-    design = np.column_stack([ramps, np.isnan(turned)])
-    bounds = [(0.0, None)] * ramps.shape[1] + [(None, None)] * (len(knots) + 1)
-    found = minimize(_loss, np.zeros(len(bounds)), (design, evidence), jac=True, bounds=bounds, method="L-BFGS-B")
-    weights, absent = found.x[: ramps.shape[1]].reshape(len(knots), -1), found.x[ramps.shape[1] : -1]
-    return Ramps(evidence.names, evidence.signs, knots, weights, absent, float(found.x[-1]))
+    design = _design(turned, knots)
+    start = np.zeros(design.shape[1] + 1)
+    bounds = [(0.0, None)] * design.shape[1] + [(None, None)]
+    found = minimize(_loss, start, (design, evidence), jac=True, bounds=bounds, method="L-BFGS-B")
+    return Ramps(evidence.names, evidence.signs, knots, found.x[:-1].reshape(len(knots), -1), float(found.x[-1]))
 
 
 def _loss(p: Array, design: Array, evidence: Evidence) -> tuple[float, Array]:
@@ -231,19 +224,18 @@ def _platt(logits: Array, evidence: Evidence) -> tuple[float, float]:
 
 def _knots(column: Array) -> Array:
     """PIECES + 1 increasing numbers: quantiles, moved apart where they coincide."""
-    known = column[~np.isnan(column)]
-    knots = np.quantile(known, np.linspace(0.02, 0.98, PIECES + 1))
-    least = 1e-3 * max(float(np.ptp(known)), 1e-6)
+    knots = np.quantile(column, np.linspace(0.02, 0.98, PIECES + 1))
+    least = 1e-3 * max(float(np.ptp(column)), 1e-6)
     for i in range(1, len(knots)):
         knots[i] = max(knots[i], knots[i - 1] + least)
     return np.asarray(knots)
 
 
 def _design(turned: Array, knots: Array) -> Array:
-    """(N, F * PIECES): how far each row of features is short of the upper end of each piece, 0 to -1; 0 of NaN."""
+    """(N, F * PIECES): how far each row of features is short of the upper end of each piece, 0 to -1."""
     low, high = knots[:, :-1], knots[:, 1:]
     short = (high - turned[:, :, None]) / (high - low)
-    return -np.nan_to_num(np.clip(short, 0.0, 1.0)).reshape(len(turned), -1)
+    return -np.clip(short, 0.0, 1.0).reshape(len(turned), -1)
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:

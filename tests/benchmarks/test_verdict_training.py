@@ -82,24 +82,6 @@ def test_the_stored_model_says_the_same() -> None:
     np.testing.assert_allclose(stored.logit(features).numpy(), model.logit(evidence.features), atol=0.03)
 
 
-def test_rows_that_are_older_than_a_feature_teach_the_others() -> None:
-    """The rows without ``confirmed`` are right more often: that is no merit of the rows with it. The law is found as
-    from rows that have all features."""
-    evidence, _ = drawn(6000, 7)
-    features = evidence.features.copy()
-    older = np.random.default_rng(8).uniform(size=6000) < 0.5
-    features[older, NAMES.index("confirmed")] = np.nan
-    right = np.where(older & (np.arange(6000) % 3 == 0), 1.0, evidence.right)
-    model, _ = train(replace(evidence, features=features, right=right, calibrated=~older))
-    fresh, logit = drawn(2000, 9)
-    found = model.logit(fresh.features)
-    assert spearmanr(found, logit).statistic > 0.96
-    assert abs(float(np.mean(1 / (1 + np.exp(-found)))) - float(fresh.right.mean())) < 0.03
-    of_file = ProbabilityModel.from_dict(model.to_dict())
-    stored = of_file.logit({name: torch.from_numpy(fresh.features[:, i]) for i, name in enumerate(NAMES)})
-    np.testing.assert_allclose(stored.numpy(), found, atol=0.03)
-
-
 def test_a_feature_that_speaks_the_wrong_way_does_not_count() -> None:
     evidence, _ = drawn(2000, 3)
     turned = evidence.features.copy()
@@ -153,12 +135,11 @@ def test_leads_are_by_the_odds_of_the_model_that_is_given() -> None:
     assert models["among"]["terms"][LEAD]["knots"][-1] <= 5.0 * 0.7, "leads are differences of what the model says"
 
 
-def test_a_feature_that_some_rows_are_older_than_can_be_left_out() -> None:
+def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
     rows = [row(number, WRONG if number % 2 else RIGHT, offset=0.01 * (number % 2)) for number in range(100)]
-    assert "offset" in trained(rows, common_features=True).model["alone"]["terms"]
-    del rows[7]["features"]["offset"]
     assert "offset" in trained(rows).model["alone"]["terms"]
-    assert "offset" not in trained(rows, common_features=True).model["alone"]["terms"]
+    del rows[7]["features"]["offset"]
+    assert "offset" not in trained(rows).model["alone"]["terms"]
 
 
 def test_look_alikes_are_told_apart_in_the_table_alone() -> None:

@@ -37,11 +37,6 @@ class EvidenceConstants:
     """Share of a patch's samples that are confirmed where the patch counts as confirmed. [by hand]"""
     min_samples_in_patch: int = 5
     """Scene samples near a patch that it takes to cover it. [by hand]"""
-    patches: int = 64
-    """Of the object's surface, in which residuals are compared: of some twenty samples each. [random worlds]"""
-    prior_samples: float = 1.0
-    """Samples without disagreement that every patch is given, so that a patch of a few samples shows little. [by
-    hand]"""
     min_slope: float = 1e-3
     """Length of the gradient. A shorter one has no direction. [derived]"""
     facing_cosine: float = -0.25

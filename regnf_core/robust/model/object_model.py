@@ -10,7 +10,7 @@ from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.options import RobustOptions
-from regnf_core.robust.constants import EVIDENCE, MODEL
+from regnf_core.robust.constants import MODEL
 from regnf_core.robust.devices import working_device
 from regnf_core.robust.model.extremal_points import extremal_points
 from regnf_core.robust.model.hull import Hull
@@ -44,11 +44,6 @@ class ObjectModel:
         return distance_grid(self.samples, self.spacing)
 
     @cached_property
-    def patch_centers(self) -> Tensor:
-        """(K, 3) points of the surface, far apart from each other: patches of it are what is nearest to each."""
-        return extremal_points(self.samples.on_surface(), EVIDENCE.patches)
-
-    @cached_property
     def hull(self) -> Hull:
         """The samples' convex hull."""
         return Hull.of(self.samples.on_surface())
@@ -68,7 +63,6 @@ class ObjectModel:
         for name in ("distance_grid", "hull"):
             if name in self.__dict__:
                 moved.__dict__[name] = self.__dict__[name].to(device)
-        moved.__dict__["patch_centers"] = self.patch_centers.to(device)  # chosen one after the other: on the CPU
         return moved
 
     def field(self, obj: SdfField) -> WorkingField:

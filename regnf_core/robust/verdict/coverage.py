@@ -24,26 +24,22 @@ def coverage(
     ``confirmed_patches``: patches of which enough samples are confirmed · ``covered_patches``: patches with scene
     surface near them.
     """
-    mine = nearest_center(object_points, centers).expand(confirmed.shape)
+    mine = _nearest(object_points, centers).expand(confirmed.shape)
     size = _count(torch.ones_like(confirmed), mine, len(centers))
     agreeing = _count(confirmed, mine, len(centers))
-    seen = _count(near, nearest_center(scene_points, centers), len(centers))
+    seen = _count(near, _nearest(scene_points, centers), len(centers))
     return {
         "confirmed_patches": (agreeing >= EVIDENCE.min_confirmed_in_patch * size).double().mean(1),
         "covered_patches": (seen >= EVIDENCE.min_samples_in_patch).double().mean(1),
     }
 
 
-def nearest_center(points: Tensor, centers: Tensor) -> Tensor:
+def _nearest(points: Tensor, centers: Tensor) -> Tensor:
     """(...): the number of the center (K, 3) that each of the points (..., 3) is nearest to."""
     return torch.stack([(points - center).square().sum(-1) for center in centers]).argmin(0)
 
 
-def sum_by_patch(values: Tensor, patch: Tensor, patches: int) -> Tensor:
-    """(H, K): sums of the values (H, N) of each patch; patch: (H, N), the samples' patches by number."""
-    return values.new_zeros(len(values), patches).scatter_add_(1, patch, values)
-
-
 def _count(mask: Tensor, patch: Tensor, patches: int) -> Tensor:
     """(H, K): how many of the samples that ``mask`` (H, N) names belong to each patch; patch: (H, N), their numbers."""
-    return sum_by_patch(mask.long(), patch, patches)
+    counts = torch.zeros(len(mask), patches, dtype=torch.long, device=mask.device)
+    return counts.scatter_add_(1, patch, mask.long())

@@ -16,7 +16,6 @@ from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.residuals import Residuals, residuals
 from regnf_core.robust.verdict.coverage import coverage
-from regnf_core.robust.verdict.patches import disagreement
 from regnf_core.robust.verdict.unexplained_surface import unexplained_samples
 
 SPEAKS_FOR = {
@@ -40,8 +39,6 @@ SPEAKS_FOR = {
     "noise": False,
     "tail": False,
     "offset": False,
-    "coherence": False,
-    "worst_patch_free": False,
 }
 """The features by name: whether more of it makes the pose more likely (True) or less (False)."""
 
@@ -67,7 +64,7 @@ def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dic
     r = residuals(problem.held_out, T, offsets)
     groups = _groups(r)
     found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _normals(r, groups) | _spread(r, groups)
-    found |= _coverage(problem, T, groups) | _disagreement(problem, r, groups) | {"offset": offsets.abs()}
+    found |= _coverage(problem, T, groups) | {"offset": offsets.abs()}
     stiffness = _stiffness(problem, T, r, groups)
     found |= {"stiffness": stiffness[:, 0], "second_stiffness": stiffness[:, 1]}
     return {name: found[name].double() for name in SPEAKS_FOR}
@@ -125,14 +122,6 @@ def _coverage(problem: RegistrationProblem, T: Sim3, groups: _Groups) -> dict[st
     """Shares of the patches about the object's outermost points that are confirmed, and that scene surface is near."""
     A, B = problem.held_out.scene_samples.points, problem.held_out.object_samples.points
     return coverage(problem.model.extremal_points, B, T.to(A).apply(A), groups.confirmed, groups.near)
-
-
-def _disagreement(problem: RegistrationProblem, r: Residuals, groups: _Groups) -> dict[str, Tensor]:
-    """What patches of the object's surface show: residuals alike in a place, and a part in free space."""
-    r2 = r.object_to_scene
-    compared = groups.visible & (r2.abs() <= EVIDENCE.coarse)
-    free = groups.observed & (r2 > EVIDENCE.close)
-    return disagreement(problem.model.patch_centers, problem.held_out.object_samples.points, r2, compared, free)
 
 
 def _normals(r: Residuals, groups: _Groups) -> dict[str, Tensor]:
