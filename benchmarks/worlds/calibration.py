@@ -55,16 +55,14 @@ def calibration_table(rows: Sequence[dict[str, Any]], logits: Array) -> str:
     return "\n".join(lines) + "\n"
 
 
-def look_alike_line(rows: Sequence[dict[str, Any]], logits: Array) -> str:
-    """Markdown: how many objects that differ from the right one by a part are accepted in its place; empty of none."""
+def measured_line(name: str, rows: Sequence[dict[str, Any]], logits: Array) -> str:
+    """Markdown: how many objects that are measured alone, not trained with, are accepted in the right object's place;
+    empty of none. name: what they are, a noun."""
     if not rows:
         return ""
     probability = 1.0 / (1.0 + np.exp(-logits[np.array([row["winner"] for row in rows])]))
     accepted = ", ".join(f"{int((probability >= bound).sum())} at {bound}" for bound in _BOUNDS)
-    return (
-        "\nLook-alikes, which lack a part or have one more, in the right object's place: accepted of "
-        f"{len(probability)}: {accepted}. In some of them the part lies where the cameras did not see.\n"
-    )
+    return f"\n{name}, in the right object's place: accepted of {len(probability)}: {accepted}.\n"
 
 
 def auroc(scores: Array, right: NDArray[np.bool_]) -> float:

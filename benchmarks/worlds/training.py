@@ -4,8 +4,9 @@ Logistic regression on monotone ramps: each feature's range is cut at quantiles,
 is at least 0, so the sum is monotone in every feature. Worlds are left out in turn to see what the model says of rooms
 that it does not know; what it says of them is then made right on average (Platt's scaling on the left-out logits).
 
-Look-alikes are measured, not trained with: in a noisy map the right object cannot be told from one that differs by a
-part, so how probable it is would be a matter of how many such objects the training has.
+Look-alikes and other objects of a similar shape are measured, not trained with: in a noisy map the right object cannot
+be told from one that differs by a part, or by little everywhere, so how probable it is would be a matter of how many
+such objects the training has.
 
 A model knows a pose alone, or it is given such a model and knows one feature more: the lead that those log odds give a
 pose over the other answers among the same candidates.
@@ -23,10 +24,11 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.robust.judging import SUCCESS
-from benchmarks.worlds.calibration import calibration_table, look_alike_line
+from benchmarks.worlds.calibration import calibration_table, measured_line
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.reliability import reliability_diagram
+from benchmarks.worlds.similar_objects import SIMILAR
 from regnf_core.robust.constants import VERDICT
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, SPEAKS_FOR_AMONG, ProbabilityModel
@@ -43,6 +45,11 @@ PENALTY = 1e-3
 """Of the squared weights."""
 
 
+MEASURED = {
+    LOOK_ALIKE: "Look-alikes, which lack a part or have one more, some of them where the cameras did not see",
+    SIMILAR: "The most similar ones of some dozens of other objects",
+}
+"""What rows are not trained with, by their model, and what tables call them."""
 OF_OTHERS = 0.5
 """Weight of poses that no registration chose."""
 
@@ -135,7 +142,8 @@ def trained(
     those that registrations chose. Of the features those count that all rows have: some rows are older than a feature.
     """
     names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
-    alike, chosen = np.array([(row["model"] == LOOK_ALIKE, row["winner"]) for row in rows]).T
+    models, chosen = np.array([row["model"] for row in rows]), np.array([row["winner"] for row in rows])
+    alike = np.isin(models, list(MEASURED))
     counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
     evidence = Evidence(
         names,
@@ -151,7 +159,8 @@ def trained(
     model, odds = train(evidence)
     used = [row for row, one in zip(rows, counts, strict=True) if one]
     table = calibration_table(used, odds[counts])
-    table += look_alike_line([row for row, other in zip(rows, alike, strict=True) if other], odds[alike])
+    for asked, name in MEASURED.items():
+        table += measured_line(name, [row for row in rows if row["model"] == asked], odds[models == asked])
     named = {"alone" if alone is None else "among": model.to_dict()}
     return Trained(named, table, reliability_diagram(used, odds[counts]))
 

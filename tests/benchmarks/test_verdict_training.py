@@ -15,6 +15,7 @@ from scipy.stats import spearmanr
 from benchmarks.worlds.calibration import auroc, calibration_table
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.reliability import reliability_diagram
+from benchmarks.worlds.similar_objects import SIMILAR
 from benchmarks.worlds.training import Evidence, train, trained
 from regnf_core.robust.verdict.pose_features import SPEAKS_FOR
 from regnf_core.robust.verdict.probability import LEAD, ProbabilityModel
@@ -142,9 +143,10 @@ def test_a_feature_that_some_rows_are_older_than_does_not_count() -> None:
     assert "offset" not in trained(rows).model["alone"]["terms"]
 
 
-def test_look_alikes_are_told_apart_in_the_table_alone() -> None:
+@pytest.mark.parametrize("model", [LOOK_ALIKE, SIMILAR])
+def test_what_is_nearly_the_right_object_is_told_in_the_table_alone(model: str) -> None:
     rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
-    alike = [{**one, "model": LOOK_ALIKE, "mssd": 9.0, "listed_mssd": 9.0} for one in rows[1::2]]
+    alike = [{**one, "model": model, "mssd": 9.0, "listed_mssd": 9.0} for one in rows[1::2]]
     without, with_alike = trained(rows), trained([*rows, *alike])
     assert with_alike.model == without.model
     assert with_alike.table.startswith(without.table)
