@@ -105,7 +105,8 @@ def _rows(known: WorldCase, asked: WorldCase) -> Iterator[Row]:
     if kept.problem is None or (other and _same_shape(known, asked, result.T_object_scene)):
         return
     last = kept.evaluations[-1]
-    yield from _described(kept.problem, last.candidates, known if asked is known else None, last.winner)
+    found = _described(kept.problem, last.candidates, known if asked is known else None, last.winner)
+    yield from ({**row, "verdict": result.verdict} for row in found)
     if asked is known:
         yield from ({**row, "found": False} for row in _described(kept.problem, _from_truth(kept, known), known, None))
 

@@ -25,6 +25,7 @@ from scipy.optimize import minimize
 
 from benchmarks.robust.judging import SUCCESS
 from benchmarks.worlds.calibration import calibration_table, measured_line
+from benchmarks.worlds.comparing import compared_line
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.recipe import parts_of_name
 from benchmarks.worlds.reliability import reliability_diagram
@@ -133,18 +134,22 @@ def trained(
     left_out: LeftOut = "world",
     calibrated_on: CalibratedOn = "all",
     alone: ProbabilityModel | None = None,
+    measured: Sequence[dict[str, Any]] = (),
 ) -> Trained:
     """A model from the rows of :mod:`benchmarks.worlds.evidence`.
 
     alone: the model of a pose alone, by which poses are chosen and lead: the one that is made knows a pose ``among``
     its candidates. None: it knows a pose ``alone`` · left_out: one world at a time, or a part with all of its meshes,
     which no other part has · calibrated_on: the poses that the probabilities are to be right of on average, all or
-    those that registrations chose. Of the features those count that all rows have: some rows are older than a feature.
+    those that registrations chose · measured: further rows, which nothing is trained with; objects are compared in
+    these. Of the features those count that all rows have: some rows are older than a feature.
     """
+    taught = np.arange(len(rows) + len(measured)) < len(rows)
+    rows = [*rows, *measured]
     names = tuple(name for name in SPEAKS_FOR if all(name in row["features"] for row in rows))
     models, chosen = np.array([row["model"] for row in rows]), np.array([row["winner"] for row in rows])
     alike = np.isin(models, list(MEASURED))
-    counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike
+    counts = np.array([not _told_apart_by_rivals(row) for row in rows]) & ~alike & taught
     evidence = Evidence(
         names,
         np.array([[row["features"][name] for name in names] for row in rows]),
@@ -153,14 +158,16 @@ def trained(
         np.array([_group(row, left_out) for row in rows]),
         chosen | (calibrated_on == "all"),
     )
-    if alone is not None:
+    of_alone = None if alone is None else _odds(rows, alone)
+    if of_alone is not None:
         found = np.array([row["found"] for row in rows])
-        evidence = evidence.with_feature(LEAD, _leads(rows, _odds(rows, alone)), found)
+        evidence = evidence.with_feature(LEAD, _leads(rows, of_alone), found)
     model, odds = train(evidence)
     used = [row for row, one in zip(rows, counts, strict=True) if one]
     table = calibration_table(used, odds[counts])
     for asked, name in MEASURED.items():
         table += measured_line(name, [row for row in rows if row["model"] == asked], odds[models == asked])
+        table += "" if of_alone is None else compared_line(asked, measured, of_alone[~taught])
     named = {"alone" if alone is None else "among": model.to_dict()}
     return Trained(named, table, reliability_diagram(used, odds[counts]))
 

@@ -13,6 +13,7 @@ import torch
 from scipy.stats import spearmanr
 
 from benchmarks.worlds.calibration import auroc, calibration_table
+from benchmarks.worlds.comparing import compared_line
 from benchmarks.worlds.look_alikes import LOOK_ALIKE
 from benchmarks.worlds.reliability import reliability_diagram
 from benchmarks.worlds.similar_objects import SIMILAR
@@ -151,6 +152,38 @@ def test_what_is_nearly_the_right_object_is_told_in_the_table_alone(model: str) 
     assert with_alike.model == without.model
     assert with_alike.table.startswith(without.table)
     assert "accepted of 50: 50 at 0.8" in with_alike.table
+
+
+def test_nothing_is_learned_of_rows_that_are_measured() -> None:
+    rows = [row(number, RIGHT if number % 2 else WRONG, confirmed=0.9 if number % 2 else 0.2) for number in range(100)]
+    turned = [{**one, "mssd": WRONG, "listed_mssd": WRONG} for one in rows[1::2]]
+    similar = [{**one, "model": SIMILAR} for one in turned[:7]]
+    plain, measured = trained(rows), trained(rows, measured=[*turned, *similar])
+    assert measured.model == plain.model
+    assert measured.diagram == plain.diagram
+    assert measured.table.startswith(plain.table)
+    assert "accepted of 7: 7 at 0.8" in measured.table
+
+
+def test_candidates_are_compared_by_hand() -> None:
+    """Four cases of both objects: the right one ahead, behind, ahead but rejected, and at a wrong pose, which does not
+    count; a fifth case has the right object alone."""
+
+    def best(case: int, model: str, score: float, verdict: str = "registered", error: float = RIGHT) -> dict[str, Any]:
+        return row(0, error) | {"case": case, "model": model, "verdict": verdict, "score": score}
+
+    rows = [
+        best(0, "chair", 0.1), best(0, SIMILAR, 0.2),
+        best(1, "chair", 0.2), best(1, SIMILAR, 0.1),
+        best(2, "chair", 0.1, "rejected"), best(2, SIMILAR, 0.2),
+        best(3, "chair", 0.1, error=WRONG), best(3, SIMILAR, 0.2),
+        best(4, "chair", 0.1),
+    ]  # fmt: skip
+    line = compared_line(SIMILAR, rows, np.zeros(len(rows)))
+    assert line == "Given both as candidates, the right object comes first in 1 of 3.\n"
+    by_odds = compared_line(SIMILAR, rows, np.array([0.0, 9.0, 9.0, 0.0, 0, 0, 0, 0, 0]))
+    assert "in 1 of 3" in by_odds  # the first two cases change places
+    assert compared_line(LOOK_ALIKE, rows, np.zeros(len(rows))) == ""
 
 
 def test_the_table_counts_what_was_chosen() -> None:
