@@ -162,6 +162,13 @@ def _say(line: str) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
+    _add_commands_on_worlds(commands)
+    _add_training(commands)
+    _add_commands_on_runs(commands)
+    return parser
+
+
+def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     making = commands.add_parser("make", help="make worlds")
     making.add_argument("--meshes", type=Path, nargs="+", required=True)
     making.add_argument("--count", type=int, default=10)
@@ -186,6 +193,9 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--lengths", nargs="+", choices=LENGTHS, default=list(LENGTHS))
         command.add_argument("--seeds", type=int, nargs="*", help="these worlds alone")
         command.add_argument("--workers", type=int, default=1)
+
+
+def _add_training(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     learning = commands.add_parser("train", help="the verdict's probability model")
     learning.add_argument("rows", type=Path, nargs="+", help="what `evidence` wrote, as it is or compressed by gzip")
     learning.add_argument("--measured", type=Path, nargs="*", default=[], help="the same, not trained with")
@@ -202,6 +212,9 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_argument(
         "--alone", type=Path, help="the model of a pose alone, by which poses lead: make the model of one among others"
     )
+
+
+def _add_commands_on_runs(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     showing = commands.add_parser("worst", help="a picture of the wrong poses that the engine was surest of")
     showing.add_argument("folder", type=Path, help="of the worlds")
     showing.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")
@@ -210,7 +223,6 @@ def _parser() -> argparse.ArgumentParser:
     reporting = commands.add_parser("report", help="tables of runs")
     reporting.add_argument("runs", type=Path, nargs="+")
     reporting.add_argument("--output", type=Path)
-    return parser
 
 
 if __name__ == "__main__":
