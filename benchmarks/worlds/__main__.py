@@ -29,7 +29,7 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 from benchmarks.worlds import tables, training  # noqa: E402
 from benchmarks.worlds.cases import OBSERVED_BY  # noqa: E402
-from benchmarks.worlds.evidence import ASKED, Gathering, evidence_of_world  # noqa: E402
+from benchmarks.worlds.evidence import ASKED, TRAINED, Gathering, evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
@@ -182,7 +182,7 @@ def _add_commands_on_worlds(commands: argparse._SubParsersAction[argparse.Argume
     gathering = commands.add_parser("evidence", help="poses with their evidence, for `train`")
     gathering.add_argument("--output", type=Path, required=True, help="JSON lines, added to")
     gathering.add_argument("--cases", type=int, default=8, help="of each world, at most")
-    gathering.add_argument("--asked", choices=ASKED, nargs="+", default=list(ASKED), help="the objects in each box")
+    gathering.add_argument("--asked", choices=ASKED, nargs="+", default=list(TRAINED), help="the objects in each box")
     gathering.add_argument("--look-alikes-every", type=int, default=1, help="of so many cases one has a look-alike too")
     for command in (registering, gathering):
         command.add_argument("--observed-by", choices=OBSERVED_BY, default="images", help="what tells what was seen")

@@ -1,8 +1,8 @@
 """Poses with what the held-out samples tell of them, and whether they are right: what the verdict's model learns from.
 
 For every case of a world: the poses that a registration chose among, the best pose that a refinement from the truth
-leads to, and, for three other objects registered in the same box, the poses that they chose among, which are all wrong:
-one of another world, one of a similar shape, and a look-alike of the right one.
+leads to, and, for other objects registered in the same box, the poses that they chose among, which are all wrong: one
+of another world, a look-alike of the right one, and, where it is asked for, one of a similar shape.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ Asked = Literal["right", "other", "look-alike", "similar"]
 ASKED: tuple[Asked, ...] = ("right", "other", "look-alike", "similar")
 """Whose pose is looked for in a case's box: the right object's, that of one of another kind, of one that differs from
 the right one by a part, of one of a similar shape."""
+TRAINED: tuple[Asked, ...] = ("right", "other", "look-alike")
+"""What the rows of a model were made of, in this order."""
 _OPTIONS = RegistrationOptions(preset="robust")
 _POINTS = 4000
 _SAME_SHAPE = 0.03
@@ -50,7 +52,7 @@ class Gathering:
 
     by: ObservedBy = "images"
     cases: int = 8
-    asked: tuple[Asked, ...] = ASKED
+    asked: tuple[Asked, ...] = TRAINED
     look_alikes_every: int = 1
 
 
