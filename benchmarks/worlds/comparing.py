@@ -1,4 +1,8 @@
-"""The right object and another one given as candidates: which of them a registration would put first."""
+"""The right object and another one: which of them comes first by what candidates are compared by.
+
+It is computed from the two registrations. The quick comparison with which a search among many objects begins is not in
+it.
+"""
 
 from __future__ import annotations
 
@@ -30,4 +34,4 @@ def compared_line(asked: str, rows: Sequence[dict[str, Any]], odds: NDArray[np.f
     if not both:
         return ""
     first = sum(best["right"][case] < best["other"][case] for case in both)
-    return f"Given both as candidates, the right object comes first in {first} of {len(both)}.\n"
+    return f"By what candidates are compared by, the right object comes first in {first} of {len(both)}.\n"

@@ -18,7 +18,7 @@ from regnf_core.geometry.symmetry import Symmetries
 from regnf_data.worlds.mesh import Mesh, block, together
 
 LEG, BRANCH = block([0.0, 0.0, 0.5], [0.1, 0.1, 1.0]), block([0.3, 0.0, 0.9], [0.5, 0.1, 0.1])
-GALLOWS = together(LEG, BRANCH)
+BRACKET = together(LEG, BRANCH)
 
 
 def world(folder: Path, **objects: Mesh) -> Path:
@@ -33,8 +33,8 @@ def world(folder: Path, **objects: Mesh) -> Path:
 def first_case(mesh: Mesh) -> WorldCase:
     field = MeshField(mesh.vertices, mesh.faces)
     box = OrientedBox(torch.zeros(3).double(), torch.ones(3).double(), torch.eye(3).double())
-    case = Case("a gallows", field, field, box, Sim3.identity())
-    return WorldCase(case, {"case": 0, "object": "gallows"}, torch.zeros(0, 3), Symmetries())
+    case = Case("a bracket", field, field, box, Sim3.identity())
+    return WorldCase(case, {"case": 0, "object": "bracket"}, torch.zeros(0, 3), Symmetries())
 
 
 def ratios(points: torch.Tensor) -> torch.Tensor:
@@ -50,10 +50,10 @@ def turned_and_wider(mesh: Mesh, width: float, scale: float) -> Mesh:
 
 
 def test_the_most_similar_object_of_another_name_is_taken(tmp_path: Path) -> None:
-    right = world(tmp_path / "right", gallows=GALLOWS)
-    wider = turned_and_wider(GALLOWS, 2.0, 3.0)
-    other = world(tmp_path / "other", gallows_02=GALLOWS, wide=wider, block=LEG, gallows=GALLOWS)
-    found = similar_object(right, first_case(GALLOWS), [other], np.random.default_rng(0))
+    right = world(tmp_path / "right", bracket=BRACKET)
+    wider = turned_and_wider(BRACKET, 2.0, 3.0)
+    other = world(tmp_path / "other", bracket_02=BRACKET, wide=wider, block=LEG, bracket=BRACKET)
+    found = similar_object(right, first_case(BRACKET), [other], np.random.default_rng(0))
     assert found.facts["object"] == SIMILAR
     sampled = torch.from_numpy(wider.sample(4000, np.random.default_rng(1))[0])
     torch.testing.assert_close(ratios(found.points), ratios(sampled), rtol=0, atol=0.02)
@@ -61,9 +61,9 @@ def test_the_most_similar_object_of_another_name_is_taken(tmp_path: Path) -> Non
 
 
 def test_without_other_worlds_one_is_drawn_and_a_seed_says_which(tmp_path: Path) -> None:
-    right = world(tmp_path / "right", gallows=GALLOWS)
+    right = world(tmp_path / "right", bracket=BRACKET)
     first, again, other = (
-        similar_object(right, first_case(GALLOWS), [], np.random.default_rng(seed)).points for seed in (0, 0, 1)
+        similar_object(right, first_case(BRACKET), [], np.random.default_rng(seed)).points for seed in (0, 0, 1)
     )
     torch.testing.assert_close(first, again)
     assert not torch.allclose(ratios(first), ratios(other))

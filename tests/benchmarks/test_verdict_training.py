@@ -180,7 +180,7 @@ def test_candidates_are_compared_by_hand() -> None:
         best(4, "chair", 0.1),
     ]  # fmt: skip
     line = compared_line(SIMILAR, rows, np.zeros(len(rows)))
-    assert line == "Given both as candidates, the right object comes first in 1 of 3.\n"
+    assert line == "By what candidates are compared by, the right object comes first in 1 of 3.\n"
     by_odds = compared_line(SIMILAR, rows, np.array([0.0, 9.0, 9.0, 0.0, 0, 0, 0, 0, 0]))
     assert "in 1 of 3" in by_odds  # the first two cases change places
     assert compared_line(LOOK_ALIKE, rows, np.zeros(len(rows))) == ""
