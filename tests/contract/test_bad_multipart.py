@@ -67,6 +67,14 @@ def test_multipart_refused(world: World, body: bytes, status: int, reason: str) 
     assert_refused(world.client.post("/fields", content=body + b"--x--\r\n", headers=headers), status, reason)
 
 
+@pytest.mark.parametrize(("name", "limit"), [("upload", 64), ("description", 16384)])
+def test_a_text_part_one_byte_too_long_is_refused_by_its_name(world: World, name: str, limit: int) -> None:
+    headers = {"Content-Type": "multipart/form-data; boundary=x"}
+    answer = world.client.post("/fields", content=part(name, b"a" * (limit + 1)) + b"--x--\r\n", headers=headers)
+    assert_refused(answer, 413, "REQUEST_TOO_LARGE")
+    assert answer.json()["detail"] == f"The part {name} takes at most {limit} bytes."
+
+
 def test_a_digest_of_a_multipart_body_is_compared_with_all_of_it(world: World) -> None:
     headers = {"Content-Type": "multipart/form-data; boundary=x", "Content-Digest": announced(GOOD)}
     whole = FILE + b"--x--\r\n"

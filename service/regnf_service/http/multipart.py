@@ -162,5 +162,5 @@ def _admit(part: _Part, parts: dict[str, _Part], files: Mapping[str, Sink], text
 
 def _add_text(part: _Part, content: bytearray, limit: int) -> None:
     if len(part.text) + len(content) > limit:
-        raise Problem("REQUEST_TOO_LARGE", f"The part takes at most {limit} bytes.", headers=CLOSE)
+        raise Problem("REQUEST_TOO_LARGE", f"The part {part.name} takes at most {limit} bytes.", headers=CLOSE)
     part.text += content
