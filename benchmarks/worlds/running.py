@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
+from benchmarks.robust.ellipsoid import mahalanobis_squared, nearest_truth, pose_error
 from benchmarks.robust.judging import SUCCESS, judge_error
 from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
 from benchmarks.worlds.stages import from_truth, recorded, stage_errors
@@ -66,7 +69,8 @@ def _run(world_case: WorldCase, way: Way) -> Run:
 def judged(result: RegistrationResult, world_case: WorldCase) -> Run:
     """Verdict, errors of the pose and of the best of those listed, and the evidence. Errors are over the true surface.
 
-    near_mssd: the least over symmetries that nearly hold as well.
+    near_mssd: the least over symmetries that nearly hold as well · mahalanobis_squared: of the true pose, by the
+    covariance; of right poses alone, and None for objects of revolution: their turn about the axis has no truth.
     """
     best, listed = _errors(result, world_case, world_case.case.symmetries)
     near = best if best["mssd_share"] <= SUCCESS else _errors(result, world_case, world_case.near)[0]
@@ -77,8 +81,23 @@ def judged(result: RegistrationResult, world_case: WorldCase) -> Run:
         **best,
         "listed_mssd": listed,
         "near_mssd": near["mssd_share"],
+        "mahalanobis_squared": _mahalanobis(result, world_case) if best["mssd_share"] <= SUCCESS else None,
         "metrics": result.metrics,
     }
+
+
+def _mahalanobis(result: RegistrationResult, world_case: WorldCase) -> float | None:
+    case = world_case.case
+    assert case.truth is not None
+    if result.covariance is None or case.symmetries.continuous:
+        return None
+    truth = nearest_truth(result.T_object_scene, case.truth, _points(world_case), case.symmetries)
+    return mahalanobis_squared(pose_error(result.T_object_scene, truth), result.covariance)
+
+
+def _points(world_case: WorldCase) -> Tensor:
+    """(N, 3): some of the object's true surface, its frame."""
+    return world_case.points[:: max(1, len(world_case.points) // _POINTS)]
 
 
 def _errors(
@@ -86,7 +105,7 @@ def _errors(
 ) -> tuple[dict[str, float], float]:
     truth = world_case.case.truth
     assert truth is not None
-    points = world_case.points[:: max(1, len(world_case.points) // _POINTS)]
+    points = _points(world_case)
     poses = [result.T_object_scene, *(other.T_object_scene for other in result.alternatives)]
     errors = [errors_against_truth(pose, truth, points, symmetries) for pose in poses]
     return {name: errors[0][name] for name in _ERRORS}, min(one["mssd_share"] for one in errors)

@@ -9,7 +9,9 @@ from typing import Any
 
 from scipy.stats import beta
 
+from benchmarks.robust.ellipsoid import calibration
 from benchmarks.robust.judging import SUCCESS
+from regnf_data.worlds.walks import LENGTHS
 
 Run = dict[str, Any]
 _CONFIDENCE = 0.95
@@ -86,7 +88,8 @@ def markdown(runs: Sequence[Run]) -> str:
         ("pixels", lambda run: run["pixels"]),
         ("symmetry", lambda run: run.get("symmetry", "unknown")),
     ]
-    parts = [f"{len(runs)} registrations.", *(_table(name, key, runs) for name, key in keys), _losses(runs)]
+    parts = [f"{len(runs)} registrations.", *(_table(name, key, runs) for name, key in keys)]
+    parts += [_ellipsoids(runs), _losses(runs)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -127,6 +130,21 @@ def _row(runs: Sequence[Run]) -> list[str]:
         f"{statistics.median(seconds):.1f}",
         f"{max(seconds):.1f}",
     ]
+
+
+def _ellipsoids(runs: Sequence[Run]) -> str:
+    """Whether the true poses lie where the covariances say."""
+    told = [run for run in runs if run.get("mahalanobis_squared") is not None]
+    groups = {length: [run for run in told if run["length"] == length] for length in LENGTHS}
+    rows = []
+    for name, some in {**groups, "**all**": told}.items():
+        if some:
+            found = calibration([run["mahalanobis_squared"] for run in some])
+            inside = _percent(round(found.inside * found.count), found.count)
+            rows.append([name, inside, f"{found.median:.2f}", f"{found.high:.2f}"])
+    head = ("walk's length", "right poses in the 95 % ellipsoid", "median of d²/7", "95th percentile")
+    text = "Covariance. d: Mahalanobis distance of the truth; calibrated: .91 and 2.01. Objects of revolution left out."
+    return f"{text}\n\n" + _cells(head, rows)
 
 
 def _losses(runs: Sequence[Run]) -> str:

@@ -141,6 +141,14 @@ def test_a_run_is_lost_at_the_first_stage_without_a_right_pose() -> None:
     assert "| long | 2 | 1/2 (50.0 %) |" in text
 
 
+def test_the_report_tells_how_many_true_poses_lie_in_their_ellipsoids() -> None:
+    """chi2.ppf(.95, 7) = 14.07; wrong poses and objects of revolution have no distance."""
+    squares = [2.0, 7.0, 14.0, 14.1, None]
+    text = markdown([run(mahalanobis_squared=square) for square in squares] + [run(length="single", mssd_share=0.2)])
+    assert "| long | 3/4 (75.0 %) | 2.00 | 2.01 |" in text
+    assert "nan" not in text
+
+
 def test_bounds_are_exact() -> None:
     assert upper_bound(0, 3000) == pytest.approx(1.0 - 0.05 ** (1.0 / 3000))
     assert lower_bound(60, 60) == pytest.approx(0.05 ** (1.0 / 60))
