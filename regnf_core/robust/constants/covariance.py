@@ -26,6 +26,13 @@ class CovarianceConstants:
     """Kernel weight of an inlier. Samples with less belong to something else. [by hand]"""
     regularization: float = 1e-6
     """Relative. Keeps matrices positive definite. [derived: far above float64's precision, far below every nugget]"""
+    normals_length: float = 0.6
+    """Distance of unit normals, about 35 degrees: how far surfaces may be turned from one another and still be off
+    alike. The likelihood of the residuals has its maximum at .35 to .6. [random worlds]"""
+    residuals_factor: float = 3.8
+    """Of the covariance that the residuals tell. [random worlds, docs/adr/0042-covariance-in-random-worlds.md]"""
+    offset_factor: float = 2.3
+    """Of the offset between the surfaces, as an error of the pose. [random worlds, the same]"""
     min_variance: float = 1e-18
     """Square diameters. Smallest variance of the errors. [derived: exact fields have residuals of 0]"""
 

@@ -87,6 +87,12 @@ def robust_cost(r: Residuals, width: Tensor | float, normals: bool = True, weigh
     return cost + prior
 
 
+def sample_weights(r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None) -> Tensor:
+    """(H, N + M): the kernel's weights, times the normals' agreement, times ``weight`` (:func:`observed_weight`)."""
+    weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
+    return _weighted(weights * facing(r) if normals else weights, r, weight)
+
+
 def normal_equations(
     r: Residuals, width: Tensor | float, normals: bool = True, weight: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
@@ -96,8 +102,7 @@ def normal_equations(
     unknown. The normals' agreement counts as a constant weight: how it changes with the pose is left out, and steps
     that raise the cost are undone.
     """
-    weights = geman_mcclure_weight(r.values, kernel_widths(r, width))
-    weights = r.weighted(_weighted(weights * facing(r) if normals else weights, r, weight))
+    weights = r.weighted(sample_weights(r, width, normals, weight))
     J = r.jacobian_with_offset().mT
     weighted = J * weights[:, None]
     H, b = (weighted @ J.mT).double(), (weighted @ r.values[..., None]).squeeze(-1).double()

@@ -1,10 +1,15 @@
 """The pose's 7x7 covariance, from what the residuals tell of the fields' errors.
 
-A field's errors are similar at neighboring points: thousands of samples of a surface that is bent as a whole tell no
-more than a few. So the residuals along the surface are modeled as one smooth random function, a Gaussian process with a
-squared exponential kernel and a nugget. Its variance and correlation length are weighted by their restricted likelihood
-(Patterson & Thompson 1971), which accounts for the part that the pose itself absorbed. The covariance is the effect of
-such a function on the minimum: B K B^T with B = (J^T W' J)^-1 J^T W, averaged by the likelihood.
+A field's errors are similar at neighboring points that face the same way: thousands of samples of a surface that is
+bent as a whole tell no more than a few, and two faces of a box, seen by other images, are off on their own, although
+they meet at an edge. So the residuals along the surface are modeled as one random function of place and normal, a
+Gaussian process with a squared exponential kernel and a nugget. Its variance and correlation length are weighted by
+their restricted likelihood (Patterson & Thompson 1971), which accounts for the part that the pose itself absorbed. The
+covariance is the effect of such a function on the minimum: B K B^T with B = (J^T W' J)^-1 J^T W, averaged by the
+likelihood.
+
+What both fields have in common, or what the pose absorbed altogether, is not in the residuals. Its size follows from
+the offset between the surfaces: fields that are too thick are not equally thick everywhere.
 """
 
 from __future__ import annotations
@@ -19,7 +24,7 @@ from regnf_core.geometry.exponential_map import skew
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.kernel import geman_mcclure_curvature, geman_mcclure_weight
-from regnf_core.robust.refine.loss import kernel_widths, offset_prior
+from regnf_core.robust.refine.loss import facing, kernel_widths, observed_weight, offset_prior, sample_weights
 from regnf_core.robust.residuals import Residuals
 from regnf_core.robust.samples import fixed_generator
 from regnf_core.robust.working_frame import WorkingFrame
@@ -29,10 +34,11 @@ _TINY = COVARIANCE.regularization
 
 @dataclass(frozen=True, eq=False)
 class _Inliers:
-    """Samples that agree with the pose. points (N, 3), object diameters · J (N, 7), with the offset (N, 8) · residuals
-    (N,) · weights, curvatures (N,)."""
+    """Samples that agree with the pose. points (N, 3), object diameters · normals (N, 3) · J (N, 7), with the offset
+    (N, 8) · residuals (N,) · weights, curvatures (N,)."""
 
     points: Tensor
+    normals: Tensor
     J: Tensor
     residuals: Tensor
     weights: Tensor
@@ -43,12 +49,12 @@ class _Inliers:
 
 
 def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
-    """(7, 7) float64 of (omega, dt, log-scale step) for one pose (H = 1), working frames.
+    """(7, 7) float64 of (omega, dt, log-scale step) for one pose (H = 1), working frames: from the residuals alone.
 
     width: of the kernel · points: (N + M, 3) where the samples lie under that pose, object frame. Positive definite; a
     rotation about an object's axis of continuous symmetry is as uncertain as the samples leave it.
     """
-    inliers = _inliers(r, float(width), points)
+    inliers = _inliers(r, width, points)
     scales = 1.0 / inliers.J.square().mean(0).sqrt().clamp_min(_TINY)  # all unknowns in similar units
     inliers = replace(inliers, J=inliers.J * scales)
     variances = _likely_variances(inliers.first(COVARIANCE.likelihood_samples))  # (lengths, nuggets)
@@ -59,32 +65,47 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)
     rough = (variances * nuggets).sum()
     cov: Tensor = rough * (B @ B.mT)
-    squares = torch.cdist(inliers.points, inliers.points).square_().float()
+    squares, turned = (part.float() for part in _squares(inliers))
     for length, smooth in zip(COVARIANCE.lengths, (variances * (1.0 - nuggets)).sum(1), strict=True):
         if smooth > _TINY * variances.sum():
-            cov = cov + smooth * (B @ _smooth(squares, length).double() @ B.mT)
+            cov = cov + smooth * (B @ _smooth(squares, turned, length).double() @ B.mT)
     symmetric: Tensor = (cov + cov.mT) / 2.0
     return scales[:7, None] * symmetric * scales[:7]
 
 
-def _inliers(r: Residuals, width: float, points: Tensor) -> _Inliers:
+def with_common_errors(cov: Tensor, points: Tensor, T: Sim3, offset: float) -> Tensor:
+    """The covariance (7, 7) that is given, from the one that the residuals tell; working frames.
+
+    points: (N, 3) of the object's surface · T: the pose · offset: of the surfaces, object diameters. An error of the
+    pose alone, in which every direction moves the points by the same root mean square, is added in proportion to the
+    offset.
+    """
+    arms = points.double() - T.translation
+    moves = torch.cat([-skew(arms), torch.eye(3).double().expand(len(arms), 3, 3), arms[..., None]], -1)  # (N, 3, 7)
+    metric = (moves.mT @ moves).mean(0)
+    metric = metric + _TINY * metric.diagonal().mean() * torch.eye(7).double()
+    common: Tensor = COVARIANCE.residuals_factor * cov
+    return common + (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.inv(metric)
+
+
+def _inliers(r: Residuals, width: Tensor, points: Tensor) -> _Inliers:
+    """The weights are those of the refinement: they say how errors of the samples move its minimum."""
     n, total = r.scene_count, r.values.shape[1]
-    share = torch.cat([torch.full((n,), 1.0 / n), torch.full((total - n,), 1.0 / (total - n))]).double()
     # Where the scene lies outside the object, the object lies inside the scene: the same error, the other sign.
     sign = torch.cat([torch.ones(n), -torch.ones(total - n)]).double()
     values = r.values[0].double() * sign
     widths = kernel_widths(r, width)
     widths = widths[0].double() if isinstance(widths, Tensor) else widths
-    weights = geman_mcclure_weight(values, widths)
-    agreeing = (weights > COVARIANCE.min_weight).nonzero().squeeze(-1)
+    weights = r.weighted(sample_weights(r, width, weight=observed_weight(r)))[0].double()
+    agrees = (geman_mcclure_weight(values, widths) > COVARIANCE.min_weight) & (facing(r)[0] > COVARIANCE.min_weight)
+    agreeing = (agrees & (weights > 0.0)).nonzero().squeeze(-1)
     if len(agreeing) < 2 * r.jacobian.shape[-1]:  # hardly any sample agrees: all of them count
         agreeing = torch.arange(total)
-    generator = fixed_generator()
-    few = agreeing[torch.randperm(len(agreeing), generator=generator)[: COVARIANCE.propagated_samples]]
-    weights = weights * share
+    few = agreeing[torch.randperm(len(agreeing), generator=fixed_generator())[: COVARIANCE.propagated_samples]]
     curvatures = geman_mcclure_curvature(values, widths, weights)
     J = r.jacobian_with_offset()[0].double() * sign[:, None]
-    return _Inliers(points[few].double(), J[few], values[few], weights[few], curvatures[few])
+    normals = torch.nn.functional.normalize(J[:, 3:6], dim=1)
+    return _Inliers(points[few].double(), normals[few], J[few], values[few], weights[few], curvatures[few])
 
 
 def _curvature(inliers: _Inliers) -> Tensor:
@@ -97,9 +118,15 @@ def _curvature(inliers: _Inliers) -> Tensor:
     return 0.5 * gauss_newton + floor
 
 
-def _smooth(squares: Tensor, length: Tensor | float) -> Tensor:
-    """The kernel at squared distances."""
-    return (squares * (-0.5 / length**2)).exp_()
+def _squares(inliers: _Inliers) -> tuple[Tensor, Tensor]:
+    """(N, N) squared distances of the places, and of the normals in units in which they are alike."""
+    places = torch.cdist(inliers.points, inliers.points).square()
+    return places, (torch.cdist(inliers.normals, inliers.normals) / COVARIANCE.normals_length).square()
+
+
+def _smooth(squares: Tensor, turned: Tensor, length: Tensor | float) -> Tensor:
+    """The kernel at squared distances of places and of normals."""
+    return (-0.5 * (squares / length**2 + turned)).exp_()
 
 
 def _likely_variances(inliers: _Inliers) -> Tensor:
@@ -107,7 +134,7 @@ def _likely_variances(inliers: _Inliers) -> Tensor:
     lengths = torch.tensor(COVARIANCE.lengths, dtype=torch.float64)[:, None, None]
     nuggets = torch.tensor(COVARIANCE.nuggets, dtype=torch.float64)[:, None, None]
     alone = torch.eye(len(inliers.points), dtype=torch.float64)
-    smooth = _smooth(torch.cdist(inliers.points, inliers.points).square(), lengths)[:, None]
+    smooth = _smooth(*_squares(inliers), lengths)[:, None]
     K = (1.0 - nuggets) * smooth + (nuggets + _TINY) * alone  # (lengths, nuggets, N, N)
     factor = torch.linalg.cholesky(K)
     both = torch.cat([inliers.J, inliers.residuals[:, None]], 1).expand(*K.shape[:2], -1, -1)

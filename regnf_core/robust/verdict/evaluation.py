@@ -17,7 +17,7 @@ from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import residuals
 from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.considered import considered_poses
-from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_known_scale
+from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors, with_known_scale
 from regnf_core.robust.verdict.criteria import PoseVerdict, evaluate_pose
 from regnf_core.robust.verdict.evidence import gather_evidence
 from regnf_core.robust.verdict.pose_features import pose_features
@@ -111,5 +111,6 @@ def pose_covariance(problem: RegistrationProblem, evaluation: Evaluation) -> Ten
     places = torch.cat([T.apply(A.points.double()), B.points.double()])
     last = REFINEMENT.last_stages[-1]
     cov = covariance(r, adaptive_width(r, last.widths[-1], last.widest), places)
+    cov = with_common_errors(cov, B.points, T, 0.0 if r.offset is None else float(r.offset))
     cov = with_known_scale(cov, problem.bound.scale.log_width)
     return in_object_units(cov, T, problem.view.frame, problem.model.frame)

@@ -10,9 +10,10 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.robust.constants import COVARIANCE
 from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
 from regnf_core.robust.sampling import sample_object_surface
-from regnf_core.robust.verdict.covariance import covariance, in_object_units
+from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors
 from regnf_core.robust.working_frame import WorkingFrame
 from tests.core.analytic import chair
 from tests.core.robust.shapes import random_pose
@@ -65,17 +66,75 @@ def test_errors_of_any_length_lie_inside_the_ellipsoid(length: float) -> None:
 
 
 def test_white_errors_give_the_textbook_covariance() -> None:
+    """In the mean over draws. A few hundred samples do not rule out that faces are off on their own: what they leave
+    open makes it up to twice as wide."""
     r, places = at_the_truth(120)  # all of them are looked at
     generator = torch.Generator().manual_seed(6)
     sigma = 0.002
-    errors = sigma * torch.randn(len(places), generator=generator, dtype=torch.float64)
-    left, _ = disturbed(r, errors)
-    found = covariance(left, WIDTH[0], places)
     J = r.jacobian[0].double()
     expected = sigma**2 * torch.linalg.inv(J.T @ J)
-    ratio = (found.diagonal() / expected.diagonal()).sqrt()
-    assert ratio.min() > 0.7
-    assert ratio.max() < 1.6
+    ratios = []
+    for _ in range(10):
+        left, _ = disturbed(r, sigma * torch.randn(len(places), generator=generator, dtype=torch.float64))
+        ratios.append((covariance(left, WIDTH[0], places).diagonal() / expected.diagonal()).sqrt())
+    ratio = torch.stack(ratios).mean(0)
+    assert ratio.min() > 0.9
+    assert ratio.max() < 2.0
+
+
+def test_faces_that_are_off_on_their_own_lie_inside_the_ellipsoid() -> None:
+    """Every side of the chair, by the axis that its normals are nearest to, has one error of its own: two sides that
+    face each other move the pose and leave nothing in the residuals. (Without normals in the kernel 1 of 40 lies inside
+    by the residuals alone, with them 18, and 40 as it is given.)"""
+    r, places = at_the_truth(250)
+    n = r.scene_count
+    sign = torch.cat([torch.ones(n), -torch.ones(r.values.shape[1] - n)]).double()
+    normals = r.jacobian[0, :, 3:6].double() * sign[:, None]
+    axis = normals.abs().argmax(1)
+    side = 2 * axis + (normals.gather(1, axis[:, None])[:, 0] > 0)
+    generator = torch.Generator().manual_seed(5)
+    inside = 0
+    for _ in range(40):
+        of_sides = torch.randn(6, generator=generator, dtype=torch.float64)
+        rough = 0.3 * torch.randn(len(places), generator=generator, dtype=torch.float64)
+        left, step = disturbed(r, 0.002 * sign * (of_sides[side] + rough))
+        cov = with_common_errors(covariance(left, WIDTH[0], places), places, Sim3.identity(), 0.0)
+        inside += float(step @ torch.linalg.solve(cov, step)) <= chi2.ppf(0.95, 7)
+    assert inside >= 38
+
+
+def test_samples_that_face_another_way_have_no_part_in_it() -> None:
+    """They have none in the refinement either."""
+    r, places = at_the_truth(120)
+    errors = 0.002 * torch.randn(len(places), generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+    left, _ = disturbed(r, errors)
+    turned = torch.arange(len(places)) % 5 == 0
+    cosines = torch.where(turned, -1.0, left.cosines)
+
+    def found(wrong: float) -> Tensor:
+        values = torch.where(turned, wrong, left.values)
+        return covariance(Residuals(values, left.jacobian, cosines, left.scene_count), WIDTH[0], places)
+
+    torch.testing.assert_close(found(0.3), found(0.0), rtol=1e-9, atol=0.0)
+    assert not torch.allclose(found(0.3), covariance(left, WIDTH[0], places), rtol=1e-3, atol=0.0)
+
+
+def test_an_offset_adds_an_error_that_moves_the_surface_by_as_much_in_every_direction() -> None:
+    """Poses drawn from what is added move the points, root mean square, by the square root of 7 such errors."""
+    points = torch.randn(400, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor([0.4, 0.1, 0.02])
+    T, offset = random_pose(7, 0.8), 0.001
+    none = torch.zeros(7, 7, dtype=torch.float64)
+    assert not with_common_errors(none, points, T, 0.0).any()
+    added = with_common_errors(none, points, T, offset)
+    draws = torch.randn(3000, 7, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    steps = draws @ torch.linalg.cholesky(added).T
+    moved = T.expand(len(steps)).perturb(steps).apply(T.inverse().apply(points.double()))
+    found = float((moved - points).square().sum(-1).mean().sqrt())
+    assert found == pytest.approx(math.sqrt(7.0) * COVARIANCE.offset_factor * offset, rel=0.03)
+    known = torch.diag(torch.arange(1.0, 8.0, dtype=torch.float64))
+    torch.testing.assert_close(
+        with_common_errors(known, points, T, offset), COVARIANCE.residuals_factor * known + added
+    )
 
 
 def test_it_is_a_covariance_even_without_any_error_or_support() -> None:
