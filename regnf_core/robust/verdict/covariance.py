@@ -84,8 +84,8 @@ def with_common_errors(cov: Tensor, points: Tensor, T: Sim3, offset: float) -> T
     moves = torch.cat([-skew(arms), torch.eye(3).double().expand(len(arms), 3, 3), arms[..., None]], -1)  # (N, 3, 7)
     metric = (moves.mT @ moves).mean(0)
     metric = metric + _TINY * metric.diagonal().mean() * torch.eye(7).double()
-    common: Tensor = COVARIANCE.residuals_factor * cov
-    return common + (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.inv(metric)
+    common: Tensor = (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.inv(metric)
+    return COVARIANCE.residuals_factor * cov + common
 
 
 def _inliers(r: Residuals, width: Tensor, points: Tensor) -> _Inliers:
