@@ -24,6 +24,9 @@ MEMORY = {"cpu": 16 * 2**20}
 MEMORY_ELSEWHERE = 256 * 2**20
 POINTS = 100_000
 ORDER_PAIRS = 6
+DEVIATIONS_APART = 0.1
+"""Largest relative difference of a pose's standard deviations: the covariance is of a draw of the samples that agree,
+and one of them more or fewer is another draw."""
 VALUES_APART = 1e-4
 """Largest difference of field values, as a share of the field's extent."""
 ALONE = RegistrationOptions()
@@ -124,8 +127,15 @@ def correctness(pairs: Sequence[Pair], device: torch.device, seeds: int, deadlin
             row, same = compared(pair, seed, here, [there, batched])
             rows.append(row)
             met &= same
-    head = ("pair", "seed", "CPU", "device", "device, batch", "apart, diameters", "batch apart", "the CPU's result")
-    notes = [f"Apart: the box's corners; {MOST_APART:g} diameters are allowed where the verdict is not a rejection."]
+    head = (
+        "pair", "seed", "CPU", "device", "device, batch", "apart, diameters", "batch apart", "deviations apart",
+        "the CPU's result",
+    )  # fmt: skip
+    notes = [
+        f"Apart: the box's corners; {MOST_APART:g} diameters are allowed where the verdict is not a rejection. "
+        "Deviations apart: relative difference of the pose's standard deviations, the largest of seven and of both; "
+        f"{DEVIATIONS_APART:g} is allowed where the pose is the CPU's and the verdict is not a rejection."
+    ]
     if left_out:
         notes.append(f"Left out for want of time: {left_out} of {seeds * len(pairs)} pairs.")
     return Section("Beside the CPU", head, rows, notes, met)
@@ -136,7 +146,7 @@ Outcome = RegistrationResult | RegnfError | None
 
 def compared(pair: Pair, seed: int, here: Outcome, others: Sequence[Outcome]) -> tuple[list[str], bool]:
     """A row of the table, and whether both others are the CPU's result."""
-    verdicts, apart, same = [_verdict(here)], [], True
+    verdicts, apart, deviations, same = [_verdict(here)], [], [], True
     for other in others:
         verdicts.append(_verdict(other))
         same &= verdicts[-1] == verdicts[0]
@@ -145,9 +155,13 @@ def compared(pair: Pair, seed: int, here: Outcome, others: Sequence[Outcome]) ->
             distance = min(_apart(here, replace(other, T_object_scene=T), pair.detection) for T in places)
             same &= here.verdict == "rejected" or distance <= MOST_APART
             apart.append(f"{distance:.1e}")
+            if here.verdict != "rejected" and _apart(here, other, pair.detection) <= MOST_APART:
+                deviations.append(_deviations_apart(here, other))
         else:
             apart.append("-")
-    return [pair.name, str(seed), *verdicts, *apart, "yes" if same else "NO"], same
+    same &= max(deviations, default=0.0) <= DEVIATIONS_APART
+    largest = f"{max(deviations):.1e}" if deviations else "-"
+    return [pair.name, str(seed), *verdicts, *apart, largest, "yes" if same else "NO"], same
 
 
 def _verdict(one: Outcome) -> str:
@@ -161,6 +175,14 @@ def _apart(one: RegistrationResult, other: RegistrationResult, box: Any) -> floa
     corners = box.corners()
     moved = one.T_object_scene.apply(corners) - other.T_object_scene.apply(corners)
     return float(moved.norm(dim=-1).max()) / one.metrics["object_diameter"]
+
+
+def _deviations_apart(one: RegistrationResult, other: RegistrationResult) -> float:
+    """Largest relative difference of the standard deviations; 0 where neither result has a covariance."""
+    if one.covariance is None or other.covariance is None:
+        return 0.0 if one.covariance is other.covariance else float("inf")
+    ratio = (other.covariance.diagonal() / one.covariance.diagonal()).sqrt()
+    return float((ratio - 1.0).abs().max())
 
 
 def _same_bits(one: BatchOutcome, other: BatchOutcome) -> bool:

@@ -3,6 +3,7 @@
     python -m benchmarks.worlds make FOLDER --meshes DIR [DIR ...] --part train --count 20
     python -m benchmarks.worlds register FOLDER --part train --output runs.jsonl
     python -m benchmarks.worlds report runs.jsonl [--output report.md]
+    python -m benchmarks.worlds covariance runs.jsonl [--output factors.md]
     python -m benchmarks.worlds worst FOLDER runs.jsonl --output worst.png
     python -m benchmarks.worlds evidence FOLDER --part train --output evidence.jsonl
     python -m benchmarks.worlds train evidence.jsonl --output model.json --diagram reliability.svg
@@ -19,7 +20,7 @@ import json
 import multiprocessing
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
@@ -27,13 +28,13 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")  # before torch loads, here and in the workers
 
-from benchmarks.worlds import tables, training  # noqa: E402
+from benchmarks.worlds import covariance, tables, training  # noqa: E402
 from benchmarks.worlds.cases import OBSERVED_BY  # noqa: E402
 from benchmarks.worlds.evidence import ASKED, TRAINED, Gathering, evidence_of_world  # noqa: E402
 from benchmarks.worlds.making import WORLD, Task, make  # noqa: E402
 from benchmarks.worlds.objects import OBJECT_KINDS  # noqa: E402
 from benchmarks.worlds.recipe import SCENES, parts_of_name  # noqa: E402
-from benchmarks.worlds.running import Way, register_world  # noqa: E402
+from benchmarks.worlds.running import Run, Way, register_world  # noqa: E402
 from benchmarks.worlds.worst import picture_of, worst_of  # noqa: E402
 from regnf_core.robust.verdict.probability import ProbabilityModel  # noqa: E402
 from regnf_data.worlds.split import PARTS, part_of_world, seeds_of  # noqa: E402
@@ -45,7 +46,8 @@ def main() -> None:
     commands: dict[str, Callable[[argparse.Namespace], None]] = {
         "make": _make,
         "register": _register,
-        "report": _report,
+        "report": partial(_table, markdown=tables.markdown),
+        "covariance": partial(_table, markdown=covariance.markdown),
         "worst": _worst,
         "evidence": _evidence,
         "train": _train,
@@ -133,9 +135,9 @@ def _text(path: Path) -> str:
     return (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
 
 
-def _report(arguments: argparse.Namespace) -> None:
+def _table(arguments: argparse.Namespace, markdown: Callable[[Sequence[Run]], str]) -> None:
     runs = [json.loads(line) for path in arguments.runs for line in path.read_text().splitlines()]
-    text = tables.markdown(runs)
+    text = markdown(runs)
     if arguments.output is None:
         sys.stdout.write(text)
     else:
@@ -221,8 +223,10 @@ def _add_commands_on_runs(commands: argparse._SubParsersAction[argparse.Argument
     showing.add_argument("--count", type=int, default=10)
     showing.add_argument("--output", type=Path, required=True, help="an image file")
     reporting = commands.add_parser("report", help="tables of runs")
-    reporting.add_argument("runs", type=Path, nargs="+")
-    reporting.add_argument("--output", type=Path)
+    fitting = commands.add_parser("covariance", help="the covariance's two factors, fitted to right poses of runs")
+    for command in (reporting, fitting):
+        command.add_argument("runs", type=Path, nargs="+", help="what `register` wrote")
+        command.add_argument("--output", type=Path, help="Markdown; otherwise it is printed")
 
 
 if __name__ == "__main__":

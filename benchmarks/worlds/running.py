@@ -12,6 +12,7 @@ from torch import Tensor
 from benchmarks.robust.ellipsoid import mahalanobis_squared, nearest_truth, pose_error
 from benchmarks.robust.judging import SUCCESS, judge_error
 from benchmarks.worlds.cases import ObservedBy, WorldCase, cases_of
+from benchmarks.worlds.covariance import diagonal_parts
 from benchmarks.worlds.stages import from_truth, recorded, stage_errors
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, Sim3, register
 from regnf_core.geometry.metrics import errors_against_truth
@@ -70,7 +71,8 @@ def judged(result: RegistrationResult, world_case: WorldCase) -> Run:
     """Verdict, errors of the pose and of the best of those listed, and the evidence. Errors are over the true surface.
 
     near_mssd: the least over symmetries that nearly hold as well · mahalanobis_squared: of the true pose, by the
-    covariance; of right poses alone, and None for objects of revolution: their turn about the axis has no truth.
+    covariance, and its parts; of right poses alone, and None for objects of revolution: their turn about the axis has
+    no truth.
     """
     best, listed = _errors(result, world_case, world_case.case.symmetries)
     near = best if best["mssd_share"] <= SUCCESS else _errors(result, world_case, world_case.near)[0]
@@ -81,18 +83,24 @@ def judged(result: RegistrationResult, world_case: WorldCase) -> Run:
         **best,
         "listed_mssd": listed,
         "near_mssd": near["mssd_share"],
-        "mahalanobis_squared": _mahalanobis(result, world_case) if best["mssd_share"] <= SUCCESS else None,
+        **_by_covariance(result, world_case, best["mssd_share"] <= SUCCESS),
         "metrics": result.metrics,
     }
 
 
-def _mahalanobis(result: RegistrationResult, world_case: WorldCase) -> float | None:
-    case = world_case.case
+def _by_covariance(result: RegistrationResult, world_case: WorldCase, right: bool) -> Run:
+    """How far the true pose lies from the one found, by the covariance."""
+    case, points = world_case.case, _points(world_case)
     assert case.truth is not None
-    if result.covariance is None or case.symmetries.continuous:
-        return None
-    truth = nearest_truth(result.T_object_scene, case.truth, _points(world_case), case.symmetries)
-    return mahalanobis_squared(pose_error(result.T_object_scene, truth), result.covariance)
+    if not right or result.covariance is None or case.symmetries.continuous:
+        return {"mahalanobis_squared": None}
+    T = result.T_object_scene
+    error = pose_error(T, nearest_truth(T, case.truth, points, case.symmetries))
+    offset = result.metrics.get("surface_offset", 0.0) * result.metrics["object_diameter"]
+    return {
+        "mahalanobis_squared": mahalanobis_squared(error, result.covariance),
+        **diagonal_parts(error, result.covariance, points, T, offset),
+    }
 
 
 def _points(world_case: WorldCase) -> Tensor:
