@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from regnf_core.errors import DatasetError
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
 
@@ -19,6 +20,9 @@ _EDGE = 8
 """Voxels along an edge of a block."""
 _BLOCKS = 20_000
 """To start with; Open3D makes room for more."""
+
+_NOTHING_NEAR = "No block is touched"
+"""What Open3D says of an image that has no depth within reach, at those pixels that it looks at."""
 
 Progress = Callable[[int], None]
 """Called with the number of images that are fused."""
@@ -46,7 +50,10 @@ class DepthImages:
 
 
 def fuse_blocks(images: DepthImages, grid: BlockGrid, path: Path, progress: Progress | None = None) -> None:
-    """Write the safe field of the fused images to ``path``. Raises FieldFormatError where nothing was measured."""
+    """Write the safe field of the fused images to ``path``.
+
+    Raises DatasetError (DATASET_NOTHING_IN_BOUNDS) where no image shows surface within reach.
+    """
     source = path.with_suffix(".npz")
     try:
         with warnings.catch_warnings():
@@ -88,6 +95,7 @@ def _save(images: DepthImages, grid: BlockGrid, path: Path, progress: Progress |
         names, channels = (*names, "color"), (*channels, 3)
     types = tuple(core.float32 for _ in names)
     blocks = o3d.t.geometry.VoxelBlockGrid(names, types, channels, grid.voxel, _EDGE, _BLOCKS, core.Device("CPU:0"))
+    fused = 0
     for number, depth in enumerate(images.depths):
         if progress is not None:
             progress(number)
@@ -97,14 +105,29 @@ def _save(images: DepthImages, grid: BlockGrid, path: Path, progress: Progress |
         camera = core.Tensor(np.linalg.inv(images.T_world_camera[number]))
         reach = (1.0, float(grid.farthest), float(grid.truncation))
         image = o3d.t.geometry.Image(core.Tensor(np.ascontiguousarray(depth[..., None])))
-        near = blocks.compute_unique_block_coordinates(image, K, camera, *reach)
+        near = _blocks_near(blocks, image, K, camera, reach)
+        if near is None:
+            continue
+        fused += 1
         if images.colors is None:
             blocks.integrate(near, image, K, camera, *reach)
             continue
         color = (images.colors[number] / np.float32(255.0)).astype(np.float32)
         blocks.integrate(near, image, o3d.t.geometry.Image(core.Tensor(color)), K, K, camera, *reach)
+    if fused == 0:
+        raise DatasetError("no depth image shows surface within reach", reason="DATASET_NOTHING_IN_BOUNDS")
     blocks.save(str(path))
     _sort(path)
+
+
+def _blocks_near(blocks: Any, image: Any, K: Any, camera: Any, reach: tuple[float, float, float]) -> Any:
+    """Coordinates of the blocks near an image's surface; None where it shows none within reach."""
+    try:
+        return blocks.compute_unique_block_coordinates(image, K, camera, *reach)
+    except RuntimeError as error:
+        if _NOTHING_NEAR in str(error):
+            return None
+        raise
 
 
 def _sort(path: Path) -> None:

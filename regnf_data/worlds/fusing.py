@@ -33,7 +33,7 @@ class Fusion:
 def fuse(taken: Capture, fusion: Fusion, bounds: Array, path: Path) -> None:
     """Write the safe field of the fused images to ``path``, imported from the file that a user would upload.
 
-    bounds: (2, 3), what a dense grid covers. Raises FieldFormatError where nothing was measured.
+    bounds: (2, 3), what a dense grid covers. Raises DatasetError where nothing was measured.
     """
     if fusion.volume == "blocks":
         intrinsics = np.tile(taken.sensor.intrinsics, (len(taken.poses), 1, 1))

@@ -15,6 +15,7 @@ from regnf_core.fields.color import has_color
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.observation_grid import FREE, SURFACE
 from regnf_core.schema.safe_format import read_description
+from regnf_data.fusing import BlockGrid, DepthImages, fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.fusion import FusionOptions, fuse_images
 from regnf_fit.images.measured import measured_rays
@@ -129,3 +130,26 @@ def test_the_same_images_make_the_same_bytes(tmp_path: Path) -> None:
     for name in ("one", "two", "three"):
         fuse_images(IMAGES, tmp_path / f"{name}.safetensors")
     assert len({one.read_bytes() for one in tmp_path.iterdir()}) == 1
+
+
+def test_an_image_with_hardly_a_depth_is_no_error(tmp_path: Path) -> None:
+    """Open3D looks at every fourth pixel and refuses an image where none of them has a depth."""
+    assert IMAGES.depths is not None
+    depths = IMAGES.depths.copy()
+    alone = np.zeros_like(depths[3])
+    alone[37, 49] = depths[3][37, 49]
+    assert alone.any()
+    depths[3] = alone
+    fuse_images(replace(IMAGES, depths=depths), tmp_path / "map.safetensors")
+    points, exact = near_surface()
+    error = np.abs(open_field(tmp_path / "map.safetensors").signed_distance(points).numpy() - exact)
+    assert np.median(error) < 0.003
+
+
+def test_images_without_surface_within_reach_have_a_reason(tmp_path: Path) -> None:
+    assert IMAGES.depths is not None
+    depths = DepthImages(IMAGES.depths, IMAGES.intrinsics, IMAGES.T_world_camera)
+    with pytest.raises(DatasetError) as raised:
+        fuse_blocks(depths, BlockGrid(0.02, 4.0, 1e-3), tmp_path / "map.safetensors")
+    assert raised.value.reason == "DATASET_NOTHING_IN_BOUNDS"
+    assert not list(tmp_path.iterdir())
