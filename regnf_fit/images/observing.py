@@ -12,11 +12,11 @@ from safetensors.numpy import load_file
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from regnf_core.errors import DatasetError
+from regnf_core.errors import DatasetError, InvalidOptionsError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import Observation
-from regnf_core.schema.observation_grid import FREE, OBSERVATION, SURFACE, UNSEEN
+from regnf_core.schema.observation_grid import FREE, MAX_COUNT, OBSERVATION, SURFACE, UNSEEN
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.depth_normals import local_planes
@@ -42,7 +42,11 @@ def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -
     spread: of the depths from image to image; what is nearer to a measured surface than that is not seen to be free.
     A voxel is free where all four rays round its center, in some image, pass it by: at the edge of a thing one of them
     ends there. (The center's own pixel is not enough: voxels are about as wide as a pixel.)
+
+    Raises InvalidOptionsError for more voxels than a safe field keeps.
     """
+    if not 0 <= voxels <= MAX_COUNT:
+        raise InvalidOptionsError(f"observation_voxels: {voxels} is not from 0 to {MAX_COUNT}")
     if images.depths is None or voxels == 0:
         return None
     low, high = torch.from_numpy(images.bounds)

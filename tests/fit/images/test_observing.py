@@ -6,8 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
+from regnf_core.errors import InvalidOptionsError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.observation import observation_of
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
@@ -141,3 +143,10 @@ def test_a_voxel_at_the_edge_of_a_thing_is_not_free() -> None:
     assert seen.states.shape == (5, 5, 1)
     # Centers at x = -.4, -.175, .05, .275, .5 and depth 1.5: columns 5.9, 7.1, 8.3, 9.5, 10.7 of the image.
     assert seen.states[:, 2, 0].tolist() == [UNSEEN, UNSEEN, UNSEEN, FREE, UNSEEN]
+
+
+@pytest.mark.parametrize("voxels", [-1, 513])
+def test_more_voxels_than_a_field_keeps_are_refused_before_the_fit(voxels: int, tmp_path: Path) -> None:
+    with pytest.raises(InvalidOptionsError, match="observation_voxels"):
+        reconstruct(images(count=4), FitFiles(tmp_path / "ball"), ReconstructionOptions(observation_voxels=voxels))
+    assert not list(tmp_path.iterdir())
