@@ -25,8 +25,8 @@ MEMORY_ELSEWHERE = 256 * 2**20
 POINTS = 100_000
 ORDER_PAIRS = 6
 DEVIATIONS_APART = 0.1
-"""Largest relative difference of a pose's standard deviations: the covariance is of a draw of the samples that agree,
-and one of them more or fewer is another draw."""
+"""Largest relative difference of a pose's standard deviations. They follow from the residuals, and those of exact
+fields are hardly larger than what two poses may be apart."""
 VALUES_APART = 1e-4
 """Largest difference of field values, as a share of the field's extent."""
 ALONE = RegistrationOptions()
