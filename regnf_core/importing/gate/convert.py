@@ -71,45 +71,64 @@ def convert_file(
     beside: what came with it, each the name and the path of one file or of an archive of files. Confines nothing: the
     caller has done so. Raises FieldFormatError with the reason of the stage that refused.
     """
+    from regnf_core.schema.safe_format import add_to_source
+
+    beside = beside or Companions()
+    read = _read(upload, out_dir, description, limits, beside)
+    target = out_dir / FIELD_NAME
+    stored = _stored(read, target, limits, beside.cameras is not None)
+    drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, stored.up_axis)
+    measured, more = _evaluated(target, drawing, None if read.description.accept_implausible else stored.guess)
+    if stored.sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
+        more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
+    warned = list(kept_warnings(_latest([*stored.warnings, *more])))
+    add_to_source(target, {WARNINGS: warned} if warned else {})
+    return {**stored.reported, "plausibility": measured, "warnings": warned, "settings": read.settings}
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What is kept of a field whose tensors are on disk: they are let go of before the evaluation.
+
+    reported: values of the report · warnings: of the reading · guess: the sign, where nothing says it · sign_is_open:
+    whether the values will tell · up_axis: of the description.
+    """
+
+    reported: dict[str, Any]
+    warnings: Sequence[str]
+    guess: _Guess
+    sign_is_open: bool
+    up_axis: str | None
+
+
+def _stored(read: ReadUpload, target: Path, limits: ImportLimits, cameras: bool) -> _Stored:
+    """Write the safe field of what was read to ``target``. cameras: whether they came with it.
+
+    Raises FieldFormatError.
+    """
     from regnf_core.importing.gate.cost_estimate import affordable_share, require_affordable, with_affordable_color
     from regnf_core.importing.gate.observed import observed
     from regnf_core.importing.gate.placement import placed
-    from regnf_core.schema.safe_format import add_to_source, write_safe_field
+    from regnf_core.schema.safe_format import write_safe_field
 
-    read = _read(upload, out_dir, description, limits, beside or Companions())
-    converted = read.field
-    _require_text(converted.description)
-    require_affordable(converted, limits)
-    settled = _settled(converted, affordable_share(converted, limits))
+    _require_text(read.field.description)
+    require_affordable(read.field, limits)
+    settled = _settled(read.field, affordable_share(read.field, limits))
     converted = placed(with_affordable_color(settled, limits), read.description)
-    converted = observed(converted, read, limits, required=beside is not None and beside.cameras is not None)
-    target = out_dir / FIELD_NAME
-    write_safe_field(target, converted.description, converted.tensors, _ROOM)
+    converted = observed(converted, read, limits, required=cameras)
+    said = converted.description
+    write_safe_field(target, said, converted.tensors, _ROOM)
     own, _ = split_color(converted.tensors)
-    parameters = sum(array.size for name, array in own.items() if name not in _SEEN)
-    family, why, warnings = converted.family, converted.why, converted.warnings
-    kind = str(converted.description["kind"])
-    bounds, label = converted.description["bounds"], converted.description["label"]
-    guessed = _Guess(None if _sign_is_said(converted, read.description) else int(converted.description["sign"]))
-    sign_is_open, up_axis = converted.sign_is_open, converted.description["up_axis"]
-    del converted  # the tensors are on disk: let go of them before the evaluation
-    drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, up_axis)
-    measured, more = _evaluated(target, drawing, None if read.description.accept_implausible else guessed)
-    if sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
-        more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
-    warned = list(kept_warnings(_latest([*warnings, *more])))
-    add_to_source(target, {WARNINGS: warned} if warned else {})
-    return {
-        "family": family,
-        "kind": kind,
-        "why": why,
-        "bounds": bounds,
-        "parameters": parameters,
-        "plausibility": measured,
-        "warnings": warned,
-        "label": label,
-        "settings": read.settings,
+    reported = {
+        "family": converted.family,
+        "kind": str(said["kind"]),
+        "why": converted.why,
+        "bounds": said["bounds"],
+        "parameters": sum(array.size for name, array in own.items() if name not in _SEEN),
+        "label": said["label"],
     }
+    guess = _Guess(None if _sign_is_said(converted, read.description) else int(said["sign"]))
+    return _Stored(reported, converted.warnings, guess, converted.sign_is_open, said["up_axis"])
 
 
 def _read(
