@@ -22,8 +22,8 @@ from torch import Tensor
 
 from benchmarks.robust.ellipsoid import FREEDOM, LIMIT
 from regnf_core import Sim3
-from regnf_core.geometry.exponential_map import skew
 from regnf_core.robust.constants import COVARIANCE
+from regnf_core.robust.verdict.covariance import of_offset
 
 Run = dict[str, Any]
 Array = NDArray[np.float64]
@@ -50,13 +50,10 @@ def diagonal_parts(error: Tensor, covariance: Tensor, points: Tensor, T: Sim3, o
     whitened_error: (7,), variance 1 each if the covariance holds · offset_share: (7,) of that variance is from the
     offset. Both are None where the covariance is not positive definite.
     """
-    arms = points.double() - T.translation
-    moves = torch.cat([-skew(arms), torch.eye(3).double().expand(len(arms), 3, 3), arms[..., None]], -1)
-    of_offset = (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.pinv((moves.mT @ moves).mean(0), hermitian=True)
     spread = covariance.diagonal().clamp_min(0.0).sqrt()  # radians, lengths, a logarithm: similar sizes first
     both = (spread[:, None] * spread).clamp_min(torch.finfo(torch.float64).tiny)
     try:
-        shares, axes = eigh((of_offset / both).numpy(), (covariance / both).numpy())
+        shares, axes = eigh((of_offset(points, T, offset) / both).numpy(), (covariance / both).numpy())
     except (np.linalg.LinAlgError, ValueError):
         return {"whitened_error": None, "offset_share": None}
     whitened = axes.T @ (error / spread).numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,19 +18,8 @@ from benchmarks.trainer_runs.training import train
 
 def write_neus(folder: Path, rng: np.random.Generator, steps: int) -> WrittenRun:
     """A run of random depth, width, skip layer, frequencies and scale."""
-    layers, hidden = int(rng.integers(4, 9)), int(rng.choice([64, 96, 128]))
-    said = {
-        "d_out": int(rng.choice([1, 65, 129])),
-        "d_in": 3,
-        "d_hidden": hidden,
-        "n_layers": layers,
-        "skip_in": [int(rng.integers(2, layers))] if rng.random() < 0.8 else [],
-        "multires": int(rng.choice([0, 4, 6, 8, 10])),
-        "bias": float(rng.choice([0.3, 0.5, 0.6])),
-        "scale": float(rng.choice([1.0, 1.0, 3.0, 2.0, 1.5, 0.5])),
-        "geometric_init": True,
-        "weight_norm": bool(rng.random() < 0.9),
-    }
+    said = _drawn_settings(rng)
+    layers, hidden = said["n_layers"], said["d_hidden"]
     degree, scale = said["multires"], said["scale"]
     widths = [3 + 6 * degree, *[hidden] * layers, said["d_out"]]
     network = sphere_network(rng, widths, 3, said["skip_in"], said["bias"] * scale)
@@ -71,6 +61,23 @@ def write_neus(folder: Path, rng: np.random.Generator, steps: int) -> WrittenRun
     (case / "recording").mkdir()
     (case / "recording" / "config.conf").write_text(_conf(said, rendering))
     return WrittenRun(folder, checkpoint, said, lambda x: value(x, net), color=color)
+
+
+def _drawn_settings(rng: np.random.Generator) -> dict[str, Any]:
+    """The settings of the network of distances."""
+    layers, hidden = int(rng.integers(4, 9)), int(rng.choice([64, 96, 128]))
+    return {
+        "d_out": int(rng.choice([1, 65, 129])),
+        "d_in": 3,
+        "d_hidden": hidden,
+        "n_layers": layers,
+        "skip_in": [int(rng.integers(2, layers))] if rng.random() < 0.8 else [],
+        "multires": int(rng.choice([0, 4, 6, 8, 10])),
+        "bias": float(rng.choice([0.3, 0.5, 0.6])),
+        "scale": float(rng.choice([1.0, 1.0, 3.0, 2.0, 1.5, 0.5])),
+        "geometric_init": True,
+        "weight_norm": bool(rng.random() < 0.9),
+    }
 
 
 def _color(

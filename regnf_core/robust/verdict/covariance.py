@@ -74,18 +74,23 @@ def covariance(r: Residuals, width: Tensor, points: Tensor) -> Tensor:
 
 
 def with_common_errors(cov: Tensor, points: Tensor, T: Sim3, offset: float) -> Tensor:
-    """The covariance (7, 7) that is given, from the one that the residuals tell; working frames.
+    """The covariance (7, 7) that is given, from the one that the residuals tell; working frames. Others: as
+    :func:`of_offset`."""
+    return COVARIANCE.residuals_factor * cov + of_offset(points, T, offset)
 
-    points: (N, 3) of the object's surface · T: the pose · offset: of the surfaces, object diameters. An error of the
-    pose alone, in which every direction moves the points by the same root mean square, is added in proportion to the
-    offset.
+
+def of_offset(points: Tensor, T: Sim3, offset: float) -> Tensor:
+    """The part (7, 7) of the covariance that follows from the offset between the surfaces.
+
+    points: (N, 3) of the object's surface · T: the pose · offset: in the points' units. It is an error of the pose
+    alone, in proportion to the offset, in which every direction moves the points by the same root mean square.
     """
     arms = points.double() - T.translation
     moves = torch.cat([-skew(arms), torch.eye(3).double().expand(len(arms), 3, 3), arms[..., None]], -1)  # (N, 3, 7)
     metric = (moves.mT @ moves).mean(0)
     metric = metric + _TINY * metric.diagonal().mean() * torch.eye(7).double()
-    common: Tensor = (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.inv(metric)
-    return COVARIANCE.residuals_factor * cov + common
+    part: Tensor = (COVARIANCE.offset_factor * offset) ** 2 * torch.linalg.inv(metric)
+    return part
 
 
 def _inliers(r: Residuals, width: Tensor, points: Tensor) -> _Inliers:
