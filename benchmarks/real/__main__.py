@@ -23,20 +23,20 @@ from benchmarks.real.fits import fit_room, fit_thing
 from benchmarks.real.fusion import fuse
 from benchmarks.real.halves import HALVES
 from benchmarks.real.maps import MAPS, OBSERVATIONS, keep_observation
-from benchmarks.real.objects import KINDS, cut_grid, cut_points
+from benchmarks.real.objects import KINDS, cut_grid, cut_points, is_shown
 from benchmarks.real.registering import Wanted, register_all
-from benchmarks.real.scenes import Thing, things_of
+from benchmarks.real.scenes import Thing, scene_names, scene_of
 from benchmarks.real.sequence import Recording, open_recording
 from benchmarks.real.table import line, tables
 from benchmarks.robust.runs import Run
 from regnf_fit.images.options import ReconstructionOptions
 
 
-def _fuse(recording: Recording, work: Work) -> None:
+def _fuse(recording: Recording, work: Work, voxel_m: float) -> None:
     for half, frames in zip("AB", work.halves.frames(len(recording)), strict=True):
         files = work.map_files(half)
         if not files.fused.exists():
-            fuse(recording, frames, files.fused)
+            fuse(recording, frames, voxel_m, files.fused)
         if half == "B" and not files.seen.exists():
             keep_observation(recording, frames, files)
 
@@ -44,6 +44,9 @@ def _fuse(recording: Recording, work: Work) -> None:
 def _cut(work: Work, things: tuple[Thing, ...]) -> None:
     for thing in things:
         fused = work.map_files("A").fused
+        if not is_shown(fused, thing):
+            print(f"{work.halves.name}: {thing.name} is left out, the first half hardly shows it", flush=True)
+            continue
         cut_points(fused, thing, work.object_file(thing, "points"))
         cut_grid(fused, thing, work.object_file(thing, "grid"))
 
@@ -72,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("command", choices=("fuse", "cut", "fit", "register", "report"))
     parser.add_argument("frames", type=Path)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--scene", default="kitchen", help="whose boxes of boxes.json")
+    parser.add_argument("--scene", choices=scene_names(), default="kitchen", help="whose boxes of boxes.json")
     parser.add_argument("--halves", nargs="+", choices=sorted(HALVES), default=sorted(HALVES, reverse=True))
     parser.add_argument("--maps", nargs="+", choices=MAPS, default=["fused"])
     parser.add_argument("--observations", nargs="+", choices=OBSERVATIONS, default=["frames"])
@@ -89,7 +92,8 @@ def _parser() -> argparse.ArgumentParser:
 def main() -> None:
     given = _parser().parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    recording, things = open_recording(given.frames), things_of(given.scene)
+    recording, scene = open_recording(given.frames), scene_of(given.scene)
+    things = scene.things
     if given.command == "report":
         print(tables([run for name in given.runs for run in json.loads((given.work / name).read_text())]))
         return
@@ -98,7 +102,7 @@ def main() -> None:
     for name in given.halves:
         work = Work(given.work, HALVES[name])
         if given.command == "fuse":
-            _fuse(recording, work)
+            _fuse(recording, work, scene.voxel_m)
         elif given.command == "cut":
             _cut(work, things)
         elif given.command == "fit":

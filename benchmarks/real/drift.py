@@ -10,13 +10,13 @@ import numpy as np
 import open3d
 from scipy.spatial import cKDTree
 
-from benchmarks.real.fusion import surface
+from benchmarks.real.fusion import surface, voxel_of
 from benchmarks.real.scenes import Thing
 
-_NEAR_M = 0.03
-"""Farther apart, points do not show the same surface: drift is 5 to 10 mm."""
-_REACH_M = 0.1
-"""Of the other map, so much round the box is looked at."""
+_NEAR = 3.0
+"""Voxels. Farther apart, points do not show the same surface: the kitchen's drift is half a voxel to a voxel."""
+_REACH = 10.0
+"""Voxels. Of the other map, so much round the box is looked at."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,15 @@ class Overlap:
 @cache
 def overlap(first: Path, second: Path, thing: Thing) -> Overlap:
     """Of two fused maps: point-to-plane ICP (Open3D) from where the poses say, of the surface in the thing's box."""
-    source, target = _cloud(first, thing, 0.0), _cloud(second, thing, _REACH_M)
+    voxel_m = voxel_of(second)
+    near_m = _NEAR * voxel_m
+    source, target = _cloud(first, thing, 0.0), _cloud(second, thing, _REACH * voxel_m)
     if len(target.points) == 0:
         return Overlap(0.0, 0.0)
     found = open3d.pipelines.registration.registration_icp(
         source,
         target,
-        _NEAR_M,
+        near_m,
         np.eye(4),
         open3d.pipelines.registration.TransformationEstimationPointToPlane(),
         open3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=50),
@@ -48,7 +50,7 @@ def overlap(first: Path, second: Path, thing: Thing) -> Overlap:
     target_tree = cKDTree(np.asarray(target.points))
     distances = target_tree.query(points)[0]
     drift = float(np.linalg.norm(moved - points, axis=1).max())
-    return Overlap(min(drift, _NEAR_M), float((distances < _NEAR_M).mean()))
+    return Overlap(min(drift, near_m), float((distances < near_m).mean()))
 
 
 def _cloud(fused: Path, thing: Thing, margin: float) -> open3d.geometry.PointCloud:

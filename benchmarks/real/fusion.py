@@ -14,20 +14,19 @@ from benchmarks.real.sequence import FARTHEST_M, Recording
 from regnf_core import SdfField
 from regnf_core.loading import open_field
 
-VOXEL_M = 0.01
 TRUNCATION_VOXELS = 8.0
 """Open3D's default."""
 _BLOCK, _BLOCKS = 16, 50_000
 
 
-def fuse(recording: Recording, frames: Iterable[int], path: Path) -> None:
+def fuse(recording: Recording, frames: Iterable[int], voxel_m: float, path: Path) -> None:
     """Write the fused map to ``path`` (.npz) and its surface beside it (.ply)."""
     core = open3d.core
     grid = open3d.t.geometry.VoxelBlockGrid(
         ("tsdf", "weight"),
         (core.float32, core.float32),
         (core.SizeVector(1), core.SizeVector(1)),
-        VOXEL_M,
+        voxel_m,
         _BLOCK,
         _BLOCKS,
     )
@@ -43,7 +42,13 @@ def fuse(recording: Recording, frames: Iterable[int], path: Path) -> None:
 
 def open_fused(path: Path) -> SdfField:
     """The map's field, world frame. Its truncation is said: where there is noise, the values do not always tell it."""
-    return open_field(path, {"truncation": TRUNCATION_VOXELS * VOXEL_M})
+    return open_field(path, {"truncation": TRUNCATION_VOXELS * voxel_of(path)})
+
+
+def voxel_of(path: Path) -> float:
+    """From node to node of a fused map, meters."""
+    with np.load(path) as arrays:
+        return float(arrays["voxel_size"].item())
 
 
 @cache

@@ -22,8 +22,8 @@ MAPS = ("fused", "fit")
 OBSERVATIONS = ("frames", "file", "none")
 """Made from the map's frames; what the map's own file tells; none at all."""
 _VOXELS = 512
-_EVERY = 6
-"""Every so many frames of the half tell what was observed."""
+_SEEING = 42
+"""Frames of the half, about, that tell what was observed."""
 _MARGIN_M = 0.05
 _EXTENT = 3.8
 """Of a room that is fitted, field units: the hash grid's cube has 4."""
@@ -66,7 +66,8 @@ def fit_frame(fused: Path) -> Sim3:
 
 def keep_observation(recording: Recording, frames: range, files: MapFiles) -> None:
     """Write what the half's frames observed."""
-    images = posed_images(recording, frames[::_EVERY], Sim3.identity(), bounds_of(files.fused), stride=2)
+    every = max(1, round(len(frames) / _SEEING))
+    images = posed_images(recording, frames[::every], Sim3.identity(), bounds_of(files.fused), stride=2)
     assert images.depths is not None
     spread = depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
     seen = observe(images, _VOXELS, spread)

@@ -8,15 +8,22 @@ import numpy as np
 import open3d
 import torch
 
-from benchmarks.real.fusion import VOXEL_M, open_fused, surface
+from benchmarks.real.fusion import open_fused, surface, voxel_of
 from benchmarks.real.scenes import Thing
 from benchmarks.real.sequence import Floats
 from regnf_core.fields.base import SdfField
 from regnf_core.loading import open_field
 
 KINDS = ("points", "grid", "fit")
-_GRID_STEP_M = VOXEL_M / 2.0
 _LEAST_POINTS = 100
+_MOST_STEPS = 200
+"""Along the longest edge of a grid that is cut out."""
+
+
+def is_shown(fused: Path, thing: Thing) -> bool:
+    """Whether a fused map has surface enough in the thing's box."""
+    vertices = surface(fused)[0] @ thing.T_room_world.rotation.numpy().T
+    return int(_within(vertices, thing).sum()) >= _LEAST_POINTS
 
 
 def cut_points(fused: Path, thing: Thing, path: Path) -> None:
@@ -24,24 +31,32 @@ def cut_points(fused: Path, thing: Thing, path: Path) -> None:
     vertices, normals = surface(fused)
     rotation = thing.T_room_world.rotation.numpy()
     vertices, normals = vertices @ rotation.T, normals @ rotation.T
-    inside = ((vertices > thing.low) & (vertices < thing.high)).all(axis=1)
-    if inside.sum() < _LEAST_POINTS:
-        raise ValueError(f"{thing.name}: hardly any surface in its box")
+    inside = _within(vertices, thing)
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(vertices[inside]))
     cloud.normals = open3d.utility.Vector3dVector(normals[inside])
     open3d.io.write_point_cloud(path, cloud)
 
 
+def _within(points: Floats, thing: Thing) -> np.typing.NDArray[np.bool_]:
+    """(N,) of points (N, 3), room frame."""
+    inside: np.typing.NDArray[np.bool_] = ((points > thing.low) & (points < thing.high)).all(axis=1)
+    return inside
+
+
 def cut_grid(fused: Path, thing: Thing, path: Path) -> None:
-    """Write the fused distances in the box on a grid of half their spacing, room frame, as .npz with weights."""
+    """Write the fused distances in the box, room frame, as .npz with weights.
+
+    The grid's step is half the map's voxel; large things have a coarser one.
+    """
     scene = open_fused(fused)
-    counts = np.ceil((thing.high - thing.low) / _GRID_STEP_M).astype(int) + 1
-    axes = [thing.low[k] + _GRID_STEP_M * np.arange(counts[k]) for k in range(3)]
+    step = max(voxel_of(fused) / 2.0, float((thing.high - thing.low).max()) / _MOST_STEPS)
+    counts = np.ceil((thing.high - thing.low) / step).astype(int) + 1
+    axes = [thing.low[k] + step * np.arange(counts[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     world = torch.from_numpy(nodes @ thing.T_room_world.rotation.numpy())
     values = scene.signed_distance(world.float()).numpy().reshape(counts)
     weights = seen_voxels(fused, world.numpy()).reshape(counts)
-    np.savez(path, sdf=values, weight=weights, origin=thing.low, spacing=np.full(3, _GRID_STEP_M))
+    np.savez(path, sdf=values, weight=weights, origin=thing.low, spacing=np.full(3, step))
 
 
 def seen_voxels(fused: Path, points: Floats) -> np.typing.NDArray[np.float32]:

@@ -34,11 +34,25 @@ class Thing:
         return OrientedBox(T.apply(center)[0], torch.from_numpy(self.high - self.low), T.rotation, self.name)
 
 
-def things_of(scene: str) -> tuple[Thing, ...]:
-    """The boxes of a scene, from boxes.json: they were found by eye in pictures of the fused room."""
-    entry = json.loads(_FILE.read_text())[scene]
+@dataclass(frozen=True, eq=False)
+class RecordedScene:
+    """voxel_m: from node to node of its maps · things: those that are cut out."""
+
+    voxel_m: float
+    things: tuple[Thing, ...]
+
+
+def scene_of(name: str) -> RecordedScene:
+    """From boxes.json. The boxes were found by eye in pictures of the fused room."""
+    entry = json.loads(_FILE.read_text())[name]
     T = room_frame(np.array(entry["up"]))
-    return tuple(Thing(name, np.array(box[0]), np.array(box[1]), T) for name, box in entry["boxes"].items())
+    things = tuple(Thing(each, np.array(box[0]), np.array(box[1]), T) for each, box in entry["boxes"].items())
+    return RecordedScene(float(entry["voxel_m"]), things)
+
+
+def scene_names() -> tuple[str, ...]:
+    """Of the scenes whose boxes are known."""
+    return tuple(json.loads(_FILE.read_text()))
 
 
 def room_frame(up: Floats) -> Sim3:

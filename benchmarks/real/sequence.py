@@ -1,7 +1,7 @@
 """A folder of recorded RGB-D frames with poses, as KinectFusion's example data lie in public repositories.
 
-``camera-intrinsics.txt`` (3 x 3) and, there or in the folder ``rgbd-frames``, ``frame-NNNNNN.depth.png`` (millimeters),
-``.color.jpg`` or ``.color.png`` and ``.pose.txt`` (camera to world).
+``camera-intrinsics.txt`` or ``intrinsics.K.txt`` (3 x 3) and, there or in the folder ``rgbd-frames``,
+``frame-NNNNNN.depth.png`` (millimeters), ``.color.jpg`` or ``.color.png`` and ``.pose.txt`` (camera to world).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 FARTHEST_M = 4.0
 """Depths beyond are left out: a structured-light camera's are mostly noise there."""
+_INTRINSICS = ("camera-intrinsics.txt", "intrinsics.K.txt")
 _PIXEL_CENTER = 0.5
 """The files count pixels from their centers, PosedImages from their corners."""
 _MILLIMETERS = 1000.0
@@ -65,7 +66,8 @@ def open_recording(folder: Path) -> Recording:
     names = tuple(sorted(path.name.removesuffix(".depth.png") for path in frames.glob("*.depth.png")))
     if not names:
         raise FileNotFoundError(f"{folder}: no *.depth.png; see docs/real-data.md for what to put there")
-    return Recording(frames, names, np.loadtxt(folder / "camera-intrinsics.txt"))
+    intrinsics = next((path for name in _INTRINSICS if (path := folder / name).exists()), folder / _INTRINSICS[0])
+    return Recording(frames, names, np.loadtxt(intrinsics))
 
 
 def posed_images(

@@ -10,11 +10,11 @@ from PIL import Image
 from benchmarks.real.cases import Work, make_case, object_field
 from benchmarks.real.drift import overlap
 from benchmarks.real.fits import seeing
-from benchmarks.real.fusion import fuse, open_fused, surface
+from benchmarks.real.fusion import fuse, open_fused, surface, voxel_of
 from benchmarks.real.halves import APART, INTERLEAVED
 from benchmarks.real.maps import keep_observation, open_map
 from benchmarks.real.objects import cut_grid, cut_points
-from benchmarks.real.scenes import Thing, placement, room_frame, things_of
+from benchmarks.real.scenes import Thing, placement, room_frame, scene_names, scene_of
 from benchmarks.real.sequence import open_recording, posed_images
 from regnf_core import Sim3
 from regnf_core.fields.observation import observation_of
@@ -24,7 +24,8 @@ BALL, RADIUS, WALL = np.array([0.0, 0.0, 1.5]), 0.2, 2.0
 SMALL, SMALL_RADIUS = np.array([0.2, 0.15, 1.5]), 0.1
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 59.5], [0.0, 0.0, 1.0]])
 SHAPE = (120, 160)
-HALF_VOXEL = 0.005
+VOXEL_M = 0.01
+HALF_VOXEL = VOXEL_M / 2.0
 
 
 def depth_at(position):
@@ -66,7 +67,7 @@ def thing():
 def work(tmp_path_factory, recording, thing):
     work = Work(tmp_path_factory.mktemp("work"), INTERLEAVED)
     for half, frames in zip("AB", work.halves.frames(len(recording)), strict=True):
-        fuse(recording, frames, work.map_files(half).fused)
+        fuse(recording, frames, VOXEL_M, work.map_files(half).fused)
     cut_points(work.map_files("A").fused, thing, work.object_file(thing, "points"))
     cut_grid(work.map_files("A").fused, thing, work.object_file(thing, "grid"))
     return work
@@ -141,9 +142,37 @@ def test_frames_that_see_a_thing(recording, thing):
     assert seeing(recording, range(16), away, 5) == []
 
 
-def test_the_kitchens_boxes():
-    things = things_of("kitchen")
-    assert len(things) == 8
-    assert all((thing.low < thing.high).all() for thing in things)
-    box = things[0].box()
-    np.testing.assert_allclose(json.loads(json.dumps(box.size.tolist())), things[0].high - things[0].low)
+@pytest.mark.parametrize(("scene", "count"), [("kitchen", 8), ("shelf", 6)])
+def test_boxes_of_the_recorded_scenes(scene, count):
+    found = scene_of(scene)
+    assert len(found.things) == count
+    for thing in found.things:
+        assert (thing.high - thing.low > 10.0 * found.voxel_m).any(), thing.name
+        assert (thing.low < thing.high).all(), thing.name
+    box = found.things[0].box()
+    np.testing.assert_allclose(json.loads(json.dumps(box.size.tolist())), found.things[0].high - found.things[0].low)
+    assert scene in scene_names()
+
+
+def test_a_map_keeps_its_voxel_and_its_truncation(recording, tmp_path):
+    for voxel_m in (0.01, 0.02):
+        path = tmp_path / f"{voxel_m}.npz"
+        fuse(recording, range(0, 16, 4), voxel_m, path)
+        assert voxel_of(path) == pytest.approx(voxel_m)
+        # 5 voxels before the wall, beside both balls: within the truncation of 8, so the distance is told.
+        before = torch.tensor([[-0.3, -0.3, WALL - 5.0 * voxel_m]])
+        assert open_fused(path).signed_distance(before).item() == pytest.approx(5.0 * voxel_m, abs=0.5 * voxel_m)
+
+
+def test_intrinsics_by_their_other_name(recording, tmp_path):
+    for path in recording.folder.iterdir():
+        name = "intrinsics.K.txt" if path.name == "camera-intrinsics.txt" else path.name
+        (tmp_path / name).symlink_to(path)
+    np.testing.assert_array_equal(open_recording(tmp_path).intrinsics, K)
+
+
+def test_a_recording_without_intrinsics_names_the_file(recording, tmp_path):
+    for path in recording.folder.glob("frame-*"):
+        (tmp_path / path.name).symlink_to(path)
+    with pytest.raises(FileNotFoundError, match=r"camera-intrinsics\.txt"):
+        open_recording(tmp_path)
