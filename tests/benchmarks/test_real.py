@@ -7,13 +7,14 @@ import pytest
 import torch
 from PIL import Image
 
+from benchmarks.real import objects
 from benchmarks.real.cases import Work, make_case, object_field
 from benchmarks.real.drift import overlap
 from benchmarks.real.fits import seeing
 from benchmarks.real.fusion import fuse, open_fused, surface, voxel_of
 from benchmarks.real.halves import APART, INTERLEAVED
 from benchmarks.real.maps import keep_observation, open_map
-from benchmarks.real.objects import cut_grid, cut_points
+from benchmarks.real.objects import cut_grid, cut_points, is_shown
 from benchmarks.real.scenes import Thing, placement, room_frame, scene_names, scene_of
 from benchmarks.real.sequence import open_recording, posed_images
 from regnf_core import Sim3
@@ -140,6 +141,21 @@ def test_frames_that_see_a_thing(recording, thing):
     assert len(seeing(recording, range(16), thing, 5)) == 5
     away = Thing("nothing", thing.low + 10.0, thing.high + 10.0, thing.T_room_world)
     assert seeing(recording, range(16), away, 5) == []
+
+
+def test_a_thing_that_a_half_does_not_show_is_told(work, thing):
+    away = Thing("nothing", thing.low + 10.0, thing.high + 10.0, thing.T_room_world)
+    fused = work.map_files("A").fused
+    assert is_shown(fused, thing)
+    assert not is_shown(fused, away)
+
+
+def test_grids_of_large_things_have_a_coarser_step(work, thing, tmp_path, monkeypatch):
+    edge = float((thing.high - thing.low).max())
+    for most, step in ((200, HALF_VOXEL), (20, edge / 20)):
+        monkeypatch.setattr(objects, "_MOST_STEPS", most)
+        cut_grid(work.map_files("A").fused, thing, tmp_path / f"{most}.npz")
+        np.testing.assert_allclose(np.load(tmp_path / f"{most}.npz")["spacing"], step)
 
 
 @pytest.mark.parametrize(("scene", "count"), [("kitchen", 8), ("shelf", 6)])
