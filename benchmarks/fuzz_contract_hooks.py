@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import schemathesis
+import yaml
 from hypothesis import strategies as st
+
+from benchmarks.fuzz_contract_refusals import CHECKED_STATUSES, beyond_schemas
 
 _WORLD: dict[str, Any] = json.loads(Path(os.environ["REGNF_FUZZ_WORLD"]).read_text(encoding="utf-8"))
 _FILES: list[bytes] = [Path(name).read_bytes() for name in _WORLD["files"]]
@@ -24,68 +27,7 @@ _REAL_OF_FOUR = 3
 _MAX_WAIT_S = 1
 _LONGER_WAITS = frozenset(str(seconds) for seconds in range(2, 31))
 _NOT_THERE_YET = "EnsureResourceAvailability"
-
-BEYOND_SCHEMAS: dict[str, frozenset[str]] = {
-    "POST /register": frozenset(
-        {
-            "FIELD_NOT_FOUND",  # which fields there are
-            "FIELD_REJECTED",
-            "FIELD_NOT_RECOGNIZED",  # what a file's bytes say
-            "FIELD_DESCRIPTION_DIFFERS",
-            "INVALID_DETECTION",  # min below max, a quaternion that is not zero
-            "DETECTION_OUTSIDE_SCENE",
-            "INVALID_TRANSFORM",  # a matrix with a rotation in it
-            "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
-            "LIBRARY_SEARCH_UNSUPPORTED",
-            "INVALID_REQUEST",
-            "INVALID_DESCRIPTION",
-            "WEBHOOK_NOT_ALLOWED",  # the operator's list
-            "IDEMPOTENCY_KEY_REUSED",  # what was asked before
-            "QUOTA_ACTIVE_JOBS",
-            "QUOTA_WEBHOOKS",
-        }
-    ),
-    "POST /render": frozenset(
-        {
-            "FIELD_NOT_FOUND",
-            "FIELD_REJECTED",
-            "INVALID_DETECTION",
-            "INVALID_TRANSFORM",
-            "CAMERA_INVALID",  # a camera at its own target, a transforms.json that is none
-            "EDIT_INVALID",  # which jobs there are
-            "EDIT_POSE_REJECTED",
-            "INVALID_REQUEST",  # members that exclude one another
-            "RENDER_TOO_LARGE",  # products of members
-            "WEBHOOK_NOT_ALLOWED",
-            "IDEMPOTENCY_KEY_REUSED",
-            "QUOTA_ACTIVE_JOBS",
-            "QUOTA_WEBHOOKS",
-        }
-    ),
-    "POST /fields": frozenset(
-        {
-            "FIELD_NOT_RECOGNIZED",
-            "DIGEST_MISMATCH",
-            "FIELD_DESCRIPTION_DIFFERS",
-            "INVALID_DESCRIPTION",
-            "MISSING_PART",  # `file` and `upload` exclude one another
-        }
-    ),
-    "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
-    "PUT /fields/{sha256}": frozenset(
-        {
-            "FIELD_NOT_RECOGNIZED",
-            "DIGEST_MISMATCH",
-            "FIELD_DESCRIPTION_DIFFERS",
-            "INVALID_HEADER",  # Content-Range against the bytes of the body
-        }
-    ),
-    "GET /fields": frozenset({"INVALID_PAGE_TOKEN"}),
-    "GET /jobs": frozenset({"INVALID_PAGE_TOKEN"}),
-    "GET /batches": frozenset({"INVALID_PAGE_TOKEN"}),
-    "GET /library": frozenset({"INVALID_PAGE_TOKEN"}),
-}
-"""Refusals of requests that fit every schema: they depend on what the service holds, or on sums over members."""
+_CONTRACT = yaml.safe_load((Path(__file__).resolve().parents[1] / "openapi.yaml").read_text(encoding="utf-8"))
 
 schemathesis.openapi.media_type("application/octet-stream", _FIELD_FILES)
 schemathesis.openapi.format("binary", _FIELD_FILES)
@@ -119,13 +61,12 @@ def _keeps_to_the_contract(case: Any) -> bool:
 @schemathesis.check
 def refusals_beyond_schemas(ctx: Any, response: Any, case: Any) -> None:  # noqa: ARG001 -- the library's signature
     """A request that fits every schema is refused for a reason that no schema can hold, or not at all."""
-    if response.status_code not in (400, 415, 422) or not _keeps_to_the_contract(case):
+    if response.status_code not in CHECKED_STATUSES or not _keeps_to_the_contract(case):
         return
     if case.method == "HEAD" or case.operation.label.startswith("GET /jobs/{id}/"):
         return  # no body, or the job's own problem
     reason = response.json()["reason"]
-    allowed = BEYOND_SCHEMAS.get(case.operation.label, frozenset())
-    if reason not in allowed:
+    if reason not in beyond_schemas(_CONTRACT, case.operation.label):
         raise AssertionError(f"{case.operation.label} refused with {reason} what fits its schemas")
 
 

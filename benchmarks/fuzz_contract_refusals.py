@@ -1,0 +1,65 @@
+"""Which refusals a request that fits every schema may meet: those that no schema can say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+CHECKED_STATUSES = frozenset({400, 415, 422})
+"""Where a reason is looked at. Other statuses, such as 404 and 409, say by themselves that the state is meant."""
+OF_STATE = frozenset(
+    {
+        "FIELD_REJECTED",  # which fields there are
+        "FIELD_NOT_RECOGNIZED",  # what a file's bytes say
+        "DIGEST_MISMATCH",
+        "DETECTION_OUTSIDE_SCENE",  # what a field is of
+        "LIBRARY_EMPTY",  # which entries there are
+        "LIBRARY_TOO_LARGE",
+        "EDIT_POSE_REJECTED",  # which jobs there are
+        "IDEMPOTENCY_KEY_REUSED",  # what was asked before
+        "INVALID_PAGE_TOKEN",  # which pages there are
+        "WEBHOOK_NOT_ALLOWED",  # the operator's settings
+        "OPTIONS_TOO_COSTLY",
+        "RENDER_TOO_LARGE",
+    }
+)
+"""Reasons that depend on what the service holds: allowed wherever the contract documents them."""
+
+OF_MEMBERS: Mapping[str, frozenset[str]] = {
+    "POST /register": frozenset(
+        {
+            "INVALID_DETECTION",  # min below max, a quaternion that is not zero
+            "INVALID_TRANSFORM",  # a matrix with a rotation in it
+            "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
+            "LIBRARY_SEARCH_UNSUPPORTED",
+            "INVALID_REQUEST",
+            "INVALID_DESCRIPTION",
+        }
+    ),
+    "POST /render": frozenset(
+        {
+            "INVALID_DETECTION",
+            "INVALID_TRANSFORM",
+            "CAMERA_INVALID",  # a camera at its own target, a transforms.json that is none
+            "EDIT_INVALID",
+            "INVALID_REQUEST",  # members that exclude one another
+        }
+    ),
+    "POST /fields": frozenset({"INVALID_DESCRIPTION", "MISSING_PART"}),  # `file` and `upload` exclude one another
+    "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
+    "PUT /fields/{sha256}": frozenset({"INVALID_HEADER"}),  # Content-Range against the bytes of the body
+}
+"""Reasons that depend on several members or on their numbers together, by operation."""
+
+
+def documented(contract: Mapping[str, Any], operation: str) -> frozenset[str]:
+    """Every reason that the contract's responses name for an operation, such as ``POST /fields``."""
+    method, path = operation.split(" ", 1)
+    responses = contract["paths"][path][method.lower()]["responses"]
+    named = [response.get("description", "").split("`")[1::2] for response in responses.values()]
+    return frozenset(reason for reasons in named for reason in reasons)
+
+
+def beyond_schemas(contract: Mapping[str, Any], operation: str) -> frozenset[str]:
+    """The reasons for which the operation may refuse what fits its schemas."""
+    return documented(contract, operation) & OF_STATE | OF_MEMBERS.get(operation, frozenset())
