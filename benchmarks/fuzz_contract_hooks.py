@@ -18,7 +18,7 @@ import schemathesis
 import yaml
 from hypothesis import strategies as st
 
-from benchmarks.fuzz_contract_refusals import CHECKED_STATUSES, beyond_schemas
+from benchmarks.fuzz_contract_refusals import CHECKED_STATUSES, beyond_schemas, headers_fit
 
 _WORLD: dict[str, Any] = json.loads(Path(os.environ["REGNF_FUZZ_WORLD"]).read_text(encoding="utf-8"))
 _FILES: list[bytes] = [Path(name).read_bytes() for name in _WORLD["files"]]
@@ -54,8 +54,10 @@ def filter_failure(context: Any, failure: Any, case: Any, response: Any) -> bool
 
 def _keeps_to_the_contract(case: Any) -> bool:
     """Whether every part of the request was meant to: a case of which one part was not is called positive too."""
-    meta = case.meta
-    return meta is not None and all(part.mode.is_positive for part in (meta.generation, *meta.components.values()))
+    meta, label = case.meta, case.operation.label
+    if meta is None or not all(part.mode.is_positive for part in (meta.generation, *meta.components.values())):
+        return False
+    return headers_fit(_CONTRACT, label, case.headers or {})
 
 
 @schemathesis.check

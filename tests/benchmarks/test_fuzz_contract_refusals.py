@@ -10,7 +10,14 @@ from typing import Any
 import pytest
 import yaml
 
-from benchmarks.fuzz_contract_refusals import CHECKED_STATUSES, OF_MEMBERS, OF_STATE, beyond_schemas, documented
+from benchmarks.fuzz_contract_refusals import (
+    CHECKED_STATUSES,
+    OF_MEMBERS,
+    OF_STATE,
+    beyond_schemas,
+    documented,
+    headers_fit,
+)
 from regnf_state.reasons import REASONS
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -54,3 +61,17 @@ def test_a_rejected_field_may_be_met_wherever_a_field_is_named_and_a_malformed_b
     naming = {operation for operation in _OPERATIONS if "FIELD_REJECTED" in beyond_schemas(_CONTRACT, operation)}
     assert naming == {"POST /library", "POST /register", "POST /render"}
     assert not any("MALFORMED_JSON" in beyond_schemas(_CONTRACT, operation) for operation in _OPERATIONS)
+
+
+@pytest.mark.parametrize(
+    ("headers", "fit"),
+    [
+        ({}, True),
+        ({"Content-Range": "bytes 0-3/8", "Content-Digest": f"sha-256=:{'A' * 43}=:"}, True),
+        ({"content-range": "bytes */8", "x-other": ""}, True),
+        ({"Content-Range": ""}, False),
+        ({"content-digest": "", "Content-Range": "bytes */8"}, False),
+    ],
+)
+def test_headers_fit_where_each_has_its_pattern(headers: dict[str, str], fit: bool) -> None:
+    assert headers_fit(_CONTRACT, "PUT /fields/{sha256}", headers) is fit
