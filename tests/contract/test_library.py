@@ -62,6 +62,14 @@ def test_the_detected_symmetry_holds_until_another_is_said(world: World) -> None
     assert (taken_back["symmetry"], taken_back["symmetry_source"]) == (FOUND, "detected")
 
 
+def test_a_symmetry_may_be_said_without_what_has_a_default(world: World) -> None:
+    add(world, world.ready_field("chair"))
+    whole = {"order": 4, "axis": None, "continuous": False}
+    assert world.client.patch("/library/office chair", json={"symmetry": {"order": 4}}).json()["symmetry"] == whole
+    upright = world.client.patch("/library/office chair", json={"symmetry": {"order": 2, "axis": [0, 0, 3]}}).json()
+    assert upright["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": False}
+
+
 def test_a_worker_is_asked_for_the_model_once(world: World) -> None:
     chair, waiting = world.ready_field("chair"), world.ready_field("table")
     world.queue.imports.clear()

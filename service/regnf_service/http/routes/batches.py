@@ -35,6 +35,8 @@ from regnf_state.blobs.base import BlobWriter
 router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
 _LINES_AT_ONCE = 50
+_MOST_LINES = 2**31 - 1
+"""More than any batch has; what a query may ask for at most."""
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
 
 
@@ -176,8 +178,8 @@ async def batch_results(
     id: str,  # noqa: A002
     services: ServicesDep,
     caller: CallerDep,
-    after: Annotated[int, Query(ge=0, description="`number` of the last result that you have.")] = 0,
-    limit: Annotated[int | None, Query(ge=1, description="How many lines at most.")] = None,
+    after: Annotated[int, Query(ge=0, le=_MOST_LINES, description="`number` of the last result that you have.")] = 0,
+    limit: Annotated[int | None, Query(ge=1, le=_MOST_LINES, description="How many lines at most.")] = None,
     status: Annotated[ResultStatus | None, Query(description="Only pairs that have ended so.")] = None,
     wait: WaitQuery = 0,
 ) -> Response:

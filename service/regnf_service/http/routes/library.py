@@ -137,7 +137,7 @@ async def patch_library_entry(
 
 
 def _changed(services: Services, caller: str, name: str, change: EntryChange) -> LibraryEntry:
-    said = change.model_dump(exclude_unset=True)
+    said = change.model_dump(include=change.model_fields_set)  # a symmetry that is said is said whole
     if said.get("name", name) is None:
         del said["name"]
     notes = EntryNotes.checked(**(find_entry(services, caller, name).notes.to_dict() | said))
