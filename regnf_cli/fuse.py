@@ -23,7 +23,9 @@ Voxel = Annotated[
 ]
 Truncation = Annotated[
     float | None,
-    typer.Option(min=1.0, help="Voxels; without it 4, or 3 standard deviations of the depths from image to image."),
+    typer.Option(
+        min=1.0, max=1000.0, help="Voxels; without it 4, or 3 standard deviations of the depths from image to image."
+    ),
 ]
 
 
@@ -36,8 +38,8 @@ def fuse(
     """
     require("engine")
     check_field_to_write(output, label)
-    if voxel is not None and not 0.0 < voxel < float("inf"):
-        raise InvalidOptionsError("the voxel's edge must be positive")
+    if voxel is not None and not 1e-9 <= voxel <= 1e6:
+        raise InvalidOptionsError("the voxel's edge must lie between 1e-9 and 1e6")
     from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fusion import FusionOptions, fuse_images
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -88,8 +87,8 @@ def _check(
         raise InvalidOptionsError("--meshes and --instance go with a layout (.json)")
     if layout and (trajectory is Trajectory.SINGLE) != (instance is not None):
         raise InvalidOptionsError("a layout's single view needs --instance, and nothing else does")
-    if units_per_meter is not None and not 0.0 < units_per_meter < math.inf:
-        raise InvalidOptionsError("the units per meter must be positive")
+    if units_per_meter is not None and not 1e-6 <= units_per_meter <= 1e6:
+        raise InvalidOptionsError("the units per meter must lie between 1e-6 and 1e6")
 
 
 def _rendered(

@@ -25,7 +25,8 @@ def test_a_dataset_becomes_a_map(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("output", "more"),
     [("map.ply", []), ("absent/map.safetensors", []), ("map.safetensors", ["--voxel", "0"]),
-     ("map.safetensors", ["--voxel", "nan"]), ("map.safetensors", ["--label", 201 * "x"])],
+     ("map.safetensors", ["--voxel", "nan"]), ("map.safetensors", ["--voxel", "1e308"]),
+     ("map.safetensors", ["--label", 201 * "x"])],
 )  # fmt: skip
 def test_options_that_cannot_be_meant_are_refused(output: str, more: list[str], run: Run, tmp_path: Path) -> None:
     write_dataset(scenes.images(count=2), tmp_path / "images")

@@ -47,6 +47,7 @@ def test_a_layout_becomes_a_dataset(run: Run, tmp_path: Path) -> None:
     [
         ("chest.ply", ["--units-per-meter", "0"], "INVALID_OPTIONS"),
         ("chest.ply", ["--units-per-meter", "nan"], "INVALID_OPTIONS"),
+        ("chest.ply", ["--units-per-meter", "1e308"], "INVALID_OPTIONS"),
         ("chest.ply", ["--instance", "a"], "INVALID_OPTIONS"),
         ("chest.ply", ["--meshes", "."], "INVALID_OPTIONS"),
         ("chest.ply", ["--trajectory", "single", "--frames", "2"], "DATASET_FRAMES_INVALID"),
