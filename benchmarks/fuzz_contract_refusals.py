@@ -31,6 +31,7 @@ OF_MEMBERS: Mapping[str, frozenset[str]] = {
         {
             "INVALID_DETECTION",  # min below max, a quaternion that is not zero
             "INVALID_TRANSFORM",  # a matrix with a rotation in it
+            "INVALID_OPTIONS",  # a least scale above the largest
             "INITIAL_TRANSFORM_UNSUPPORTED",  # members that exclude one another
             "LIBRARY_SEARCH_UNSUPPORTED",
             "INVALID_REQUEST",
