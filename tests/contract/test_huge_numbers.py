@@ -117,3 +117,15 @@ def numbers_of(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[Any, .
             yield from numbers_of(held, (*place, part))
     elif isinstance(value, int | float) and not isinstance(value, bool):
         yield place
+
+
+@pytest.mark.parametrize("value", [value for value in HUGE if isinstance(value, int)])
+def test_in_a_header(world: World, value: int) -> None:
+    job = world.client.post("/register", json=world.valid_request()).json()["id"]
+    world.succeed(job, {"result.glb": bytes(100)})
+    artifact, put = f"/jobs/{job}/artifacts/result.glb", f"/fields/{sha256(field_bytes('other'))}"
+    for span in (f"bytes={value}-", f"bytes=-{value}", f"bytes=0-{value}", f"bytes={value}-{value}"):
+        assert world.client.get(artifact, headers={"Range": span}).status_code < 500, span
+    for span in (f"bytes 0-{value}/{value}", f"bytes */{value}", f"bytes {value}-{value}/10"):
+        assert world.client.put(put, content=b"12", headers={"Content-Range": span}).status_code < 500, span
+    assert world.client.get(f"/jobs/{job}/events", headers={"Last-Event-ID": str(value)}).status_code < 500
