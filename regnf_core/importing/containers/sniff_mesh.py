@@ -56,8 +56,8 @@ def _is_xyz(head: bytes) -> bool:
     lines = head.splitlines()
     if len(head) >= _HEAD and not head.endswith(b"\n"):
         lines = lines[:-1]
-    said = [line.replace(b",", b" ").replace(b";", b" ").split() for line in lines if line.strip()]
-    said = [words for words in said if not words[0].startswith((b"#", b"//"))]
+    said = [line.replace(b",", b" ").replace(b";", b" ").split() for line in lines]
+    said = [words for words in said if words and not words[0].startswith((b"#", b"//"))]
     if said and len(said[0]) == 1 and said[0][0].isdigit():
         said = said[1:]
     return bool(said) and len(said[0]) >= 3 and all(len(w) == len(said[0]) and all(map(_is_number, w)) for w in said)

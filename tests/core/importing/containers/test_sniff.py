@@ -70,6 +70,8 @@ def test_a_zip_cut_short_is_still_a_torch_archive() -> None:
         (b"VERSION 3\n", "FORMAT_NOT_RECOGNIZED"),
         (b"1 2\n3 4\n", "FORMAT_NOT_RECOGNIZED"),
         (b"1 2 3\n4 5\n", "FORMAT_NOT_RECOGNIZED"),
+        (b";", "FORMAT_NOT_RECOGNIZED"),
+        (b",;\n,\n", "FORMAT_NOT_RECOGNIZED"),
         (b"v is for vertex", "FORMAT_NOT_RECOGNIZED"),
         (b"# a list of things\nv 1 2 3\x00", "FORMAT_NOT_RECOGNIZED"),
         (bytes(80) + b"\x08\0\0\0" + bytes(428), "FORMAT_NOT_RECOGNIZED"),  # an STL file's facets have corners
@@ -100,6 +102,17 @@ def test_everything_else_is_named_none_and_explained(head: bytes, reason: str) -
 )
 def test_files_of_others_are_told_what_they_are(head: bytes, words: str) -> None:
     assert words in explain_refusal(head)[1]
+
+
+def test_a_line_of_separators_says_nothing() -> None:
+    assert sniff_format(b"0,0,1\n;\n0;1;0\n,\n") == "xyz"
+
+
+def test_every_file_of_one_or_two_bytes_is_looked_at() -> None:
+    for first in range(256):
+        for head in (bytes([first]), *(bytes([first, second]) for second in range(256))):
+            if sniff_format(head) is None:
+                assert explain_refusal(head)[0], head
 
 
 def test_sniffing_loads_nothing_heavy() -> None:
