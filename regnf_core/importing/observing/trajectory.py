@@ -93,11 +93,12 @@ def trajectory_of(
 
 def _require_rigid(name: str, poses: Array) -> None:
     axes = poses[:, :3, :3]
-    off = np.abs(axes.transpose(0, 2, 1) @ axes - np.eye(3)).max(axis=(1, 2))
-    wrong = (off > _NOT_RIGID) | (np.linalg.det(axes) <= 0) | (np.abs(poses[:, :3, 3]).max(axis=1) > _FARTHEST)
-    wrong |= np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1) > 1e-6
-    if wrong.any():
-        raise malformed(f"{name}: pose {int(np.flatnonzero(wrong)[0])} is no rotation and place")
+    with np.errstate(all="ignore"):  # numbers near the largest ones overflow, and nothing compares with NaN
+        off = np.abs(axes.transpose(0, 2, 1) @ axes - np.eye(3)).max(axis=(1, 2))
+        sound = (off <= _NOT_RIGID) & (np.linalg.det(axes) > 0) & (np.abs(poses[:, :3, 3]).max(axis=1) <= _FARTHEST)
+        sound &= np.abs(poses[:, 3] - (0.0, 0.0, 0.0, 1.0)).max(axis=1) <= 1e-6
+    if not sound.all():
+        raise malformed(f"{name}: pose {int(np.flatnonzero(~sound)[0])} is no rotation and place")
 
 
 def malformed(message: str) -> FieldFormatError:

@@ -26,8 +26,8 @@ def read_tum(name: str, data: bytes | memoryview) -> Array | None:
     if not rows or any(len(row) != _TUM for row in rows):
         return None
     values = np.array(rows, np.float64)
-    length = np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
     with np.errstate(all="ignore"):
+        length = np.linalg.norm(values[:, 4:], axis=1, keepdims=True)
         x, y, z, w = (values[:, 4:] / length).T
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, 3] = values[:, 1:4]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from regnf_core.importing.settings.plain import MAX_DEPTH, decoded, malformed, too_large
+from regnf_core.importing.settings.plain import MAX_DEPTH, MAX_NUMBER_CHARACTERS, decoded, malformed, too_large
 
 MAX_BYTES = 8 << 20
 MAX_VALUES = 400_000
@@ -20,7 +20,7 @@ def read_json(name: str, data: bytes | memoryview) -> Any:
     if text.count("[") + text.count("{") > MAX_DEPTH and _depth(text) > MAX_DEPTH:
         raise too_large(f"{name} is nested more than {MAX_DEPTH} deep")
     try:
-        return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant)
+        return json.loads(text, object_pairs_hook=_object, parse_constant=_no_constant, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise malformed(f"{name} is no sound JSON") from error
 
@@ -52,3 +52,10 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _no_constant(word: str) -> float:
     raise ValueError(f"{word} is not JSON")
+
+
+def _whole(digits: str) -> int:
+    """No float is as large as an int of some hundred digits."""
+    if len(digits) > MAX_NUMBER_CHARACTERS:
+        raise ValueError("a number of too many digits")
+    return int(digits)

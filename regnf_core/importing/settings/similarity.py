@@ -32,6 +32,8 @@ def is_similarity(rows: Sequence[Sequence[float]] | np.ndarray) -> bool:
     scale = np.cbrt(np.linalg.det(linear))
     if not (np.isfinite(matrix).all() and 1e-9 < scale < 1e9 and tuple(matrix[3]) == (0.0, 0.0, 0.0, 1.0)):
         return False
+    if np.abs(linear).max() > 2.0 * scale:  # and its square may be more than a float can be
+        return False
     return bool(np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=_TOLERANCE * scale**2))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -196,6 +197,31 @@ def test_what_is_refused(files: list[SettingsFile], reason: str) -> None:
     with pytest.raises(FieldFormatError) as raised:
         read_trajectory(files, NOTHING)
     assert raised.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    "written", ["1" + "0" * 309, "1e309", "-1e309", "1e308", "5e-324", "1" * 17, "null", "true", "[]"]
+)
+@pytest.mark.parametrize("name", ["transforms.json", "meta_data.json", "groundtruth.txt"])
+def test_each_number_in_turn_is_an_extreme_one(name: str, written: str) -> None:
+    contents = {"transforms.json": transforms(applied_transform=np.eye(4)[:3].tolist()), "meta_data.json": meta_data()}
+    text = json.dumps(contents[name]) if name in contents else tum()
+    for number in re.finditer(r"-?[0-9.]+(e-?[0-9]+)?(?=[,\] }\n])", text):
+        changed = text[: number.start()] + written + text[number.end() :]
+        found = _read_or_refused([file(name, changed)], SAID if name.endswith("txt") else NOTHING)
+        if isinstance(found, Trajectory):
+            assert np.abs(found.poses[:, :3, :3]).max() < 1.1, number
+            assert np.isfinite(np.c_[found.focal, found.middle, found.aspect]).all(), number
+        else:
+            assert found.startswith("CAMERAS_"), number
+
+
+def _read_or_refused(files: list[SettingsFile], said: CamerasDescription) -> Trajectory | str:
+    """What was read, or the reason why nothing was."""
+    try:
+        return read_trajectory(files, said)
+    except FieldFormatError as error:
+        return error.reason
 
 
 def test_a_quaternion_of_zeros_is_no_pose() -> None:

@@ -181,6 +181,7 @@ def test_hocon_that_is_refused(text: str, reason: str) -> None:
         (b'{"a": NaN}', "SETTINGS_MALFORMED"),
         (b'{"a": {"b": 1, "b": 1}}', "SETTINGS_MALFORMED"),
         (b"9" * 5000, "SETTINGS_MALFORMED"),
+        (b'{"a": 1' + b"0" * 309 + b"}", "SETTINGS_MALFORMED"),
         (b"\xff", "SETTINGS_MALFORMED"),
         (b"[" * 200 + b"]" * 200, "SETTINGS_TOO_LARGE"),
         (b"[" + b"1," * 500_000 + b"1]", "SETTINGS_TOO_LARGE"),
