@@ -70,7 +70,7 @@ def fuse_images(
     rough = output.with_name(f"{output.stem}.part.safetensors")
     try:
         fused = write_map(images, grid, rough, progress)
-        attach_observation(rough, fused, options.observation_voxels)
+        attach_observation(rough, fused, options.observation_voxels, prepared.spread)  # ``fused`` is too little of them
         _describe(rough, label, source or {})
         error = _error(rough, rays)
         rough.replace(output)

@@ -31,7 +31,8 @@ _PIXELS = 1.2
 _AT_ONCE = 1 << 17
 """Voxels that are looked up in an image at once: what is in use stays in the processor's cache."""
 _CHECKED, _NEAR, _AGREEING = 2000, 2.0, 0.6
-"""So many voxels with surface are looked up in a field; so many of them must be within so many voxels of its own."""
+"""So many voxels with surface are looked up in a field; this share of them must be within so many voxels of its own, or
+within ``_SPREADS`` deviations of the depths."""
 
 
 def observe(images: PosedImages, voxels: int, spread: DepthSpread = NO_SPREAD) -> Observation | None:
@@ -118,19 +119,22 @@ def _ends(images: PosedImages, image: int) -> Tensor:
     return torch.from_numpy((rays * z[:, None]) @ T[:3, :3].T + T[:3, 3])
 
 
-def attach_observation(path: Path, images: PosedImages, voxels: int = 192) -> Observation:
+def attach_observation(
+    path: Path, images: PosedImages, voxels: int = 192, spread: DepthSpread | None = None
+) -> Observation:
     """Keep with the safe field in ``path`` what ``images`` of the same scene, in the field's frame, have seen.
 
+    spread: of the depths from image to image; None: as these images show it, all of whose pixels it takes.
     Raises DatasetError: DATASET_DEPTH_MISSING, or DATASET_OF_ANOTHER_FRAME where the field has no surface where the
     images saw one; FieldFormatError as :func:`regnf_core.fields.build.open_field`.
     """
-    spread = NO_SPREAD
-    if images.depths is not None:
+    if spread is None and images.depths is not None:
         spread = depth_spread(images, local_planes(images.depths, images.intrinsics).cosines)
+    spread = spread or NO_SPREAD
     seen = observe(images, voxels, spread)
     if seen is None:
         raise DatasetError("an observation needs depths, and there are none", reason="DATASET_DEPTH_MISSING")
-    _check_frame(open_field(path), seen)
+    _check_frame(open_field(path), seen, _SPREADS * _typical(spread, images))
     description = read_description(path)
     scale = float(description["world_scale"])
     grid, words = replace(seen, low=seen.low / scale, voxel=seen.voxel / scale).stored()
@@ -139,13 +143,24 @@ def attach_observation(path: Path, images: PosedImages, voxels: int = 192) -> Ob
     return seen
 
 
-def _check_frame(field: SdfField, seen: Observation) -> None:
-    """Raise DatasetError (DATASET_OF_ANOTHER_FRAME) unless the field's surface runs where one was measured."""
+def _typical(spread: DepthSpread, images: PosedImages) -> float:
+    """The deviation of a depth, in the median over the pixels."""
+    if images.depths is None or not (images.depths > 0.0).any():
+        return 0.0
+    return float(np.median(spread.at(images.depths[images.depths > 0.0])))
+
+
+def _check_frame(field: SdfField, seen: Observation, noise: float) -> None:
+    """Raise DatasetError (DATASET_OF_ANOTHER_FRAME) unless the field's surface runs where one was measured.
+
+    noise: how far from it depths may end, world units; many voxels in a small thing before a coarse sensor.
+    """
     cells = (seen.states == SURFACE).nonzero()
     cells = cells[:: max(1, len(cells) // _CHECKED)]
     points = ((cells + 0.5) * seen.voxel + seen.low).float()
     distance = field.signed_distance(points.to(field.device)).abs().cpu()
-    if len(cells) == 0 or not float((distance <= _NEAR * seen.voxel).float().mean()) >= _AGREEING:
+    near = max(_NEAR * seen.voxel, noise)
+    if len(cells) == 0 or not float((distance <= near).float().mean()) >= _AGREEING:
         raise DatasetError(
             "the field has no surface where the images saw one: are they of the same scene, in the same frame?",
             reason="DATASET_OF_ANOTHER_FRAME",

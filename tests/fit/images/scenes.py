@@ -28,21 +28,24 @@ def distance(points: Floats) -> Floats:
     return np.minimum(ball_distance(points), box)
 
 
-def images(count: int = 8, height: int = 36, width: int = 48, ball_alone: bool = False) -> PosedImages:
-    """Views from all sides, with exact depths; the color tells the place."""
+def images(
+    count: int = 8, height: int = 36, width: int = 48, ball_alone: bool = False, away: float = 1.0
+) -> PosedImages:
+    """Views from all sides, with exact depths; the color tells the place. From ``away`` times as far, the lens is as
+    many times as long."""
     measured = ball_distance if ball_alone else distance
     steps = np.arange(count) + 0.5
     polar, azimuth = np.arccos(1.0 - 2.0 * steps / count), np.pi * (1.0 + 5.0**0.5) * steps
     outwards = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    focal = 0.9 * width
+    focal = 0.9 * width * away
     camera = np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
     rows, columns = np.indices((height, width)) + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera).T
     poses, depths, colors = [], [], []
     for outward in outwards:
-        pose = _looking_back(1.6 * outward)
+        pose = _looking_back(1.6 * away * outward)
         directions = rays @ pose[:3, :3].T
-        depth = _traced(measured, pose[:3, 3], directions)
+        depth = _traced(measured, pose[:3, 3], directions, 5.0 * away)
         points = pose[:3, 3] + depth[..., None] * directions
         shade = np.clip(0.5 + 0.8 * (points - BALL_CENTER), 0.0, 1.0)
         poses.append(pose)
@@ -69,9 +72,9 @@ def _looking_back(position: Floats) -> Floats:
     return pose
 
 
-def _traced(measured, origin: Floats, directions: Floats) -> Floats:  # type: ignore[no-untyped-def]
+def _traced(measured, origin: Floats, directions: Floats, farthest: float) -> Floats:  # type: ignore[no-untyped-def]
     depth = np.zeros(directions.shape[:2])
     speed = np.linalg.norm(directions, axis=-1)
     for _ in range(100):
         depth += measured(origin + depth[..., None] * directions) / speed
-    return np.where(depth < 5.0, depth, 0.0)
+    return np.where(depth < farthest, depth, 0.0)

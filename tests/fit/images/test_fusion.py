@@ -72,6 +72,20 @@ def test_the_truncation_follows_what_images_differ_by(tmp_path: Path) -> None:
     assert abs(float(distances.median())) < 0.01
 
 
+def test_a_small_thing_before_a_coarse_sensor_is_fused(tmp_path: Path) -> None:
+    """Its depths end many voxels beside its surface, which is there all the same."""
+    noisy = misplaced(scenes.images(count=16, height=144, width=192, ball_alone=True, away=4.0), 0.08)
+    corners = scenes.BALL_CENTER + 1.6 * scenes.BALL_RADIUS * np.array([[-1.0], [1.0]])
+    fuse_images(replace(noisy, bounds=corners), tmp_path / "map.safetensors")
+    field = open_field(tmp_path / "map.safetensors")
+    seen = observation_of(field)
+    assert seen is not None
+    assert seen.voxel < 0.02
+    along = scenes.BALL_RADIUS * np.outer([0.0, 1.4], [1.0, 0.0, 0.0])
+    inside, outside = field.signed_distance(torch.from_numpy(scenes.BALL_CENTER + along).float())
+    assert inside < -0.1 < 0.04 < outside
+
+
 def test_voxels_are_no_smaller_than_half_the_deviation(tmp_path: Path) -> None:
     sharp = scenes.images(count=24, height=288, width=384)
     exact = fuse_images(sharp, tmp_path / "exact.safetensors")
