@@ -24,7 +24,7 @@ Voxel = Annotated[
 Truncation = Annotated[
     float | None,
     typer.Option(
-        min=1.0, max=1000.0, help="Voxels; without it 4, or 3 standard deviations of the depths from image to image."
+        min=1.0, max=1000.0, help="Voxels; without it 4, or 6 standard deviations of the depths from image to image."
     ),
 ]
 
