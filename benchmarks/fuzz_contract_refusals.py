@@ -24,7 +24,7 @@ OF_STATE = frozenset(
         "RENDER_TOO_LARGE",
     }
 )
-"""Reasons that depend on what the service holds: allowed wherever the contract documents them."""
+"""Reasons that depend on what the service holds, and on its settings: allowed wherever the contract documents them."""
 
 OF_MEMBERS: Mapping[str, frozenset[str]] = {
     "POST /register": frozenset(
@@ -50,7 +50,8 @@ OF_MEMBERS: Mapping[str, frozenset[str]] = {
     "POST /fields": frozenset({"INVALID_DESCRIPTION", "MISSING_PART"}),  # `file` and `upload` exclude one another
     "PATCH /fields/{sha256}": frozenset({"INVALID_DESCRIPTION"}),  # corners of bounds, a matrix
     "POST /library": frozenset({"INVALID_REQUEST"}),  # a continuous symmetry without an axis, an axis of length 0
-    "PATCH /library/{name}": frozenset({"INVALID_REQUEST"}),
+    "PATCH /library/{name}": frozenset({"INVALID_REQUEST", "LIBRARY_ENTRY_INVALID"}),  # or such a one together with
+    # what the entry has
     "PUT /fields/{sha256}": frozenset({"INVALID_HEADER", "UPLOAD_EMPTY"}),  # Content-Range against the body, and of 0
 }
 """Reasons that depend on several members or on their numbers together, by operation."""
@@ -65,7 +66,7 @@ def documented(contract: Mapping[str, Any], operation: str) -> frozenset[str]:
 
 
 def headers_fit(contract: Mapping[str, Any], operation: str, headers: Mapping[str, Any]) -> bool:
-    """Whether every header has its pattern. schemathesis's coverage phase takes empty ones for such."""
+    """Whether every header has its pattern; schemathesis's coverage phase takes empty headers for such."""
     method, path = operation.split(" ", 1)
     patterns = {
         parameter["name"].lower(): parameter["schema"].get("pattern", "")

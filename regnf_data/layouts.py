@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 _REASON = "DATASET_LAYOUT_INVALID"
 _USUAL_UNITS_PER_METER = 0.5
 _LONGEST_NAME = 200
+_LONGEST_FILE_NAME = 255
+"""Bytes; with more, file systems answer an error rather than that there is no such file."""
 _USUAL_ORIGIN_M = (0.0, 0.0, 1.0)
 
 
@@ -80,7 +82,7 @@ def _furnishing(instance: Any, meshes: Path) -> Furnishing:
     if not name.isprintable() or len(name) > _LONGEST_NAME:
         raise DatasetError("an instance's id has control characters or is too long", reason=_REASON)
     mesh = meshes / Path(instance["mesh"]).name
-    if "\0" in instance["mesh"] or not mesh.is_file():
+    if "\0" in mesh.name or len(mesh.name.encode("utf-8", "surrogatepass")) > _LONGEST_FILE_NAME or not mesh.is_file():
         raise DatasetError(f"{name}: no such mesh: {mesh.name!r:.200}", reason="DATASET_MESH_MISSING")
     bounds = None
     if instance.get("aabb_min") is not None:

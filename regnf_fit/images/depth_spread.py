@@ -40,6 +40,10 @@ class DepthSpread:
             return np.zeros_like(depths)
         return np.interp(depths, self.depths, self.deviations).astype(np.float32)
 
+    def median(self, depths: NDArray[np.float32]) -> float:
+        """The deviation in the median over the depths (R,), at least one."""
+        return float(np.median(self.at(depths)))
+
 
 NO_SPREAD = DepthSpread(np.zeros(0), np.zeros(0))
 """Nothing is known."""

@@ -50,7 +50,7 @@ def map_grid(prepared: PreparedImages, rays: PixelRays, size: MapSize) -> BlockG
     Raises InvalidOptionsError for voxels that are too small for the surface that was measured.
     """
     width, ends = sharp_width(prepared, rays), ends_of(rays)
-    spread = float(np.median(prepared.spread.at(rays.depths.numpy())))
+    spread = prepared.spread.median(rays.depths.numpy())
     voxel = size.voxel or max(width, _LEAST_SPREADS * spread)
     while (blocks := len(cells_of(ends, _BLOCK * voxel).counts)) > _MOST_BLOCKS and size.voxel is None:
         voxel *= _GROWTH

@@ -134,20 +134,15 @@ def attach_observation(
     seen = observe(images, voxels, spread)
     if seen is None:
         raise DatasetError("an observation needs depths, and there are none", reason="DATASET_DEPTH_MISSING")
-    _check_frame(open_field(path), seen, _SPREADS * _typical(spread, images))
+    assert images.depths is not None
+    measured = images.depths[images.depths > 0.0]
+    _check_frame(open_field(path), seen, _SPREADS * spread.median(measured) if len(measured) else 0.0)
     description = read_description(path)
     scale = float(description["world_scale"])
     grid, words = replace(seen, low=seen.low / scale, voxel=seen.voxel / scale).stored()
     tensors = {**load_file(path), OBSERVATION: words}
     write_safe_field(path, {**description, OBSERVATION: asdict(grid)}, tensors)
     return seen
-
-
-def _typical(spread: DepthSpread, images: PosedImages) -> float:
-    """The deviation of a depth, in the median over the pixels."""
-    if images.depths is None or not (images.depths > 0.0).any():
-        return 0.0
-    return float(np.median(spread.at(images.depths[images.depths > 0.0])))
 
 
 def _check_frame(field: SdfField, seen: Observation, noise: float) -> None:

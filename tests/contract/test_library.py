@@ -66,8 +66,18 @@ def test_a_symmetry_may_be_said_without_what_has_a_default(world: World) -> None
     add(world, world.ready_field("chair"))
     whole = {"order": 4, "axis": None, "continuous": False}
     assert world.client.patch("/library/office chair", json={"symmetry": {"order": 4}}).json()["symmetry"] == whole
-    upright = world.client.patch("/library/office chair", json={"symmetry": {"order": 2, "axis": [0, 0, 3]}}).json()
-    assert upright["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": False}
+    patched = world.client.patch("/library/office chair", json={"symmetry": {"axis": [0, 0, 3], "order": 2}}).json()
+    assert patched["symmetry"] == {"order": 2, "axis": [0.0, 0.0, 1.0], "continuous": False}
+
+
+def test_what_a_change_leaves_out_of_a_symmetry_stays(world: World) -> None:
+    add(world, world.ready_field("chair"))
+    world.client.patch("/library/office chair", json={"symmetry": TURNED})
+    once = world.client.patch("/library/office chair", json={"symmetry": {"order": 1}}).json()
+    assert once["symmetry"] == UNIT | {"order": 1}
+    refused = world.client.patch("/library/office chair", json={"symmetry": {"order": 4}})
+    assert_refused(refused, 422, "LIBRARY_ENTRY_INVALID")  # a continuous one has the order 1 or 2
+    assert world.client.get("/library/office chair").json()["symmetry"] == UNIT | {"order": 1}
 
 
 def test_a_worker_is_asked_for_the_model_once(world: World) -> None:

@@ -162,6 +162,7 @@ def test_refused_requests(tmp_path: Path) -> None:
         ({"instances": [{"id": "a", "mesh": "absent.glb"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "../../etc/passwd"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "a\0b"}]}, "DATASET_MESH_MISSING"),
+        ({"instances": [{"id": "a", "mesh": 300 * "a"}]}, "DATASET_MESH_MISSING"),
         ({"instances": [{"id": "a", "mesh": "chest.ply", "T_room_from_object": [1]}]}, "DATASET_LAYOUT_INVALID"),
         ({"scene_units_per_meter": 0}, "DATASET_LAYOUT_INVALID"),
         ({"scene_origin_m": "here"}, "DATASET_LAYOUT_INVALID"),

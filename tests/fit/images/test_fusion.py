@@ -19,6 +19,7 @@ from regnf_data.fusing import BlockGrid, DepthImages, fuse_blocks
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.fusion import FusionOptions, fuse_images
 from regnf_fit.images.measured import measured_rays
+from regnf_fit.images.observing import attach_observation
 from regnf_fit.images.preparation import prepare
 from tests.fit.images import scenes
 
@@ -84,6 +85,12 @@ def test_a_small_thing_before_a_coarse_sensor_is_fused(tmp_path: Path) -> None:
     along = scenes.BALL_RADIUS * np.outer([0.0, 1.4], [1.0, 0.0, 0.0])
     inside, outside = field.signed_distance(torch.from_numpy(scenes.BALL_CENTER + along).float())
     assert inside < -0.1 < 0.04 < outside
+    shift, poses = 3.0 * scenes.BALL_RADIUS * np.array([1.0, 0.0, 0.0]), noisy.T_world_camera.copy()
+    poses[:, :3, 3] += shift
+    elsewhere = replace(noisy, T_world_camera=poses, bounds=corners + shift)
+    with pytest.raises(DatasetError) as refused:
+        attach_observation(tmp_path / "map.safetensors", elsewhere)
+    assert refused.value.reason == "DATASET_OF_ANOTHER_FRAME"
 
 
 def test_voxels_are_no_smaller_than_half_the_deviation(tmp_path: Path) -> None:

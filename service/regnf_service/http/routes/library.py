@@ -122,13 +122,14 @@ def get_library_entry(name: NamePath, services: ServicesDep, caller: CallerDep, 
     "/library/{name}",
     summary="Change an entry",
     response_model=EntryDocument,
-    responses=refusals(*_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND"),
+    responses=refusals(*_BODY_REFUSALS, "LIBRARY_ENTRY_NOT_FOUND", "LIBRARY_ENTRY_INVALID"),
     openapi_extra={"requestBody": {"required": True, "content": {JSON: {"schema": reference(EntryChange)}}}},
 )
 async def patch_library_entry(
     name: NamePath, request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep
 ) -> JSONResponse:
-    """What is left out stays; null takes a unit, a note or a symmetry back, and all tags with `[]` (RFC 7396)."""
+    """What is left out stays, in a symmetry too; null takes a unit, a note or a symmetry back, and `[]` all tags
+    (RFC 7396)."""
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
     change = await read_body(services, EntryChange, await body.read_small(request, services.settings))
@@ -137,11 +138,13 @@ async def patch_library_entry(
 
 
 def _changed(services: Services, caller: str, name: str, change: EntryChange) -> LibraryEntry:
-    said = change.model_dump(include=change.model_fields_set)  # a symmetry that is said is said whole
+    said = change.model_dump(exclude_unset=True)
     if said.get("name", name) is None:
         del said["name"]
-    notes = EntryNotes.checked(**(find_entry(services, caller, name).notes.to_dict() | said))
-    return change_entry(services, caller, name, notes)
+    held = find_entry(services, caller, name).notes.to_dict()
+    if said.get("symmetry") is not None:
+        said["symmetry"] = (held["symmetry"] or {"axis": None, "continuous": False}) | said["symmetry"]
+    return change_entry(services, caller, name, EntryNotes.checked(**(held | said)))
 
 
 @router.delete(

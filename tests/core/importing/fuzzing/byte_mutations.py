@@ -23,7 +23,7 @@ NUMBERS: tuple[int, ...] = (
 )
 NUMBERS += ((1 << 47), (1 << 48) - 1, 1 << 48, (1 << 62), (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 """Where counts, lengths and offsets change their nature."""
-TEXT_NUMBERS = (b"0", b"-1", b"2.5", b"1e308", b"1e309", b"5e-324", b"nan", b"9" * 20, b"1" + b"0" * 309)
+_TEXT_NUMBERS = (b"0", b"-1", b"2.5", b"1e308", b"1e309", b"5e-324", b"nan", b"9" * 20, b"1" + b"0" * 309)
 """Where a number that is written out is no count, no float or no number any more."""
 _WRITTEN = re.compile(rb"-?[0-9][0-9.]*(?:e[-+]?[0-9]+)?")
 _MOST = 1 << 18
@@ -66,7 +66,7 @@ def _changed(random: Random, data: bytes, at: int, length: int, other: bytes) ->
         case 7:
             return head
         case 8:
-            return head + _WRITTEN.sub(random.choice(TEXT_NUMBERS), data[at:], count=1)
+            return head + _WRITTEN.sub(random.choice(_TEXT_NUMBERS), data[at:], count=1)
         case _:
             width = random.choice((1, 2, 4, 8))
             return head + number(random, width) + data[at + width :]
