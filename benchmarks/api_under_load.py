@@ -24,7 +24,8 @@ from pathlib import Path
 import httpx
 import numpy as np
 
-from regnf_cli.local_service import api_process, running_service
+from benchmarks.api_process import api_process
+from regnf_cli.local_service import running_service
 from regnf_cli.remote import RemoteService
 from tests.core.importing.checkpoints import write_full_size_checkpoint
 

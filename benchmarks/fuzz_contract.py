@@ -33,7 +33,7 @@ from benchmarks.service_load.small_fields import EMPTY_BOX, SmallPair, write_sma
 from regnf_cli.remote import RemoteService
 from regnf_service.http.paging import encode_token
 from tests.contract.live import Live, eventually, live_service
-from tests.worker.bench import children_of
+from tests.processes import children_of
 
 _ROOT = Path(__file__).resolve().parents[1]
 _HERE = Path(__file__).resolve().parent

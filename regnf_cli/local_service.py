@@ -14,7 +14,6 @@ from pathlib import Path
 
 START_DEADLINE_S = 30
 STOP_DEADLINE_S = 30
-_LISTENING = "0A"  # in /proc/net/tcp
 
 
 @contextmanager
@@ -50,25 +49,3 @@ def _address(server: subprocess.Popen[str]) -> str:
                 return word.rstrip("/")
     server.kill()
     raise RuntimeError("the service did not start; see serve.log in its state folder")
-
-
-def api_process(address: str) -> int:
-    """The API's process at the address, found through /proc (Linux).
-
-    The supervisor holds the listening socket too, so that a restart of the API drops no connection: it is passed over.
-    """
-    port = int(address.rsplit(":", 1)[1])
-    sockets = {
-        f"socket:[{line.split()[9]}]"
-        for line in Path("/proc/net/tcp").read_text().splitlines()[1:]
-        if int(line.split()[1].split(":")[1], 16) == port and line.split()[3] == _LISTENING
-    }
-    for folder in Path("/proc").glob("[0-9]*/fd"):
-        try:
-            holds = any(os.readlink(entry) in sockets for entry in folder.iterdir())
-            command = (folder.parent / "cmdline").read_bytes().decode(errors="replace").split("\0")
-        except OSError:  # another user's process, or one that has just ended
-            continue
-        if holds and "regnf_cli.api_process" in command:
-            return int(folder.parent.name)
-    raise RuntimeError(f"no API process listens at {address}")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import tempfile
 import threading
@@ -29,11 +28,11 @@ from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import write_small_pair
 from regnf_cli.remote import RemoteService
 from regnf_state.redis.client import connect
+from tests.processes import processor_seconds
 
 _OPTIONS = {"up_axis": "z"}
 _NDJSON = {"Content-Type": "application/x-ndjson"}
 _PATIENCE_S = 600.0
-_TICKS_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
 @dataclass(frozen=True)
@@ -66,18 +65,9 @@ class Killer(threading.Thread):
     def run(self) -> None:
         while not self.ended.wait(self._every_s):
             index = self.kills % len(self._house.workers)
-            self.spent += spent(self._house.workers[index].pid)
+            self.spent += processor_seconds(self._house.workers[index].pid)
             self._house.kill_worker(index)
             self.kills += 1
-
-
-def spent(pid: int) -> float:
-    """Processor seconds of a process and of its children that have ended."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return 0.0
-    return sum(map(int, fields[11:15])) * _TICKS_S
 
 
 def spent_by(house: House) -> dict[str, float]:
@@ -86,8 +76,8 @@ def spent_by(house: House) -> dict[str, float]:
     with connect(house.redis.url) as redis:
         told: Any = redis.info("cpu")
     return {
-        "front end": spent(house.api.pid),
-        "workers and their jobs": sum(spent(worker.pid) for worker in house.workers),
+        "front end": processor_seconds(house.api.pid),
+        "workers and their jobs": sum(processor_seconds(worker.pid) for worker in house.workers),
         "Redis": told["used_cpu_sys"] + told["used_cpu_user"],
     }
 

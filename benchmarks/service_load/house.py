@@ -18,8 +18,9 @@ from redis import Redis
 
 from regnf_state.redis.client import connect
 from regnf_state.redis.queue import RqJobQueue
+from tests.processes import children_of
 from tests.restartable_redis import RestartableRedis, restartable_redis
-from tests.worker.bench import children_of, eventually
+from tests.worker.bench import eventually
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ in turn, one at a time: the ratio holds on a busy machine too. The engine's seco
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import tempfile
 import time
@@ -25,11 +24,14 @@ from typing import Any
 
 import httpx
 import numpy as np
+import psutil
 
+from benchmarks.api_process import api_process
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from regnf_cli.local_service import api_process, running_service
+from regnf_cli.local_service import running_service
 from regnf_cli.remote import RemoteService
+from tests.processes import descendants_of, processor_seconds
 
 _OPTIONS = {"up_axis": "z"}
 _REST_S = 1.2
@@ -58,7 +60,7 @@ class Service:
 
     def run(self, seed: int) -> None:
         """One job, from its POST to its result."""
-        begun, used = time.monotonic(), processor_seconds(self.server)
+        begun, used = time.monotonic(), processor_seconds_below(self.server)
         job = self.client.post("/register", json={**self.request, "seed": seed}).json()
         while job["status"] not in ("successful", "failed"):
             job = self.client.get(f"/jobs/{job['id']}", params={"wait": 30}).json()
@@ -75,7 +77,7 @@ class Service:
         self.started.append((started - created).total_seconds())
         self.engine.append(engine)
         time.sleep(_REST_S)  # until the worker has collected the process
-        self.processor.append(processor_seconds(self.server) - used)
+        self.processor.append(processor_seconds_below(self.server) - used)
 
     def forget_first(self) -> None:
         """The first job makes the object's model for all others."""
@@ -83,18 +85,9 @@ class Service:
             del values[0]
 
 
-def processor_seconds(process: int) -> float:
+def processor_seconds_below(process: int) -> float:
     """Processor seconds of a process, its descendants, and those of them that have ended (Linux)."""
-    found, left = 0.0, [process]
-    while left:
-        pid = left.pop()
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-            left += map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
-        except OSError:
-            continue
-        found += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
-    return found
+    return sum(map(processor_seconds, (process, *descendants_of(process))))
 
 
 def start(
@@ -107,8 +100,7 @@ def start(
     for sha256 in (request["scene"], request["object"]):  # their drawing would count as a job's
         while client.get(f"/fields/{sha256}").json().get("views") == "pending":
             time.sleep(1)
-    parent = Path(f"/proc/{api_process(address)}/stat").read_text().rpartition(")")[2].split()[1]
-    return Service(name, client, request, int(parent))
+    return Service(name, client, request, psutil.Process(api_process(address)).ppid())
 
 
 def measure(folder: Path, jobs: int, before: Path | None) -> tuple[list[Service], list[float]]:

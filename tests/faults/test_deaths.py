@@ -14,7 +14,8 @@ from regnf_state.queue import Work
 from tests.contract.world import field_bytes, sha256
 from tests.faults.house import House
 from tests.faults.promise import check_promise, fault, leftovers
-from tests.worker.bench import alive, children_of, eventually
+from tests.processes import alive, children_of
+from tests.worker.bench import eventually
 
 
 def kill(process: subprocess.Popen[bytes]) -> None:

@@ -13,34 +13,10 @@ import httpx
 
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
-from tests.worker.bench import alive, eventually
+from tests.processes import alive, command_of, descendants_of
+from tests.worker.bench import eventually
 
 DEADLINE_S = 40.0
-
-
-def descendants(pid: int) -> set[int]:
-    """Every process below this one."""
-    children: dict[int, list[int]] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        children.setdefault(int(fields[1]), []).append(int(stat.parent.name))
-    found: set[int] = set()
-    waiting = [pid]
-    while waiting:
-        below = children.get(waiting.pop(), [])
-        found.update(below)
-        waiting += below
-    return found
-
-
-def command_line(pid: int) -> str:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-    except (FileNotFoundError, ProcessLookupError):  # the second: it ended between open and read
-        return ""
 
 
 @dataclass
@@ -53,16 +29,18 @@ class Service:
     seen: set[int] = field(default_factory=set)
 
     def look(self) -> set[int]:
-        found = descendants(self.process.pid)
+        found = set(descendants_of(self.process.pid))
         self.seen |= found
         return found
 
     def part(self, name: str) -> int:
         """The process whose command line holds this."""
-        return eventually(lambda: next((pid for pid in self.look() if name in command_line(pid)), 0), name, DEADLINE_S)
+        return eventually(
+            lambda: next((pid for pid in self.look() if name in " ".join(command_of(pid))), 0), name, DEADLINE_S
+        )
 
     def socket_dir(self) -> Path:
-        line = command_line(self.part("unixsocket:"))
+        line = " ".join(command_of(self.part("unixsocket:")))
         return Path(line.split("unixsocket:")[1].split("/redis.sock")[0])
 
     def is_ready(self) -> bool:

@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,8 @@ from regnf_cli.listening import address_of, check_access, open_socket
 from regnf_cli.start_errors import StartError
 from regnf_cli.state_lock import StateLock
 from regnf_state.settings import Settings, is_loopback
-from tests.worker.bench import alive, children_of, eventually
+from tests.processes import alive, command_of, descendants_of
+from tests.worker.bench import eventually
 
 
 @pytest.mark.parametrize(
@@ -122,15 +122,7 @@ def test_the_guarded_command_ends_with_whoever_asked_for_it(kernel_kills: bool) 
     try:
 
         def sleeper() -> int:
-            waiting, found = [parent.pid], 0
-            while waiting:
-                pid = waiting.pop()
-                # a process may end between being listed and being looked at
-                with suppress(FileNotFoundError, ProcessLookupError):
-                    if b"sleep" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]:
-                        found = pid
-                    waiting += children_of(pid)
-            return found
+            return next((pid for pid in descendants_of(parent.pid) if "/bin/sleep" in command_of(pid)[:1]), 0)
 
         command = eventually(sleeper, "the guarded command")
         parent.kill()

@@ -10,25 +10,10 @@ from pathlib import Path
 import httpx
 
 from regnf_cli.local_service import running_service
+from tests.processes import command_of, descendants_of
 
 TOKEN, FILED = "token-in-the-environment-1f9c", "token-in-the-file-77aa"
 SECRET = base64.b64encode(b"a webhook secret, 26 bytes").decode()
-
-
-def descendants() -> dict[int, list[str]]:
-    """The command line of every process below this one."""
-    parents, commands = {}, {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            commands[int(folder.name)] = (folder / "cmdline").read_bytes().decode(errors="replace").split("\0")
-        except OSError:  # it has just ended
-            continue
-    found, fresh = set[int](), {os.getpid()}
-    while fresh:
-        fresh = {child for child, parent in parents.items() if parent in fresh} - found
-        found |= fresh
-    return {child: commands[child] for child in found if child in commands}
 
 
 def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
@@ -49,9 +34,9 @@ def test_secrets_stay_where_they_belong(tmp_path: Path) -> None:
             for method, path in (("GET", "/jobs"), ("POST", "/register"), ("PUT", "/fields/x"), ("GET", "/nowhere")):
                 texts.append(client.request(method, path, headers=headers, content=b"x").text)
         assert client.get("/jobs", headers={"Authorization": f"Bearer {FILED}"}).status_code == 200
-        running = descendants()
+        running = {pid: command_of(pid) for pid in descendants_of(os.getpid())}
         texts += [" ".join(command) for command in running.values()]
-        workers = {pid for pid, command in running.items() if "regnf_worker.main" in command}
+        workers = [pid for pid, command in running.items() if "regnf_worker.main" in command]
         assert workers
         environments = [(Path("/proc") / str(pid) / "environ").read_bytes().decode() for pid in workers]
     texts += [path.read_text(errors="replace") for path in state.rglob("*.log")]

@@ -12,8 +12,9 @@ from typing import BinaryIO
 import httpx
 import pytest
 
-from tests.serve.service import DEADLINE_S, Service, command, command_line, environment, start
-from tests.worker.bench import alive, eventually
+from tests.processes import alive, command_of
+from tests.serve.service import DEADLINE_S, Service, command, environment, start
+from tests.worker.bench import eventually
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_it_comes_up_with_nothing_configured(shared: Service) -> None:
     shared.await_ready()
     assert httpx.get(f"{shared.address}/healthz").json() == {"status": "ok"}
     parts = ("unixsocket:", "regnf_worker.main", "regnf_cli.api_process")
-    assert {shared.part(part) for part in parts} == shared.look(), [command_line(pid) for pid in shared.look()]
+    assert {shared.part(part) for part in parts} == shared.look(), [command_of(pid) for pid in shared.look()]
     assert shared.address.startswith("http://127.0.0.1:")
     assert oct(shared.socket_dir().stat().st_mode & 0o777) == "0o700"
     assert oct(shared.state_dir.stat().st_mode & 0o777) == "0o700"

@@ -132,19 +132,5 @@ def bench(folder: Path, **settings: object) -> Iterator[Bench]:
                 worker.wait()
 
 
-def children_of(pid: int) -> list[int]:
-    """Processes whose parent this is."""
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-
-
-def alive(pid: int) -> bool:
-    """Whether the process exists and is no zombie."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except (FileNotFoundError, ProcessLookupError):  # the second: it ended between open and read
-        return False
-    return state not in "ZX"
-
-
 def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
     os.kill(pid, number)

@@ -14,7 +14,8 @@ from regnf_core.field_views import FieldViews
 from regnf_state.records import FieldRecord
 from regnf_worker.context import Context
 from regnf_worker.drawing import draw_field
-from tests.worker.bench import OBJECT, SCENE, Bench, alive, bench, children_of, eventually, kill
+from tests.processes import alive, children_of
+from tests.worker.bench import OBJECT, SCENE, Bench, bench, eventually, kill
 from tests.worker.doubles import SHA, begin_import, field
 
 VIEWS = FieldViews(b"fine", None, b"picture")

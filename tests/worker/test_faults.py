@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes import children_of
 from tests.restartable_redis import RestartableRedis, restartable_redis
-from tests.worker.bench import Bench, bench, children_of, eventually
+from tests.worker.bench import Bench, bench, eventually
 
 Full = Callable[[], AbstractContextManager[None]]
 

@@ -16,7 +16,8 @@ from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
 from regnf_worker.engine import Made
 from regnf_worker.settle import ChildExit, settle_registration
-from tests.worker.bench import Bench, alive, bench, children_of, eventually, kill
+from tests.processes import alive, children_of
+from tests.worker.bench import Bench, bench, eventually, kill
 from tests.worker.doubles import accept, job
 from tests.worker.tiny_engine import TinyEngine
 

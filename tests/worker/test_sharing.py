@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.worker.bench import Bench, bench, children_of, eventually
+from tests.processes import children_of
+from tests.worker.bench import Bench, bench, eventually
 
 CALLERS = ("greedy", "honest")
 GREEDY = [f"greedy-{number}" for number in range(4)]

@@ -10,7 +10,8 @@ import pytest
 
 from regnf_state.manifest import read_manifest
 from regnf_state.records import FieldRecord
-from tests.worker.bench import OBJECT, SCENE, Bench, alive, bench, children_of, eventually
+from tests.processes import alive, children_of
+from tests.worker.bench import OBJECT, SCENE, Bench, bench, eventually
 
 
 @pytest.fixture

@@ -10,15 +10,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from regnf_core.importing.gate import gate
 from regnf_core.importing.gate.child import run_child
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.watch import MAX_THREADS
+from tests.processes import alive
 
 ROOT = Path(__file__).resolve().parents[4]
 PRELUDE = f"""
@@ -272,11 +275,10 @@ print(os.getpgrp())
 
 def any_alive(group: int) -> bool:
     """Whether a process of the group lives; zombies that nobody has collected yet do not count."""
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, _, found = stat.read_text().rpartition(")")[2].split()[:3]
-        except (FileNotFoundError, ProcessLookupError):
-            continue
-        if int(found) == group and state != "Z":
-            return True
-    return False
+
+    def is_member(pid: int) -> bool:
+        with suppress(ProcessLookupError):  # it ended meanwhile
+            return os.getpgid(pid) == group
+        return False
+
+    return any(is_member(pid) and alive(pid) for pid in psutil.pids())
