@@ -15,6 +15,7 @@ from regnf_cli.commands import app_of
 from regnf_core.errors import RegnfError
 from tests.contract.live import DEADLINE_S, eventually
 from tests.core.analytic import AnalyticField, boxes, sphere
+from tests.listing import below
 
 T = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -0.25], [0.0, 0.0, 0.0, 1.0]]
 
@@ -54,7 +55,7 @@ def test_a_command_that_is_terminated_leaves_nothing_behind(fields: Path, tmp_pa
     output = tmp_path / "out"
     said = ("render", str(fields / "room.safetensors"), "--mode", "volume", "--frames", "500", "--output", str(output))
     with subprocess.Popen([sys.executable, "-m", "regnf_cli.main", *said], stderr=subprocess.PIPE) as command:
-        eventually(lambda: output.is_dir() and any(output.rglob("*.png")), "the first frame")
+        eventually(lambda: output.is_dir() and any(path.suffix == ".png" for path in below(output)), "the first frame")
         command.terminate()
         _, errors = command.communicate(timeout=DEADLINE_S)
     assert (command.returncode, list(output.iterdir())) == (143, [])

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import httpx
 
+from tests.listing import files_below
 from tests.redis_server import private_redis
 
 DEADLINE_S = 60.0
@@ -59,7 +60,7 @@ class Live:
     def files(self) -> set[str]:
         """Every file in the blob store, unfinished ones included; not what the journal says of them."""
         root = self.folder / "blobs"
-        names = {path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file()}
+        names = {path.relative_to(root).as_posix() for path in files_below(root)}
         return {name for name in names if not name.startswith("journal/")}
 
     def log(self) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 from tests.contract.world import field_bytes
 from tests.faults.house import House
 from tests.faults.stores import left_unfinished
+from tests.listing import below
 from tests.worker.bench import eventually
 
 WITHIN_S = 120.0
@@ -78,9 +79,10 @@ def check_result(house: House, job_id: str) -> None:
 def leftovers(house: House) -> list[str]:
     """Temporary files: of jobs, of dead workers, of the storage, of copies of fields, and of the system's folder."""
     states = {house.state(role) for role in ("api", "worker")}
-    inside = [path for state in states for path in (state / "scratch").glob("*/*") if path.name != ".lock"]
-    parts = [path for state in states for path in (state / "field-cache").glob("*.part")]
-    system = list(Path(house.environment["TMPDIR"]).iterdir())
+    scratch = [state / "scratch" for state in states]
+    inside = [path for top in scratch for path in below(top) if path.parent != top and path.name != ".lock"]
+    parts = [path for state in states for path in below(state / "field-cache") if path.suffix == ".part"]
+    system = below(Path(house.environment["TMPDIR"]))
     return [str(path) for path in (*inside, *parts, *system)] + left_unfinished(house.store)
 
 

@@ -11,6 +11,7 @@ import obstore
 from obstore.store import S3Store
 
 from regnf_state.blobs.object_client import object_client
+from tests.listing import files_below
 from tests.object_store import ObjectServer, environment
 
 _TEMPORARY = ".tmp/"
@@ -43,7 +44,7 @@ class Folder:
         return {}
 
     def listing(self) -> list[str]:
-        return sorted(path.relative_to(self.root).as_posix() for path in self.root.rglob("*") if path.is_file())
+        return sorted(path.relative_to(self.root).as_posix() for path in files_below(self.root))
 
     def read(self, key: str) -> bytes:
         return (self.root / key).read_bytes()

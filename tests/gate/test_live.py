@@ -16,6 +16,7 @@ from tests.core.importing.fuzzing.seeds import Seeds
 from tests.gate.bad_containers import CONTAINERS
 from tests.gate.bad_pickles import PICKLES
 from tests.gate.bad_tensors import TENSORS
+from tests.listing import below
 from tests.live_stack import DATA, LIVE, demo_request, finished, imported
 
 pytestmark = LIVE
@@ -37,7 +38,8 @@ def test_a_bad_file_is_rejected_and_leaves_nothing(
     assert f"{field['state']} {field['error']['reason']}" == outcome
     left = {Path(name).name for name in live_stack.files() if field["sha256"] in name}
     assert left == ({"original"} if field["error"]["reason"] in QUESTIONS else set())
-    eventually(lambda: not list((live_stack.folder / "scratch").glob("*/import-*")), "an empty scratch folder")
+    scratch = live_stack.folder / "scratch"
+    eventually(lambda: not [path for path in below(scratch) if "import-" in path.name], "an empty scratch folder")
 
 
 def test_the_next_good_file_is_taken(live_client: httpx.Client, seeds: Seeds) -> None:

@@ -23,6 +23,7 @@ from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from regnf_worker.context import Context
+from tests.listing import below
 from tests.redis_server import private_redis
 from tests.requests import request_record
 
@@ -103,8 +104,8 @@ class Bench:
     def leftovers(self) -> list[str]:
         """Temporary files of jobs and of the blob store."""
         scratch = self.context.settings.scratch_dir
-        inside = [path for folder in scratch.iterdir() if folder.is_dir() for path in folder.iterdir()]
-        temporary = (self.context.settings.blob_dir / ".tmp").iterdir()
+        inside = [path for path in below(scratch) if len(path.relative_to(scratch).parts) == 2]
+        temporary = below(self.context.settings.blob_dir / ".tmp")
         return [path.name for path in [*inside, *temporary] if path.name != ".lock"]
 
 
