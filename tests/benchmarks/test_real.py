@@ -158,7 +158,7 @@ def test_grids_of_large_things_have_a_coarser_step(work, thing, tmp_path, monkey
         np.testing.assert_allclose(np.load(tmp_path / f"{most}.npz")["spacing"], step)
 
 
-@pytest.mark.parametrize(("scene", "count"), [("kitchen", 8), ("shelf", 6)])
+@pytest.mark.parametrize(("scene", "count"), [("kitchen", 8), ("shelf", 6), ("office", 5)])
 def test_boxes_of_the_recorded_scenes(scene, count):
     found = scene_of(scene)
     assert len(found.things) == count
