@@ -19,7 +19,7 @@ _BISECTIONS = 6
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Depth errors: field units, of rays that met a surface, where a depth was measured too."""
+    """Depth errors: field units, of rays that met a surface, where a depth was measured, not before the bounds."""
 
     depth_error: float | None
     depth_error_median: float | None
@@ -46,8 +46,9 @@ def first_hits(field: RadianceField, rays: PixelRays, size: float) -> FirstHits:
 
 @torch.no_grad()
 def evaluate(field: RadianceField, rays: PixelRays, size: float) -> HeldOutErrors:
-    """The errors at held-out rays."""
-    rays = rays.take(~rays.background)
+    """The errors at held-out rays, but for those that something before the bounds ends: they show nothing of it."""
+    occluded = (rays.depths > 0.0) & (rays.depths < rays.near)
+    rays = rays.take(~rays.background & ~occluded)
     hits = first_hits(field, rays, size)
     met = hits.depths > 0.0
     both = met & (rays.depths > 0.0)

@@ -119,7 +119,8 @@ class ReconstructionReport:
     ssim: float | None
     """Their mean structural similarity, up to 1."""
     depth_error: float | None
-    """Mean |rendered - measured depth|, field units, where both are; None without depth. Sensor noise is part of it."""
+    """Mean |rendered - measured depth|, field units, where both are and nothing before the bounds hides what is in
+    them; None without depth. Sensor noise is part of it."""
     depth_error_median: float | None
     eikonal_error: float
     """Mean ||gradient| - 1| near the surface."""

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 from redis import Redis
+from redis.exceptions import ResponseError
 
 from regnf_service.upkeep.reaper import Reaped, Reaper
 from regnf_state.records import FieldRecord, JobRecord
@@ -156,6 +158,23 @@ def test_heartbeats_get_time_to_come_again_after_an_outage(world: World) -> None
     assert world.reaper.run_once() == Reaped(), "nobody could beat, and nobody could look"
     assert world.after(14) == Reaped()
     assert world.after(1) == Reaped(requeued=("j1",))
+
+
+def test_a_round_that_failed_begins_the_counting_anew(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Redis refuses writes for less time than rounds may be apart: workers could not write either."""
+    world.run()
+    assert world.after(75) == Reaped()
+    with monkeypatch.context() as full:
+        full.setattr(world.redis, "lock", refused)
+        with pytest.raises(ResponseError):
+            world.pass_by(10)
+    assert world.pass_by(10) == Reaped(), "95 seconds without a heartbeat, but who could write one?"
+    assert world.pass_by(14) == Reaped()
+    assert world.pass_by(1) == Reaped(requeued=("j1",))
+
+
+def refused(*_given: object, **_named: object) -> NoReturn:
+    raise ResponseError("MISCONF Errors writing to the AOF file: No space left on device")
 
 
 def test_a_reaper_that_has_just_begun_does_not_know_who_was_silent(world: World) -> None:

@@ -78,6 +78,13 @@ class Reaper:
 
     def run_once(self) -> Reaped:
         """One round; nothing when another process leads. Raises RedisError when Redis cannot be reached."""
+        try:
+            return self._round()
+        except RedisError:
+            self._staleness.forget()
+            raise
+
+    def _round(self) -> Reaped:
         recalled = self._rebuild()
         with self._lease.held() as term:
             if term is None:

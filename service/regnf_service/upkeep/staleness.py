@@ -10,7 +10,8 @@ from typing import Any
 class Staleness:
     """Sees every record in every round. When two rounds are more than ``unbroken_s`` apart, all counting begins anew.
 
-    A process that could not look, because Redis was away or the machine slept, does not know what changed.
+    A process that could not look, because Redis was away or the machine slept, does not know what changed. Where it
+    knows that it could not, it says so with ``forget``.
     """
 
     def __init__(self, unbroken_s: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -25,6 +26,10 @@ class Staleness:
         now = self._clock()
         self._before = self._seen if now - self._now <= self._unbroken_s else {}
         self._now, self._seen = now, {}
+
+    def forget(self) -> None:
+        """A round failed: nobody could write either, so that no silence until now tells anything."""
+        self._before, self._seen = {}, {}
 
     def of(self, name: str, mark: Any) -> float:
         """For how many seconds the record ``name`` has been seen with this very mark."""
