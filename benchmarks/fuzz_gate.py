@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import base64
 import json
+import os
 import platform
 import select
 import subprocess
@@ -32,7 +33,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 from tests.core.importing.fuzzing.cases import STAGES
 from tests.core.importing.fuzzing.seeds import make_seeds
-from tests.core.importing.fuzzing.worker import CASE_S, MEMORY_BYTES
+from tests.core.importing.fuzzing.worker import CASE_S, ENVIRONMENT, MEMORY_BYTES
 
 _ANSWER_S = 3600.0
 """For a chunk of cases, each of which has a limit of its own: a machine may have other things to do."""
@@ -48,7 +49,10 @@ class Worker:
         self._folder = folder
         places = (str(folder / "seeds"), str(folder), seed, str(corpus))
         command = [sys.executable, "-m", "tests.core.importing.fuzzing.worker", *places, *stages]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        environment = os.environ | ENVIRONMENT
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
 
     def run(self, first: int, count: int) -> dict[str, Any] | None:
         """The chunk's results, None if the process did not live to tell them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from tests.core.importing.checkpoints import checkpoint
 from tests.core.importing.fuzzing.cases import STAGES, make_case
 from tests.core.importing.fuzzing.seeds import Seeds, make_seeds
 from tests.core.importing.fuzzing.stages import run_stage
+from tests.core.importing.fuzzing.worker import ENVIRONMENT
 
 ROOT = Path(__file__).resolve().parents[3]
 CASES = 4_500
@@ -170,7 +172,8 @@ def fuzzed(seeds: Seeds, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     seeds.save(folder / "seeds")
     module, places = "tests.core.importing.fuzzing.worker", (str(folder / "seeds"), str(folder))
     command = [sys.executable, "-m", module, *places, "1.1", str(folder / "corpus"), *STAGES]
-    done = subprocess.run(command, input=f"0 {CASES}\n", cwd=ROOT, capture_output=True, text=True, check=False)
+    asked, environment = f"0 {CASES}\n", os.environ | ENVIRONMENT
+    done = subprocess.run(command, input=asked, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{done.stderr} at {(folder / 'case').read_bytes()!r:.300}"
     results: dict[str, Any] = json.loads(done.stdout)
     return results

@@ -34,6 +34,8 @@ MEMORY_BYTES = 2 << 30
 CASE_S = 5.0
 _TRACED_S = 20.0
 """The same with every line traced, which makes Python several times slower."""
+ENVIRONMENT = {"MALLOC_ARENA_MAX": "1"}
+"""Variables that the process needs. Each thread's arena would take 64 MiB of its address space, used or not."""
 _MAX_FINDS = 400
 _TRACED_SHARE = 0.5
 
