@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def below(folder: Path) -> list[Path]:
-    """Every file and folder below this one, at whatever depth, in their order."""
+    """Every file and folder below this one, at whatever depth, in their order; none if it is not there."""
     places = ((Path(place), [*folders, *files]) for place, folders, files in os.walk(folder))
     return sorted(place / name for place, names in places for name in names)
 

@@ -1,4 +1,7 @@
-"""Which processes there are. One that ends while it is looked at is one that has ended, and no error."""
+"""Which processes there are. One that ends while it is looked at is one that has ended, and no error.
+
+But for ``children_of``: whoever asks for the children of one process takes it to be alive.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,16 @@ import psutil
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes whose parent this is; zombies count."""
-    return _below(pid, recursive=False)
+    """Processes whose parent this is; zombies count. Raises psutil.NoSuchProcess when the parent has ended."""
+    return [child.pid for child in psutil.Process(pid).children()]
 
 
 def descendants_of(pid: int) -> list[int]:
     """Every process below this one; zombies count."""
-    return _below(pid, recursive=True)
+    try:
+        return [child.pid for child in psutil.Process(pid).children(recursive=True)]
+    except psutil.NoSuchProcess:
+        return []
 
 
 def alive(pid: int) -> bool:
@@ -37,10 +43,3 @@ def processor_seconds(pid: int) -> float:
         return float(sum(psutil.Process(pid).cpu_times()[:4]))
     except psutil.NoSuchProcess:
         return 0.0
-
-
-def _below(pid: int, recursive: bool) -> list[int]:
-    try:
-        return [child.pid for child in psutil.Process(pid).children(recursive)]
-    except psutil.NoSuchProcess:
-        return []

@@ -24,7 +24,7 @@ from benchmarks.attacks.outcome import Outcome
 from benchmarks.attacks.persistent_client import PersistentClient
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
-from tests.processes import children_of
+from tests.processes import children_of, descendants_of
 
 _CLIENTS = 4
 _SETTINGS: dict[str, object] = {"threads": 1, "heartbeat_s": 1.0, "lost_after_s": 8.0, "rate_limit_per_s": 0}
@@ -97,7 +97,7 @@ def _inner(house: House, random: Random, deep: bool) -> bool:
     """Kill what a worker has forked; ``deep``: the process that reads an upload, inside of that."""
     pids = [child for worker in house.workers for child in children_of(worker.pid)]
     if deep:
-        pids = [grandchild for child in pids for grandchild in children_of(child)]
+        pids = [grandchild for child in pids for grandchild in descendants_of(child)]
     if not pids:
         return False
     with suppress(ProcessLookupError):

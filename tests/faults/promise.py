@@ -81,8 +81,8 @@ def leftovers(house: House) -> list[str]:
     states = {house.state(role) for role in ("api", "worker")}
     scratch = [state / "scratch" for state in states]
     inside = [path for top in scratch for path in below(top) if path.parent != top and path.name != ".lock"]
-    parts = [path for state in states for path in below(state / "field-cache") if path.suffix == ".part"]
-    system = below(Path(house.environment["TMPDIR"]))
+    parts = [path for state in states for path in (state / "field-cache").glob("*.part")]
+    system = list(Path(house.environment["TMPDIR"]).iterdir())
     return [str(path) for path in (*inside, *parts, *system)] + left_unfinished(house.store)
 
 

@@ -173,6 +173,16 @@ def test_a_round_that_failed_begins_the_counting_anew(world: World, monkeypatch:
     assert world.pass_by(1) == Reaped(requeued=("j1",))
 
 
+def test_a_round_that_fails_at_its_end_hides_no_dead_job(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here one step of every round is refused, and heartbeats could have been written."""
+    world.run()
+    monkeypatch.setattr(world.records, "expire_jobs", refused)
+    for _ in range(7):
+        with pytest.raises(ResponseError):
+            world.pass_by(15)
+    assert world.queue.registrations == [("j1", 2)]
+
+
 def refused(*_given: object, **_named: object) -> NoReturn:
     raise ResponseError("MISCONF Errors writing to the AOF file: No space left on device")
 

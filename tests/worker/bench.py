@@ -104,8 +104,8 @@ class Bench:
     def leftovers(self) -> list[str]:
         """Temporary files of jobs and of the blob store."""
         scratch = self.context.settings.scratch_dir
-        inside = [path for path in below(scratch) if len(path.relative_to(scratch).parts) == 2]
-        temporary = below(self.context.settings.blob_dir / ".tmp")
+        inside = [path for folder in scratch.iterdir() for path in below(folder) if path.parent == folder]
+        temporary = (self.context.settings.blob_dir / ".tmp").iterdir()
         return [path.name for path in [*inside, *temporary] if path.name != ".lock"]
 
 

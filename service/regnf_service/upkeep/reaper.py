@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -78,15 +79,13 @@ class Reaper:
 
     def run_once(self) -> Reaped:
         """One round; nothing when another process leads. Raises RedisError when Redis cannot be reached."""
-        try:
-            return self._round()
-        except RedisError:
-            self._staleness.forget()
-            raise
-
-    def _round(self) -> Reaped:
-        recalled = self._rebuild()
-        with self._lease.held() as term:
+        with ExitStack() as stack:
+            try:
+                recalled = self._rebuild()
+                term = stack.enter_context(self._lease.held())
+            except RedisError:  # no worker could write a heartbeat either
+                self._staleness.forget()
+                raise
             if term is None:
                 return Reaped(recalled=recalled)
             actions: dict[str, list[str]] = {name: [] for name in ("requeued", "failed", "dismissed", "enqueued")}

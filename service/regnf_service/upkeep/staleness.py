@@ -28,7 +28,7 @@ class Staleness:
         self._now, self._seen = now, {}
 
     def forget(self) -> None:
-        """A round failed: nobody could write either, so that no silence until now tells anything."""
+        """Redis could not be written to: a record that stayed the same until now tells nothing."""
         self._before, self._seen = {}, {}
 
     def of(self, name: str, mark: Any) -> float:

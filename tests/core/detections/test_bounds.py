@@ -151,4 +151,7 @@ def test_swapped_scene_and_object_are_noticed() -> None:
 
 
 def test_a_scene_without_bounds_refuses_nothing() -> None:
-    require_in_scene(Detection((9, 9, 9), (1, 1, 1)), ([-math.inf] * 3, [math.inf] * 3))
+    far = Detection((9, 9, 9), (1, 1, 1))
+    require_in_scene(far, ([-math.inf] * 3, [math.inf] * 3))
+    with pytest.raises(InvalidDetectionError):
+        require_in_scene(far, ROOM)
