@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from regnf_core.importing.containers.sniff_mesh import sniff_mesh
 
-HEAD_BYTES = 512
-"""How many first bytes are enough to name every format."""
+HEAD_BYTES = 16 * 1024
+"""How many first bytes are looked at: text may have a license before its first statement."""
 
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 _VDB_MAGICS = (b" BDV", b"NanoVDB")
@@ -103,7 +103,7 @@ def _first_name(head: bytes) -> bytes:
 def _may_be_torch_archive(head: bytes) -> bool:
     """Whether the first entry's name fits torch.save: <archive>/<member>. A head cut short gets the benefit."""
     name_end = _ZIP_NAME_AT + int.from_bytes(head[26:28], "little")
-    if len(head) < min(name_end, HEAD_BYTES):
+    if len(head) < name_end:
         return True
     parts = head[_ZIP_NAME_AT:name_end].split(b"/")
     return len(parts) >= 2 and parts[1] in _TORCH_MEMBERS

@@ -8,73 +8,91 @@ import struct
 
 MESH_FORMATS = ("dae", "glb", "gltf", "obj", "off", "pcd", "ply", "stl", "xyz")
 
-_HEAD = 512
 _BLANK = b"\xef\xbb\xbf \t\r\n"
-_OFF = re.compile(rb"(ST)?C?N?4?n?OFF(?![A-Za-z])")
+_OFF = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
 _OBJ_NUMBERS = {b"v": 3, b"vn": 3, b"vt": 1}
-_OBJ_WORDS = (b"o", b"g", b"mtllib", b"usemtl", b"s")
+_OBJ_WORDS = frozenset(
+    b"v vt vn vp f l p o g s mg mtllib usemtl usemap maplib lod bevel c_interp d_interp shadow_obj trace_obj "
+    b"cstype deg bmat step curv curv2 surf parm trim hole scrv sp end con ctech stech call csh".split()
+)
+"""The statements of the format's specification."""
+_OBJ_FEW = 8
+"""Statements that decide: by then every writer has written one that no other text begins with."""
+_LONG_COMMENT = 4096
+"""Bytes of comments, and nothing else, before the first statement: of the formats taken only OBJ has such."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
 
 
 def sniff_mesh(head: bytes) -> str | None:
-    """One of MESH_FORMATS, or None. ``head``: the file's first 512 bytes, or all of it."""
-    if head.startswith((b"ply\n", b"ply\r")):
-        return "ply"
+    """One of MESH_FORMATS, or None. ``head``: the file's beginning, HEAD_BYTES of it or the whole file.
+
+    Text may begin with a byte-order mark, blank lines and comments: the first statement decides, wherever it stands.
+    """
     if head.startswith(b"glTF"):
         return "glb"
-    if _OFF.match(head):
-        return "off"
-    if b"<COLLADA" in head and head.lstrip(_BLANK).startswith(b"<"):
-        return "dae"
-    if head.lstrip(_BLANK).startswith(b"{") and any(word in head for word in _GLTF_WORDS):
-        return "gltf"
-    if _is_pcd(head):
-        return "pcd"
-    if head.startswith(b"solid") and b"facet" in head:
-        return "stl"
-    if _is_obj(head):
-        return "obj"
     if _is_binary_stl(head):
         return "stl"
-    return "xyz" if _is_xyz(head) else None
+    text = head.lstrip(_BLANK)
+    if re.match(rb"ply[ \t]*[\r\n]", text):
+        return "ply"
+    if _OFF.match(text):
+        return "off"
+    if b"<COLLADA" in text and text.startswith(b"<"):
+        return "dae"
+    if text.startswith(b"{") and any(word in text for word in _GLTF_WORDS):
+        return "gltf"
+    if _is_pcd(text):
+        return "pcd"
+    if text[:5].lower() == b"solid" and (b"facet" in text.lower() or not _CONTROL & set(text)):
+        return "stl"
+    if _is_obj(text):
+        return "obj"
+    return "xyz" if _is_xyz(text) else None
 
 
-def _is_pcd(head: bytes) -> bool:
-    """Text whose first line that is not a comment names a version, and then the fields of a point."""
-    lines = [line.split() for line in head.splitlines() if line.strip() and not line.startswith(b"#")]
-    named = head.startswith(b"# .PCD") or bool(lines and lines[0][:1] == [b"VERSION"])
-    return named and any(words[:1] == [b"FIELDS"] for words in lines)
-
-
-def _is_xyz(head: bytes) -> bool:
-    """Lines of as many numbers each, three at least; the first may be their count alone, the last is cut off."""
-    if _CONTROL & set(head):
-        return False
-    lines = head.splitlines()
-    if len(head) >= _HEAD and not head.endswith(b"\n"):
+def _statements(text: bytes, comments: tuple[bytes, ...]) -> list[list[bytes]]:
+    """The words of each line that is no comment. A last line without an end may be cut off: it does not count, unless
+    it is the only one."""
+    lines = text.splitlines()
+    if len(lines) > 1 and not text.endswith((b"\n", b"\r")):
         lines = lines[:-1]
-    said = [line.replace(b",", b" ").replace(b";", b" ").split() for line in lines]
-    said = [words for words in said if words and not words[0].startswith((b"#", b"//"))]
+    return [line.split() for line in lines if line.strip() and not line.lstrip().startswith(comments)]
+
+
+def _is_pcd(text: bytes) -> bool:
+    """Its first line that is not a comment names a version, and then the fields of a point."""
+    said = _statements(text, (b"#",))
+    named = text.startswith(b"# .PCD") or bool(said and said[0][0] == b"VERSION")
+    return named and any(words[0] == b"FIELDS" for words in said)
+
+
+def _is_xyz(text: bytes) -> bool:
+    """Lines of as many numbers each, three at least; the first may be their count alone."""
+    if _CONTROL & set(text):
+        return False
+    said = _statements(text.replace(b",", b" ").replace(b";", b" "), (b"#", b"//"))
     if said and len(said[0]) == 1 and said[0][0].isdigit():
         said = said[1:]
     return bool(said) and len(said[0]) >= 3 and all(len(w) == len(said[0]) and all(map(_is_number, w)) for w in said)
 
 
-def _is_obj(head: bytes) -> bool:
-    """Text whose first line that is not a comment says what a line of an OBJ file may say."""
-    if _CONTROL & set(head):
+def _is_obj(text: bytes) -> bool:
+    """Lines that begin with statements of an OBJ file, or comments alone, as far as one can see."""
+    if _CONTROL & set(text):
         return False
-    lines = [line.split() for line in head.splitlines() if line.strip()]
-    said = [words for words in lines if not words[0].startswith(b"#")]
+    said = _statements(text, (b"#",))[:_OBJ_FEW]
     if not said:
-        return b"obj" in head.lower() and head.startswith(b"#")
-    first, *rest = said[0]
-    if first in _OBJ_NUMBERS:
-        return len(rest) >= _OBJ_NUMBERS[first] and all(map(_is_number, rest))
-    return first in _OBJ_WORDS and len(rest) >= 1
+        return text.startswith(b"#") and (b"obj" in text.lower() or len(text) > _LONG_COMMENT)
+    if not all(words[0] in _OBJ_WORDS for words in said):
+        return False
+    # A single short word begins many a text: one line alone has to say all that its statement needs.
+    needed = _OBJ_NUMBERS.get(said[0][0])
+    if needed is not None:
+        return len(said[0]) > needed and all(map(_is_number, said[0][1:]))
+    return len(said) > 1 or len(said[0]) > 1
 
 
 def _is_number(word: bytes) -> bool:

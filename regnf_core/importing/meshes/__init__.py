@@ -27,6 +27,8 @@ _WHOLE: dict[str, Callable[[memoryview], Geometry]] = {
     "stl": read_stl,
     "xyz": read_xyz,
 }
+_AT_FIXED_BYTES = frozenset({"glb", "stl"})
+_BLANK, _MOST_BLANKS = b"\xef\xbb\xbf \t\r\n", 4096
 MESH_READERS = (*_WHOLE, *_IN_PARTS)
 """The names that ``sniff_format`` gives files with a reader here."""
 
@@ -36,6 +38,9 @@ def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None) 
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED.
     """
+    if format_ not in _AT_FIXED_BYTES:  # text may begin with a byte-order mark and blank lines
+        head = bytes(data[:_MOST_BLANKS])
+        data = data[len(head) - len(head.lstrip(_BLANK)) :]
     if format_ in _IN_PARTS:
         return _IN_PARTS[format_](data, siblings or {})
     return _WHOLE[format_](data)

@@ -19,8 +19,9 @@ from regnf_core.importing.meshes.geometry import (
     within_unit,
 )
 
-_MAGIC = re.compile(rb"(ST)?(C)?(N)?(4)?(n)?OFF(?:[ \t]*BINARY)?")
+_MAGIC = re.compile(rb"(?:#[^\n]*\n\s*)*(ST)?(C)?(N)?(4)?(n)?OFF(?:[ \t]*BINARY)?")
 _MAX_CORNERS, _MAX_COLORS = 255, 8
+_MOST_HEAD = 16 * 1024  # comments may stand before the magic word
 _TRIANGLE_INTS = 5
 
 
@@ -28,7 +29,7 @@ def read_off(data: memoryview) -> Geometry:
     """The polygons of an OFF file, as fans of triangles. Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, or
     FORMAT_NOT_SUPPORTED for one of another dimension than three.
     """
-    head = bytes(data[:64])
+    head = bytes(data[:_MOST_HEAD])
     magic = _MAGIC.match(head)
     if magic is None:
         raise malformed("no OFF file")
@@ -36,7 +37,7 @@ def read_off(data: memoryview) -> Geometry:
     if four or any_dimension:
         raise unsupported("an OFF file of other than three dimensions")
     if magic.group().endswith(b"BINARY"):
-        line = head.find(b"\n")
+        line = head.find(b"\n", magic.end())
         if line < 0:
             raise malformed("an OFF file that ends within its first line")
         return _binary(data[line + 1 :], 3 + 3 * normal + 4 * color + 2 * texture, normal, color)

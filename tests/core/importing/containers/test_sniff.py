@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from tests.core.importing.archives import torch_zip, zip_bytes
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
@@ -36,6 +36,34 @@ def test_names_meshes() -> None:
     assert sniff_format(b"VERSION 0.7\nFIELDS x y z\n") == sniff_format(b"# .PCD v.7\nFIELDS x\n") == "pcd"
     assert sniff_format(b"1 2 3\n4e1 5 6\n") == sniff_format(b"# x y z\n2\n1,2,3\n") == "xyz"
     assert sniff_format(b"1.5 2.5 3.5 0.1 0.2 0.3\n" * 30) == "xyz"
+
+
+def _license(sign: str) -> bytes:
+    return (f"{sign} Permission is granted to whoever reads these words.\n" * 40).encode()
+
+
+@pytest.mark.parametrize(
+    ("head", "format_"),
+    [
+        (b"# File exported by Houdini\n# 8 points\ng\nv 0 0 1\nv 0 1 1\n", "obj"),
+        (_license("#") + b"v 0 0 1\n", "obj"),
+        (_license("#") * 9, "obj"),
+        (b"\xef\xbb\xbf# a mesh\r\n\r\nmaplib a\r\no\r\nv 0 0 1\r\n", "obj"),
+        (b"solid " + b"/" * 3000 + b"\nfacet normal 0 0 1\n", "stl"),
+        (b"\xef\xbb\xbf \n SOLID X\n FACET NORMAL 0 0 1\n", "stl"),
+        (b"solid\n" + b"facet normal 0 0 1\n", "stl"),
+        (_license("#") + b"OFF\n8 12 0\n", "off"),
+        (b"\xef\xbb\xbfply \r\nformat ascii 1.0\r\n", "ply"),
+        (_license("//") + b"1 2 3\n4 5 6\n", "xyz"),
+    ],
+)
+def test_the_first_statement_decides_wherever_it_stands(head: bytes, format_: str) -> None:
+    assert sniff_format(head[:HEAD_BYTES]) == format_
+
+
+@pytest.mark.parametrize("head", [b"g\n", b"end of the story\nonce more\n", b"solid\x00\x01", _license("%")])
+def test_one_short_word_is_no_mesh(head: bytes) -> None:
+    assert sniff_format(head) is None
 
 
 def test_arrays_and_databases_are_named() -> None:
