@@ -270,3 +270,46 @@ def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
         assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNIZED")
         assert list(table.context.blobs.list("fields")) == []
         assert "Traceback" not in table.log()
+
+
+BEGINNINGS = [
+    ("os:setpgrp", "OSError"),
+    ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
+    ("regnf_worker.kernel:give_way", "MemoryError"),
+    ("regnf_worker.worker_pipe:hold", "OSError"),
+    ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
+    ("regnf_worker.scratch:Scratch.use", "OSError"),
+    ("random:seed", "KeyboardInterrupt"),
+]
+"""What a job's process does before its job."""
+
+
+@pytest.mark.parametrize(
+    ("breaks", "raises", "reason"),
+    [*((*each, "INTERNAL") for each in BEGINNINGS), ("pathlib:Path.mkdir", "OSError", "STORAGE_FULL")],
+)
+def test_a_process_that_cannot_begin_takes_nothing_with_it(
+    table: Bench, breaks: str, raises: str, reason: str
+) -> None:
+    """The worker, its folder, its registration and the pictures of the job before stay; the job says what is wrong."""
+    table.environment |= {"TINY_BREAKS": breaks, "TINY_RAISES": raises}
+    worker = table.start_worker()
+    table.submit("draw_for_ever", "drawn")
+    assert table.finished("drawn").status == "successful"
+    (drawing,) = children_of(worker.pid)
+    folders = sorted(table.context.settings.scratch_dir.glob("*"))
+    (table.context.settings.state_dir / "break").touch()
+    table.submit("succeed")
+    failed = table.finished()
+    assert (failed.status, (failed.error or {}).get("reason")) == ("failed", reason), table.log()
+    assert alive(drawing)
+    assert worker.poll() is None
+    assert sorted(table.context.settings.scratch_dir.glob("*")) == folders
+    assert table.context.queue.live_workers() == 1
+    manifest = read_manifest(table.context.blobs, "drawn")
+    assert manifest is not None
+    assert (manifest.pending, manifest.missing) == (("preview.png",), ())
+    (table.context.settings.state_dir / "break").unlink()
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+    assert alive(drawing)
