@@ -92,10 +92,12 @@ def future_job_id(services: Services, caller: str, asked: JobRequest) -> str:
     return job_id_of(request, functions_of(found))
 
 
-def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: str | None) -> JobRecord:
+def submit(
+    services: Services, caller: str, asked: JobRequest, idempotency_key: str | None, batch: str | None = None
+) -> JobRecord:
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
-    A job that exists tells the request's webhook of its end too; one that has finished, at once.
+    batch: the id of the batch that starts it. A job that exists tells the request's webhook of its end too; one that has finished, at once.
     Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
@@ -114,7 +116,7 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
             kind=kind_of(request),
             status="accepted",
             request=request.to_record(),
-            inputs=_inputs(asked),
+            inputs=_inputs(asked) | ({} if batch is None else {"batch": batch}),
             created=now,
             updated=now,
         ),
