@@ -48,10 +48,11 @@ def document(world: World, batch_id: str) -> dict[str, Any]:
 
 def work(world: World, most: int = 1000) -> list[str]:
     """The jobs that wait succeed, ``most`` at most; their ids."""
-    done = [job_id for job_id, _ in world.queue.registrations[:most]]
-    for job_id in done:
+    done = []
+    for job_id, attempt in world.queue.registrations[:most]:
+        world.queue.take(job_id, attempt)
         record = world.records.get_job(job_id)
-        assert record is not None
-        world.queue.take(job_id, record.attempt)
-        world.succeed(job_id)
+        if record is not None and record.status == "accepted":  # one may be queued again that has just ended
+            world.succeed(job_id)
+            done.append(job_id)
     return done

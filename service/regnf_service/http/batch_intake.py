@@ -54,7 +54,8 @@ class Intake:
         most = self._services.settings.max_batch_pairs
         self._count += len(texts)
         if self._count > most:
-            raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", headers=CLOSE)
+            extra = {"fitting_lines": most}
+            raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", headers=CLOSE, extra=extra)
         return [self._read(text) for text in texts]
 
     def take(self, read: Sequence[Read]) -> None:
