@@ -16,7 +16,7 @@ from regnf_core.pair_result import short_result
 from regnf_service.budget import check_budget
 from regnf_service.fields.ingest import room_for_bytes
 from regnf_service.jobs.lookup import manifest_of, result_of
-from regnf_service.jobs.submit import check_fields, future_job_id, submit
+from regnf_service.jobs.submit import check_fields, future_job_id, start
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch, Pair
@@ -125,11 +125,12 @@ class Posting:
 
     def submit(self, lines: Sequence[Line]) -> None:
         """Start their jobs, as POST /register does. Raises what that raises, where it is not of one line alone."""
+        self._services.room.make(self._caller)
         for line in lines:
             if line.asked is None or line.job is None or line.is_done:
                 continue
             try:
-                line.job = submit(self._services, self._caller, line.asked, None, self._batch_id).id
+                start(self._services, self._caller, line.asked, line.job, self._batch_id)
             except QuotaError as error:
                 if error.reason != "QUOTA_WEBHOOKS":
                     raise

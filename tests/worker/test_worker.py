@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from regnf_core.options import RegistrationOptions
 from regnf_state.manifest import read_manifest
 from regnf_state.records import FieldRecord
 from tests.processes import alive, children_of
@@ -271,6 +272,17 @@ def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
         assert list(table.context.blobs.list("fields")) == []
         assert "Traceback" not in table.log()
 
+
+@pytest.mark.parametrize("pictures", [True, False])
+def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: bool) -> None:
+    table.start_worker()
+    table.submit("succeed", candidates=(OBJECT, SCENE), options=RegistrationOptions(), pictures=pictures)
+    assert table.finished().status == "successful", table.log()
+    manifest = read_manifest(table.context.blobs, "j1")
+    assert manifest is not None
+    named = {*manifest.pending, *(one.name for one in manifest.artifacts)}
+    assert named == ({"result.json", "preview.png"} if pictures else {"result.json"})
+    eventually(lambda: not read_manifest(table.context.blobs, "j1").pending, "all pictures")  # type: ignore[union-attr]
 
 BEGINNINGS = [
     ("os:setpgrp", "OSError"),

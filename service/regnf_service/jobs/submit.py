@@ -92,12 +92,10 @@ def future_job_id(services: Services, caller: str, asked: JobRequest) -> str:
     return job_id_of(request, functions_of(found))
 
 
-def submit(
-    services: Services, caller: str, asked: JobRequest, idempotency_key: str | None, batch: str | None = None
-) -> JobRecord:
+def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: str | None) -> JobRecord:
     """The job for a caller's request: a new one, or the one that exists, queued if it has not run.
 
-    batch: the id of the batch that starts it. A job that exists tells the request's webhook of its end too; one that has finished, at once.
+    A job that exists tells the request's webhook of its end too; one that has finished, at once.
     Raises Problem IDEMPOTENCY_KEY_REUSED, QUOTA_WORKER_SECONDS, QueueFullError, QuotaError, RecordsFullError.
     """
     request = asked.owned_by(caller)
@@ -109,6 +107,14 @@ def submit(
         if existing is not None:
             return existing
     _require_budget(services, caller, job_id)
+    return start(services, caller, asked, job_id)
+
+
+def start(
+    services: Services, caller: str, asked: JobRequest, job_id: str, batch: str | None = None
+) -> JobRecord:
+    """The same once there is room, for a job whose id is known. batch: the id of the batch that starts it."""
+    request = asked.owned_by(caller)
     now = services.records.now()
     record, _ = services.records.create_job(
         JobRecord(
