@@ -52,8 +52,16 @@ def results(path: Path) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     ("member", "value", "reason"),
     [
-        ("initial_transform", [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "INITIAL_TRANSFORM_UNSUPPORTED"),
-        ("ground_truth", {"T_object_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "INVALID_REQUEST"),
+        (
+            "initial_transform",
+            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+            "INITIAL_TRANSFORM_UNSUPPORTED",
+        ),
+        (
+            "ground_truth",
+            {"T_object_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+            "INVALID_REQUEST",
+        ),
     ],
 )
 def test_a_search_refuses_what_is_of_one_object(

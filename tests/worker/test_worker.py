@@ -284,6 +284,7 @@ def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: b
     assert named == ({"result.json", "preview.png"} if pictures else {"result.json"})
     eventually(lambda: not read_manifest(table.context.blobs, "j1").pending, "all pictures")  # type: ignore[union-attr]
 
+
 BEGINNINGS = [
     ("os:setpgrp", "OSError"),
     ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
@@ -300,9 +301,7 @@ BEGINNINGS = [
     ("breaks", "raises", "reason"),
     [*((*each, "INTERNAL") for each in BEGINNINGS), ("pathlib:Path.mkdir", "OSError", "STORAGE_FULL")],
 )
-def test_a_process_that_cannot_begin_takes_nothing_with_it(
-    table: Bench, breaks: str, raises: str, reason: str
-) -> None:
+def test_a_process_that_cannot_begin_takes_nothing_with_it(table: Bench, breaks: str, raises: str, reason: str) -> None:
     """The worker, its folder, its registration and the pictures of the job before stay; the job says what is wrong."""
     table.environment |= {"TINY_BREAKS": breaks, "TINY_RAISES": raises}
     worker = table.start_worker()

@@ -186,9 +186,7 @@ class CoreEngine:
         place, options = open_field(scene, self.device), request.options
         box = OrientedBox.from_quaternion(**asdict(request.detection))
         objects = {
-            one.sha256: LibraryObject(one.sha256, opener(one), one.model)
-            for one in candidates
-            if one.model is not None
+            one.sha256: LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None
         }
         found = search_library(place, box, [*objects.values()], options, request.seed, report, clouds=False)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)

@@ -44,7 +44,9 @@ class CallersLibrary:
         return object_, candidates
 
     def _selected(self, wanted: LibraryFilter) -> list[str]:
-        found = self._named({f"/candidates/library/names/{place}": name for place, name in enumerate(wanted.names or ())})
+        found = self._named(
+            {f"/candidates/library/names/{place}": name for place, name in enumerate(wanted.names or ())}
+        )
         if wanted.tags is not None or wanted.names is None:
             found = found + self._tagged(wanted.tags)
         meant = list(dict.fromkeys(found))

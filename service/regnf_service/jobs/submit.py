@@ -110,9 +110,7 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
     return start(services, caller, asked, job_id)
 
 
-def start(
-    services: Services, caller: str, asked: JobRequest, job_id: str, batch: str | None = None
-) -> JobRecord:
+def start(services: Services, caller: str, asked: JobRequest, job_id: str, batch: str | None = None) -> JobRecord:
     """The same once there is room, for a job whose id is known. batch: the id of the batch that starts it."""
     request = asked.owned_by(caller)
     now = services.records.now()
