@@ -31,6 +31,7 @@ from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.viewing import write_artifacts
+from regnf_worker import kernel
 from regnf_worker.job_limits import JobLimits
 from tests.core.analytic import AnalyticField, boxes
 from tests.option_extremes import extremes
@@ -84,9 +85,7 @@ def run(name: str, values: dict[str, Any], seconds: float) -> Run:
 def in_child(options: RegistrationOptions, seconds: float) -> tuple[str, int]:
     """Register in a process under a job's limits: how it ended, and its peak of resident memory."""
     with tempfile.TemporaryDirectory() as folder:
-        child = os.fork()
-        if child == 0:
-            os._exit(_job(options, Path(folder)))
+        child = kernel.forked(lambda: os._exit(_job(options, Path(folder))))
         deadline = time.monotonic() + seconds
         while True:
             pid, status, usage = os.wait4(child, os.WNOHANG)

@@ -125,18 +125,33 @@ def _document(pair: FilePair) -> dict[str, Any]:
     lower, upper = scene.bounds.tolist()
     require_in_scene(detection, (lower, upper))
     box = OrientedBox.from_detection(detection)
+    start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     if pair.is_search:
-        found = search_library(scene, box, [_candidate(one, options) for one in pair.objects], options, request["seed"])
+        _require_nothing_of_one_object(start, truth)
+        library = [_candidate(one, options) for one in pair.objects]
+        found = search_library(scene, box, library, options, request["seed"], clouds=False)
         ranking = ranking_document(found.ranking, {})
         document: dict[str, Any] = result_document(found.result, object_name=found.ranking[0].name, candidates=ranking)
         return document
     (name,) = pair.objects
     model = _model(name, options.robust.object_samples) if options.preset == "robust" else None
-    start, truth = request.get("initial_transform"), (request.get("ground_truth") or {}).get("T_object_scene")
     warm = WarmStart(None if start is None else Sim3.from_matrix(start), model)
-    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=False)
+    # errors against a truth are those of the clouds' points
+    clouds = truth is not None
+    result = register(scene, _field(name, "object"), box, options, request["seed"], warm_start=warm, clouds=clouds)
     told: dict[str, Any] = result_document(result, None if truth is None else Sim3.from_matrix(truth))
     return told
+
+
+def _require_nothing_of_one_object(start: object, truth: object) -> None:
+    """Raises InvalidInputError, as a service refuses such a line."""
+    for name, given, reason in (
+        ("initial_transform", start, "INITIAL_TRANSFORM_UNSUPPORTED"),
+        ("ground_truth", truth, "INVALID_REQUEST"),
+    ):
+        if given is not None:
+            hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
+            raise InvalidInputError(f"`{name}` is of one object, not of several candidates", reason=reason, hint=hint)
 
 
 @lru_cache(_FIELDS_OPEN)

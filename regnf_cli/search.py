@@ -167,6 +167,7 @@ def _search_here(
             options,
             request["seed"],
             lambda phase, share: bar.update(task, description=phase, completed=share),
+            clouds=output is not None,
         )
         bar.update(task, description="exporting", completed=1.0)
     winner = next(one for one in objects if str(one.named) == found.ranking[0].name)

@@ -16,7 +16,7 @@ import regnf_client.registrations as registrations
 from regnf_client.answers import refusal
 from regnf_client.async_driver import AsyncDriver
 from regnf_client.async_library import AsyncLibrary
-from regnf_client.batches import BatchReader, PairLike, PairResult, parts_of
+from regnf_client.batches import BatchReader, PairLike, PairResult
 from regnf_client.connection import ADDRESS, WORKER_TIMEOUT_S, Connection
 from regnf_client.errors import unreachable
 from regnf_client.events import EventReader
@@ -154,15 +154,13 @@ class AsyncClient:
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> AsyncIterator[PairResult]:
-        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, in no order.
+        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, each batch in its order.
 
         A pair that fails stops no other. Called again with the same requests after an interruption, it goes on.
         """
         asking = self._connection.asking(progress, timeout_s)
-        deadline = asking.deadline()
-        for part in parts_of(requests):
-            reader = BatchReader(asking, part, deadline)
-            found: list[PairResult] | None = await self._driver.run(reader.post())
+        reader = BatchReader(asking, requests, asking.deadline())
+        while (found := await self._driver.run(reader.post())) is not None:
             while found is not None:
                 for one in found:
                     yield one

@@ -5,28 +5,28 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from httpx import Response
 from pydantic import BeforeValidator, Field
 
 from regnf_client.answers import checked, refusal, service_error
-from regnf_client.errors import ServiceError
 from regnf_client.fields import Asking, Deadline, FieldLike, known_sha256, upload
 from regnf_client.models import Alternative, Document, Matrix, Verdict
 from regnf_client.registrations import Request
-from regnf_client.steps import Flow, call
+from regnf_client.steps import Flow, Pause, call
 from regnf_client.worker_watch import look
 from regnf_core.detections.objects import BoxLike
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.field_source import Role
 from regnf_core.options import OptionsLike
 
-PAIRS_AT_ONCE = 5000
-"""More requests become several batches, one after the other."""
-_LINES_AT_ONCE = 500
+PAIRS_AT_ONCE = 500
+_BYTES_AT_ONCE = 4 << 20
+"""More requests become several batches, one after the other: the service takes a thousand lines, of 8 MiB."""
 _OWN = ("scene", "object", "candidates", "detection", "options", "seed", "key")
+_LONGEST_PAUSE_S = 60.0
 _HEADERS = {"Content-Type": "application/x-ndjson"}
 
 
@@ -96,87 +96,87 @@ class PairResult(Document):
         return f"PairResult({name}: {self.verdict or (self.error.reason if self.error else self.status)})"
 
 
-def parts_of(requests: Iterable[PairLike]) -> Iterator[list[tuple[int, PairLike]]]:
-    """The requests with their places, as many at a time as one batch has."""
-    numbered = iter(enumerate(requests))
-    while part := list(islice(numbered, PAIRS_AT_ONCE)):
-        yield part
-
-
 class BatchReader:
-    """One batch, from its requests to its last result. Call ``post``, then ``read`` until it says None."""
+    """Any number of requests, from the first to the last result: several batches, one after the other.
 
-    def __init__(self, asking: Asking, part: list[tuple[int, PairLike]], deadline: Deadline) -> None:
+    Call ``post``, then ``read`` until it says None; so on until ``post`` says None. What is posted twice is one job, so
+    after an interruption the same requests go on.
+    """
+
+    def __init__(self, asking: Asking, requests: Iterable[PairLike], deadline: Deadline) -> None:
         self._asking = asking
-        self._part = part
+        self._requests = enumerate(requests)
         self._deadline = deadline
         self._sent: dict[tuple[str, str], str | RegnfError] = {}
+        self._lines: list[tuple[int, bytes]] = []
+        """Lines that are not posted yet, with the places of their requests."""
         self._indexes: list[int] = []
-        """Of the pairs that were posted."""
+        """Of the pairs that were posted last."""
         self._id = ""
         self._after = 0
-        self._pairs = 0
-        self._ended = False
+        self._read = 0
 
-    def post(self) -> Flow[list[PairResult]]:
-        """Upload what the service lacks and post the pairs; the results that are known at once: pairs that could not be
-        posted, and what an earlier call has left."""
-        lines, refused = [], []
-        for index, given in self._part:
+    def post(self) -> Flow[list[PairResult] | None]:
+        """Upload what the service lacks and post the next pairs; the results of those that could not be posted. None
+        after the last. Where the service has no room for all of them, as many as it has room for, once it has."""
+        refused = yield from self._fill()
+        if not self._lines:
+            return refused or None
+        content = b"\n".join(line for _, line in self._lines)
+        while True:
+            answer = yield from call(self._asking.patience, "POST", "/batches", content=content, headers=_HEADERS)
+            fitting = _fitting(answer)
+            if fitting is None:
+                break
+            if fitting == 0:
+                self._deadline.check("room for the next pairs")
+                yield from look(self._asking.watch, self._asking.patience)
+                yield Pause(_retry_after_s(answer))
+            else:
+                content = b"\n".join(line for _, line in self._lines[:fitting])
+        self._id, pairs = checked(answer)["id"], checked(answer)["pairs"]
+        self._indexes = [index for index, _ in self._lines[:pairs]]
+        self._lines, self._after = self._lines[pairs:], 0
+        return refused
+
+    def _fill(self) -> Flow[list[PairResult]]:
+        """Take requests until there are as many lines as one batch has; the results of those that cannot be posted."""
+        refused = []
+        size = sum(len(line) for _, line in self._lines)
+        while len(self._lines) < PAIRS_AT_ONCE and size < _BYTES_AT_ONCE:
+            index, given = next(self._requests, (None, None))
+            if index is None:
+                break
             try:
-                pair = Pair.of(given)
-                lines.append(json.dumps((yield from self._line(pair))).encode())
-                self._indexes.append(index)
+                line = json.dumps((yield from self._line(Pair.of(given)))).encode()
+                self._lines.append((index, line))
+                size += len(line)
             except RegnfError as error:
                 if getattr(error, "unavailable", False) or error.reason == "UNAUTHENTICATED":
                     raise
                 refused.append(PairResult(index=index, key=_key_of(given), status="refused", error=error))
-        if not lines:
-            self._ended = True
-            return refused
-        content = b"\n".join(lines)
-        answer = yield from call(self._asking.patience, "POST", "/batches", content=content, headers=_HEADERS)
-        document = checked(answer)
-        self._id, self._pairs = document["id"], document["pairs"]
-        if document["passes"] > 1:
-            refused += yield from self._earlier(document)
         return refused
 
-    def _earlier(self, document: Mapping[str, Any]) -> Flow[list[PairResult]]:
-        """What is left of the passes before this one: failed pairs are repeated now."""
-        last: dict[int, PairResult] = {}
-        while self._after < document["results"]:
-            for one in (yield from self._fetch(wait_s=0, limit=document["results"] - self._after)):
-                last[one.index] = one
-        goes_on = document["status"] == "running"
-        return [one for one in last.values() if not (goes_on and one.status == "failed")]
-
     def read(self) -> Flow[list[PairResult] | None]:
-        """The next results, some or none; None after the last. Raises WaitTimeoutError, ServiceError (CANCELLED)."""
-        if self._ended:
+        """The next results, some or none; None after the last of what was posted. Raises WaitTimeoutError."""
+        if self._after >= len(self._indexes):
             return None
-        found = yield from self._fetch(self._deadline.hold_s(), _LINES_AT_ONCE)
-        self._asking.tell("registering", min(1.0, self._after / self._pairs))
-        if not found and not self._ended:
-            self._deadline.check(f"the batch {self._id}")
-            yield from look(self._asking.watch, self._asking.patience)
-        return found
-
-    def _fetch(self, wait_s: int, limit: int) -> Flow[list[PairResult]]:
-        params = {"after": self._after, "limit": limit, "wait": wait_s}
+        params = {"after": self._after, "wait": self._deadline.hold_s()}
         answer = yield from call(self._asking.patience, "GET", f"/batches/{self._id}/results", params=params)
         if not answer.is_success:
             raise refusal(answer)
         found = [self._result(json.loads(line)) for line in answer.text.splitlines()]
-        status = answer.headers.get("batch-status")
-        if not found and status == "dismissed":
-            raise ServiceError(f"the batch {self._id} was cancelled", reason="CANCELLED", hint="Post it again.")
-        self._ended = not found and status != "running"
+        self._read += len(found)
+        known = self._read + len(self._indexes) - self._after + len(self._lines)
+        self._asking.tell("registering", self._read / max(1, known))
+        if not found:
+            self._deadline.check(f"the batch {self._id}")
+            yield from look(self._asking.watch, self._asking.patience)
         return found
 
     def _result(self, told: dict[str, Any]) -> PairResult:
         self._after = told["number"]
-        return PairResult.model_validate({**told, "index": self._indexes[told["pair"] - 1]})
+        return PairResult.model_validate({**told, "index": self._indexes[told["number"] - 1]})
 
     def _line(self, pair: Pair) -> Flow[dict[str, Any]]:
         body = Request(pair.detection, pair.options, pair.seed, more=pair.more).body()
@@ -207,6 +207,20 @@ class BatchReader:
         if isinstance(found, RegnfError):
             raise found
         return found
+
+
+def _fitting(answer: Response) -> int | None:
+    """How many of the first lines the service has room for, where it has none for all of them."""
+    try:
+        fitting = None if answer.is_success else answer.json().get("fitting_lines")
+    except (ValueError, AttributeError):
+        return None
+    return fitting if isinstance(fitting, int) else None
+
+
+def _retry_after_s(answer: Response) -> float:
+    text = answer.headers.get("retry-after", "")
+    return min(_LONGEST_PAUSE_S, float(text)) if text.isdecimal() and text.isascii() else 1.0
 
 
 def _key_of(given: PairLike) -> str | None:

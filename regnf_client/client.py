@@ -13,7 +13,7 @@ import regnf_client.fields as fields
 import regnf_client.jobs as jobs
 import regnf_client.registrations as registrations
 from regnf_client.answers import refusal
-from regnf_client.batches import BatchReader, PairLike, PairResult, parts_of
+from regnf_client.batches import BatchReader, PairLike, PairResult
 from regnf_client.connection import ADDRESS, WORKER_TIMEOUT_S, Connection
 from regnf_client.errors import unreachable
 from regnf_client.events import EventReader
@@ -153,15 +153,13 @@ class Client:
     def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> Iterator[PairResult]:
-        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, in no order.
+        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, each batch in its order.
 
         A pair that fails stops no other. Called again with the same requests after an interruption, it goes on.
         """
         asking = self._connection.asking(progress, timeout_s)
-        deadline = asking.deadline()
-        for part in parts_of(requests):
-            reader = BatchReader(asking, part, deadline)
-            found: list[PairResult] | None = self._driver.run(reader.post())
+        reader = BatchReader(asking, requests, asking.deadline())
+        while (found := self._driver.run(reader.post())) is not None:
             while found is not None:
                 yield from found
                 found = self._driver.run(reader.read())

@@ -78,11 +78,13 @@ def search_library(
     options: RegistrationOptions | None = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
+    clouds: bool = True,
 ) -> LibrarySearch:
     """Rank the library's objects for one detection, and register the likeliest, by the preset `robust`.
 
     All are compared by signature, the nearest 12 searched coarsely, at most 4 refined on their fields and evaluated:
-    the time hardly grows with the library. Deterministic for a seed. ``progress`` as in :func:`regnf_core.register`.
+    the time hardly grows with the library. Deterministic for a seed. ``progress`` and ``clouds`` as in
+    :func:`regnf_core.register`.
     Raises InvalidOptionsError (LIBRARY_SEARCH_UNSUPPORTED) for options of another preset, InvalidInputError
     (LIBRARY_EMPTY, FIELD_NOT_FINITE), InvalidDetectionError, NoSurfaceError.
     """
@@ -100,13 +102,13 @@ def search_library(
     with run.phase("optimizing"):
         refined = _refine(query, library, worth_refining(coarse), run)
     with run.phase("verifying"):
-        result = _register_first(query, library[refined[0].number], refined[0])
+        first = library[refined[0].number]
+        result = _register_first(query, first, refined[0])
 
     def add_clouds(found: RegistrationResult) -> RegistrationResult:
-        obj = library[refined[0].number].field()
-        return with_clouds(found, scene, obj, detection, cloud_region(detection))
+        return with_clouds(found, scene, first.field(), detection, cloud_region(detection))
 
-    result = run.finish(result, add_clouds)
+    result = run.finish(result, add_clouds if clouds else None)
     return LibrarySearch(_ranking(library, nearest, coarse, refined, result), result)
 
 

@@ -280,12 +280,7 @@ REASONS: dict[str, Reason] = {
     ),
     "RANGE_NOT_SATISFIABLE": Reason(416, "Range not satisfiable", "The range begins past the artifact's end."),
     # batches
-    "BATCH_NOT_FOUND": Reason(404, "No such batch", "The id is unknown, or the batch was deleted."),
-    "BATCH_EXPIRED": Reason(
-        410, "Batch has expired", "The batch was deleted after its retention time. Post its pairs again."
-    ),
-    "BATCH_ACTIVE": Reason(409, "Batch is active", "Cancel the batch before you delete it."),
-    "BATCH_FINISHED": Reason(409, "Batch has finished", "A batch that has finished can no longer be cancelled."),
+    "BATCH_NOT_FOUND": Reason(404, "No such batch", "The id is unknown, or the batch is gone. Post its lines again."),
     "BATCH_EMPTY": Reason(422, "Batch without pairs", "The body has no line. Send one request a line."),
     "TOO_MANY_PAIRS": Reason(
         413, "Too many pairs", "The batch has more lines than the service takes. Send them as several batches."

@@ -9,7 +9,7 @@ from regnf_core.library_entries import EntryNotes
 from regnf_state.library import LibraryEntry
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.pages import Page, Position
-from regnf_state.records import NO_QUOTA, FieldRecord, JobEvent, JobNews, JobRecord, Quota
+from regnf_state.records import NO_QUOTA, FieldRecord, JobEvent, JobNews, JobRecord, Quota, UnreadableRecordError
 
 
 class RecordStore(Protocol):
@@ -39,8 +39,16 @@ class RecordStore(Protocol):
 
     def get_job(self, job_id: str) -> JobRecord | None: ...
 
-    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | None]:
-        """Several jobs in one round trip, in the order asked for."""
+    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
+        """Several jobs in one round trip, in the order asked for; one that cannot be read keeps no other back."""
+        ...
+
+    def active_among(self, job_ids: Sequence[str]) -> set[str]:
+        """Which of these jobs wait or run, without reading their records. Redis may have lost some."""
+        ...
+
+    def room_for_jobs(self, owner: str, max_active: int, quota: Quota) -> tuple[int, str]:
+        """How many jobs ``create_job`` takes of the owner now, and the reason that one more is refused for."""
         ...
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:

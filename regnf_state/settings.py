@@ -115,9 +115,9 @@ class Settings(BaseSettings):
     quota_worker_seconds_per_hour: int | None = Field(default=None, ge=1)
     """What each caller's imports and jobs may cost the workers in an hour."""
     quota_batches: int = Field(default=100, ge=1)
-    """Of each caller; beyond this its oldest batch that has ended goes."""
-    max_batch_pairs: int = Field(default=10_000, ge=1)
-    max_batch_bytes: int = Field(default=64 * MIB, ge=1024)
+    """Of each caller; beyond this the one goes that was posted first of those that have ended."""
+    max_batch_pairs: int = Field(default=1000, ge=1)
+    max_batch_bytes: int = Field(default=8 * MIB, ge=1024)
     """Largest body of a batch."""
     caller_weights: Mapping[str, Annotated[float, Field(gt=0, le=1000)]] = Field(default_factory=dict)
     """JSON object of callers' shares of the workers, where another caller waits; of everyone else: 1."""

@@ -89,8 +89,8 @@ def results(client: httpx.Client, batch_id: str) -> Iterator[dict[str, Any]]:
         answer = client.get(f"/batches/{batch_id}/results", params={"after": after, "wait": 20})
         lines = [json.loads(line) for line in answer.text.splitlines()]
         yield from lines
-        after += len(lines)
-        if not lines and answer.headers["batch-status"] != "running":
+        after = int(answer.headers["batch-after"])
+        if answer.headers["batch-left"] == "0":
             return
 
 

@@ -45,6 +45,7 @@ def search(
     options: OptionsLike = None,
     seed: int = 0,
     progress: ProgressCallback | None = None,
+    clouds: bool = True,
 ) -> Search:
     """Which object stands in the box, and where, by the preset `robust`.
 
@@ -64,7 +65,7 @@ def search(
             unusable[name] = error.reason
     if not library:
         raise NoSurfaceError("none of the objects has a surface", reason="NO_SURFACE_IN_OBJECT")
-    found = search_library(place.field, box, library, chosen, seed, progress)
+    found = search_library(place.field, box, library, chosen, seed, progress, clouds)
     first = found.ranking[0].name
     notes = None if place.notes is None else {"scene": place.notes}
     return Search(found.ranking, Registered.of(found.result, first, notes, box), unusable)

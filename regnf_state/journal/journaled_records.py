@@ -80,6 +80,15 @@ class JournaledRecordStore(RedisRecordStore):
             found = super().get_job(job_id)
         return found
 
+    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
+        found = super().get_jobs(job_ids)
+        missing = [name for name, job in zip(job_ids, found, strict=True) if job is None]
+        if not missing or self.generation.is_current():
+            return found
+        for name in missing:
+            self.recall_job(name)
+        return super().get_jobs(job_ids)
+
     def news(self, positions: Sequence[tuple[str, str | None]]) -> list[JobNews]:
         found = super().news(positions)
         if all(one.record is not None for one in found) or self.generation.is_current():

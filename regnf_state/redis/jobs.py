@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, cast
 
 from redis import Redis
+from redis.exceptions import ResponseError
 
 from regnf_state import transitions
 from regnf_state.ownership import ANONYMOUS, owner_of
@@ -32,7 +33,7 @@ from regnf_state.records import (
 )
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
-from regnf_state.redis.documents import Cap, Command, Kind, ask, stored_in, text
+from regnf_state.redis.documents import Cap, Command, Kind, ask, is_wrong_type, stored_in, text
 from regnf_state.redis.events import events_in, start_of
 from regnf_state.redis.keys import PREFIX
 from regnf_state.redis.library import RedisLibrary
@@ -202,9 +203,43 @@ class RedisRecordStore(RedisLibrary):
             self._require_known(JOB, job_id)
         return found
 
-    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | None]:
-        found = [self._readable(JOB, name, held) for name, held in self._fetch(JOB, job_ids)]
-        return [record or self.get_job(name) for name, record in zip(job_ids, found, strict=True)]
+    def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
+        return [self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)]
+
+    def _held(self, job_id: str, stored: Stored | None) -> JobRecord | UnreadableRecordError | None:
+        try:
+            found = self._record(JOB, job_id, stored)
+            if found is None:
+                self._require_known(JOB, job_id)
+        except UnreadableRecordError as error:
+            return error
+        return found
+
+    def active_among(self, job_ids: Sequence[str]) -> set[str]:
+        return {name for name, held in zip(job_ids, self._are_active(job_ids), strict=True) if held}
+
+    def _are_active(self, job_ids: Sequence[str]) -> list[int]:
+        try:
+            return cast(list[int], self._redis.smismember(_ACTIVE, list(job_ids))) if job_ids else []
+        except ResponseError as error:
+            if not is_wrong_type(error):
+                raise
+            return [0] * len(job_ids)  # a damaged index holds nothing
+
+    def room_for_jobs(self, owner: str, max_active: int, quota: Quota) -> tuple[int, str]:
+        with self._redis.pipeline(transaction=False) as pipeline:
+            pipeline.scard(_ACTIVE)
+            pipeline.scard(_active_key(owner))
+            every, own = (held if isinstance(held, int) else 0 for held in pipeline.execute(raise_on_error=False))
+        of_owner = max_active
+        if quota.active_jobs is not None:
+            of_owner = quota.active_jobs - own
+        elif quota.share_jobs:
+            of_owner = (max_active - own - every + 1) // 2  # each new one leaves two fewer: see ``create_job``
+        if of_owner <= 0 and self._forget_ended(owner):
+            return self.room_for_jobs(owner, max_active, quota)
+        reason = "QUOTA_ACTIVE_JOBS" if of_owner < max_active - every else "QUEUE_FULL"
+        return max(0, min(of_owner, max_active - every)), reason
 
     def job_expired(self, job_id: str, owner: str = ANONYMOUS) -> bool:
         with self._redis.pipeline(transaction=False) as pipeline:

@@ -11,9 +11,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from fastapi import FastAPI
 from redis.exceptions import RedisError
 
-from regnf_service.batches.feeding import feed_until_stopped
 from regnf_service.concurrency import in_thread, pause
-from regnf_service.http.batch_intake import REQUESTS
 from regnf_service.http.hosts import allowed_hosts
 from regnf_service.metrics import Metrics
 from regnf_service.metrics_port import served
@@ -38,7 +36,6 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         app.openapi()  # takes a while, so not during the first request
         await in_thread(_check_storage, services)
         reaping = asyncio.create_task(_reap(services))
-        feeding = asyncio.create_task(feed_until_stopped(services, REQUESTS))
         delivering = asyncio.create_task(
             deliver_until_stopped(services.webhooks, services.records, services.redis, services.stopping)
         )
@@ -51,7 +48,6 @@ def lifespan_of(services: Services, metrics: Metrics) -> Callable[[FastAPI], Abs
         await services.uploads.emptied(_CLEARING_UP_S)
         await delivering
         await reaping
-        await feeding
         services.redis.close()
 
     return lifespan

@@ -22,7 +22,6 @@ from regnf_state.pieces import Pieces
 from regnf_state.queue import JobQueue
 from regnf_state.quota import quota_of
 from regnf_state.records import Quota
-from regnf_state.redis.batch_index import BatchIndex
 from regnf_state.room import Room
 from regnf_state.settings import Settings
 
@@ -32,10 +31,7 @@ _LOOK_THREADS = 2
 
 @dataclass(frozen=True)
 class Services:
-    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too.
-
-    ``batch_posted`` is set when a batch has pairs to hand out, so that nobody waits for the feeder's next round.
-    """
+    """What every request may use. ``stopping`` is set when the process is to end: long answers then end too."""
 
     settings: Settings
     redis: Redis
@@ -44,7 +40,6 @@ class Services:
     queue: JobQueue
     webhooks: Webhooks
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
-    batch_posted: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
     # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
     upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
@@ -74,7 +69,7 @@ class Services:
     @cached_property
     def batches(self) -> Batches:
         """Batches of registrations."""
-        return Batches(self.blobs, BatchIndex(self.redis), self.settings.retention_s)
+        return Batches(self.blobs)
 
     @cached_property
     def requests(self) -> Slots:

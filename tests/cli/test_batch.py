@@ -49,6 +49,30 @@ def results(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.with_suffix(".results.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.parametrize(
+    ("member", "value", "reason"),
+    [
+        (
+            "initial_transform",
+            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+            "INITIAL_TRANSFORM_UNSUPPORTED",
+        ),
+        (
+            "ground_truth",
+            {"T_object_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
+            "INVALID_REQUEST",
+        ),
+    ],
+)
+def test_a_search_refuses_what_is_of_one_object(
+    run: Run, folder: Path, member: str, value: object, reason: str
+) -> None:
+    """As a service does; nothing that is given is passed over."""
+    path = write(folder, [pair(object=None, candidates=["armchair.safetensors"], **{member: value})])
+    assert run("batch", str(path), "--jobs", "1").code == 1
+    assert [one["error"]["reason"] for one in results(path)] == [reason]
+
+
 def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> None:
     lines: list[dict[str, Any] | str] = [
         pair(key="a"),

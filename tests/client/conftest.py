@@ -10,10 +10,10 @@ from regnf_client import Client
 from regnf_client.sync_driver import SyncDriver
 from tests.client.transports import Handler, Pretended
 from tests.contract.asgi import AppTransport
-from tests.contract.conftest import world
+from tests.contract.conftest import world, worlds
 from tests.contract.world import World
 
-__all__ = ["world"]
+__all__ = ["world", "worlds"]
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,30 @@ import httpx
 import numpy as np
 import pytest
 
-from regnf_client import AsyncClient, Client, Pair, PairResult, ServiceError
+from regnf_client import AsyncClient, Client, Pair, PairResult, ServiceError, WaitTimeoutError
 from tests.client.conftest import pretended
 from tests.contract.asgi import AppTransport
-from tests.contract.batch_rounds import Rounds
+from tests.contract.batch_posts import work
 from tests.contract.world import BOX, RESULT, World
 
 
 @pytest.fixture
-def working(world: World) -> Iterator[Rounds]:
-    """The service's rounds, and a worker that has every job succeed, until the test ends."""
-    rounds, ended = Rounds(world), threading.Event()
+def working(world: World) -> Iterator[World]:
+    """A worker has every job succeed, until the test ends."""
+    yield from at_work(world)
+
+
+def at_work(world: World) -> Iterator[World]:
+    ended = threading.Event()
     world.valid_request()
 
     def run() -> None:
         while not ended.wait(0.02):
-            rounds.feed()
-            rounds.work()
+            work(world)
 
     worker = threading.Thread(target=run)
     worker.start()
-    yield rounds
+    yield world
     ended.set()
     worker.join()
 
@@ -43,7 +46,7 @@ def requests(world: World, count: int) -> Iterator[dict[str, Any]]:
         yield {**world.valid_request(), "seed": number, "key": f"pair {number}"}
 
 
-def test_results_come_with_the_keys_of_their_requests(world: World, working: Rounds, transport: AppTransport) -> None:
+def test_results_come_with_the_keys_of_their_requests(world: World, working: World, transport: AppTransport) -> None:
     shares: list[float] = []
     with Client("http://localhost", transport=transport) as client:
         found = list(client.batch(requests(world, 5), progress=lambda _, share: shares.append(share)))
@@ -58,7 +61,7 @@ def test_results_come_with_the_keys_of_their_requests(world: World, working: Rou
 
 
 def test_a_pair_that_fails_stops_no_other(
-    world: World, working: Rounds, transport: AppTransport, tmp_path: Path
+    world: World, working: World, transport: AppTransport, tmp_path: Path
 ) -> None:
     good = next(requests(world, 1))
     bad: list[Any] = [
@@ -73,11 +76,11 @@ def test_a_pair_that_fails_stops_no_other(
     reasons = [one.error and one.error.reason for _, one in sorted(found.items())]
     assert reasons[:3] == ["FIELD_NOT_FOUND", "FILE_NOT_FOUND", "INVALID_DETECTION"]
     assert reasons[3:] == ["INVALID_REQUEST", "INVALID_REQUEST", None]
-    assert found[0].status == "failed"
+    assert found[0].status == "refused"
     assert found[1].key == "no file"
 
 
-def test_the_same_to_be_awaited(world: World, working: Rounds) -> None:
+def test_the_same_to_be_awaited(world: World, working: World) -> None:
     async def run() -> list[PairResult]:
         transport = httpx.ASGITransport(world.app)
         async with AsyncClient("http://localhost", transport=transport) as client:
@@ -86,40 +89,65 @@ def test_the_same_to_be_awaited(world: World, working: Rounds) -> None:
     assert sorted(one.index for one in asyncio.run(run())) == [0, 1, 2]
 
 
-def test_failed_pairs_that_are_repeated_are_told_once() -> None:
-    """Of an earlier pass only what is not repeated is told; then what this pass finds."""
-    earlier = [line(1, 1, "failed"), line(2, 2, "refused"), line(3, 3, "successful")]
-    later = [line(4, 1, "successful")]
-    status = {"id": "b", "pairs": 3, "passes": 2, "results": 3, "status": "running"}
+def test_more_pairs_than_the_service_has_room_for_become_several_batches(
+    worlds: Callable[..., World], monkeypatch: pytest.MonkeyPatch, slept: list[float]
+) -> None:
+    """Each as large as there is room: here two jobs at once, and three lines a batch."""
+    world = worlds(quota_active_jobs=2, max_batch_pairs=3)
+    for _ in at_work(world):
+        posts = []
+        transport = AppTransport(world.app)
+        whole = transport.handle_request
+
+        def counted(request: httpx.Request) -> httpx.Response:
+            answer = whole(request)
+            if (request.method, request.url.path) == ("POST", "/batches"):
+                posts.append(answer.status_code)
+            return answer
+
+        monkeypatch.setattr(transport, "handle_request", counted)
+        with Client("http://localhost", transport=transport) as client:
+            found = list(client.batch(requests(world, 7)))
+    assert [one.index for one in found] == list(range(7))
+    assert {one.verdict for one in found} == {"registered"}
+    assert posts.count(202) + posts.count(200) == 4
+    assert {413, 429} <= set(posts)
+
+
+def test_a_full_service_is_waited_for(slept: list[float]) -> None:
+    """Other requests of the caller have taken all the room: so long as the service says."""
+    answers = iter([(429, 0), (429, 0), (202, None)])
 
     def answer(request: httpx.Request) -> httpx.Response:
         if request.method == "POST":
-            return httpx.Response(202, json=status)
-        after = int(request.url.params["after"])
-        lines = earlier if after == 0 else later if after == 3 else []
-        return httpx.Response(200, text="".join(lines), headers={"Batch-Status": "finished" if after else "running"})
+            status, fitting = next(answers)
+            problem = {"reason": "QUOTA_ACTIVE_JOBS", "detail": "full", "fitting_lines": fitting}
+            return httpx.Response(status, json={"id": "b", "pairs": 1} if status == 202 else problem)
+        return httpx.Response(200, text=line(1, "successful"))
 
-    pair = Pair("0" * 64, "1" * 64, BOX)
-    found = list(pretended(answer).batch([pair] * 3))
-    assert [(one.index, one.status) for one in found] == [(1, "refused"), (2, "successful"), (0, "successful")]
+    found = list(pretended(answer).batch([Pair("0" * 64, "1" * 64, BOX)]))
+    assert [(one.index, one.status) for one in found] == [(0, "successful")]
+    assert len(slept) == 2
 
 
-def line(number: int, pair: int, status: str) -> str:
-    error = None if status == "successful" else {"reason": "JOB_TIMEOUT", "detail": "too long", "status": 500}
-    told = {"number": number, "pair": pair, "line": pair, "key": None, "job": "j", "status": status, "error": error}
+def test_an_interrupted_call_goes_on(worlds: Callable[..., World]) -> None:
+    """The second call finds the jobs of the first, in whatever pieces they were posted."""
+    world = worlds()
+    with Client("http://localhost", transport=AppTransport(world.app)) as client:
+        begun = client.batch(requests(world, 4), timeout_s=0)
+        with pytest.raises(WaitTimeoutError):
+            next(begun)
+        jobs = [job_id for job_id, _ in world.queue.registrations]
+        assert len(jobs) == 4
+        for _ in at_work(world):
+            found = [*client.batch(requests(world, 2)), *client.batch(requests(world, 6))]
+    assert [one.job for one in found[2:6]] == jobs
+    assert {world.records.get_job(one.job).attempt for one in found} == {1}  # type: ignore[union-attr, arg-type]
+
+
+def line(number: int, status: str) -> str:
+    told = {"number": number, "line": number, "key": None, "job": "j", "status": status}
     return json.dumps(told) + "\n"
-
-
-def test_a_batch_that_is_cancelled_elsewhere_says_so() -> None:
-    status = {"id": "b", "pairs": 1, "passes": 1, "results": 0, "status": "running"}
-
-    def answer(request: httpx.Request) -> httpx.Response:
-        dismissed = {"Batch-Status": "dismissed"}
-        return httpx.Response(202, json=status) if request.method == "POST" else httpx.Response(200, headers=dismissed)
-
-    with pytest.raises(ServiceError) as caught:
-        list(pretended(answer).batch([Pair("0" * 64, "1" * 64, BOX)]))
-    assert caught.value.reason == "CANCELLED"
 
 
 def test_a_refused_batch_is_an_error() -> None:

@@ -9,7 +9,6 @@ import pytest
 from redis import Redis
 
 from tests.contract.bad_input import nothing_of_a_request_stays, nothing_of_an_upload_stays
-from tests.contract.batch_rounds import Rounds
 from tests.contract.live import Live, eventually, live_service
 from tests.contract.world import World, field_bytes, make_world, sha256
 
@@ -36,12 +35,6 @@ def worlds(tmp_path: Path, any_redis: Redis) -> Iterator[Callable[..., World]]:
     yield make
     for world in made:
         world.client.close()
-
-
-@pytest.fixture
-def rounds(world: World) -> Rounds:
-    """The rounds of ``world``'s feeder of batches."""
-    return Rounds(world)
 
 
 @pytest.fixture

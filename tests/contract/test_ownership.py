@@ -12,8 +12,6 @@ import httpx
 import pytest
 from redis import Redis
 
-from regnf_service.batches.feeder import Feeder
-from regnf_service.http.batch_intake import REQUESTS
 from regnf_state.ownership import reference_of
 from tests.contract.asgi import client_of
 from tests.contract.world import BOX, World, assert_refused, field_bytes, make_world, sha256
@@ -168,14 +166,14 @@ def test_anothers_batch_is_not_there(
     line = {"scene": sha256(SCENE), "object": sha256(OBJECT), "detection": BOX}
     content, headers = json.dumps(line).encode(), {"Content-Type": "application/x-ndjson"}
     posted = shared.client.post("/batches", content=content, headers=headers)
-    assert posted.status_code == 202, posted.text
-    Feeder(shared.app.state.services, REQUESTS).run_once()
+    assert posted.status_code == 200, posted.text
     assert_refused(bob.request(method, prefix + path.format(batch=posted.json()["id"])), 404, "BATCH_NOT_FOUND")
     assert bob.get("/batches").json()["batches"] == []
     assert shared.client.get(f"/batches/{posted.json()['id']}").json()["status"] == "finished"
     if method == "GET":
         bobs = bob.post("/batches", content=content, headers=headers).json()
-        assert bobs["status"] == "running", "the same lines are each caller's own batch"
+        assert bobs["counts"]["refused"] == 1, "the same lines are each caller's own batch"
+        assert bobs["id"] != posted.json()["id"]
 
 
 def test_a_job_that_has_expired_is_gone_to_its_owner_and_unknown_to_others(

@@ -112,7 +112,7 @@ class World:
         listed = self._put(job_id, attempt, {"result.json": json.dumps(RESULT).encode()} | (artifacts or {}))
         document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
-        self.records.update_job(job_id, attempt, status="successful")
+        self.records.update_job(job_id, attempt, status="successful", verdict=RESULT["verdict"])
 
     def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
         """What it leaves behind of what was still to come."""

@@ -64,6 +64,25 @@ def test_the_right_object_comes_first_and_few_fields_are_opened() -> None:
     assert len(found.result.residuals["scene_residuals"]) > 1000
 
 
+def test_a_search_without_clouds_has_the_same_numbers_and_evaluates_less() -> None:
+    evaluations, found = [], []
+    for clouds in (True, False):
+        scene = CountingField(room(chair_pose()))
+        found.append(
+            search_library(scene, detection(), library({"chair": chair()}, Counter()), ROBUST, clouds=clouds).result
+        )
+        evaluations.append(scene.evaluations)
+    with_clouds, without = found
+    assert evaluations[1] < evaluations[0]
+    assert (bool(with_clouds.residuals), without.residuals) == (True, {})
+    torch.testing.assert_close(with_clouds.T_object_scene.matrix(), without.T_object_scene.matrix(), rtol=0, atol=0)
+    numbers = [
+        {name: value for name, value in one.metrics.items() if not name.startswith(("seconds", "field_evaluations"))}
+        for one in found
+    ]
+    assert numbers[0] == numbers[1]
+
+
 def test_the_same_seed_gives_the_same_search() -> None:
     shapes = {"table": table(), "chair": chair(), "s": slab_table()}
     first, second = (

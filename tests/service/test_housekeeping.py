@@ -1,5 +1,6 @@
 """What goes from the store because nobody needs it, and what stays because somebody does."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -185,12 +186,20 @@ def test_once_an_hour_is_enough(world: World) -> None:
         assert keeper.run_if_due(term) == Removed()
 
 
-def test_lines_of_a_batch_whose_head_was_never_written_go_after_a_day(world: World) -> None:
-    for name in ("left", "kept"):
-        world.blobs.put(f"batches/data/anyone/{name}/pairs", b"{}")
-        world.blobs.put(f"batches/data/anyone/{name}/results/00000000", b"{}")
-    world.blobs.put("batches/heads/anyone/kept", b"{}")
-    assert world.tidy() == Removed()
+def test_a_batch_goes_when_its_time_is_over(world: World) -> None:
+    world.blobs.put("batches/anyone/old", b"{}")
+    world.tidy()
+    assert list(world.blobs.list("batches")) == ["batches/anyone/old"]
     world.blobs.age()
-    assert world.tidy() == Removed(temporary=1)
-    assert {key.split("/")[3] for key in world.blobs.list("batches/data")} == {"kept"}
+    world.blobs.put("batches/anyone/new", b"{}")
+    world.tidy()
+    assert list(world.blobs.list("batches")) == ["batches/anyone/new"]
+
+
+def test_batches_count_in_the_cap_and_go_before_their_time(world: World) -> None:
+    for number in range(3):
+        world.blobs.put(f"batches/anyone/{number}", b"." * 600)
+        moment = world.records.now() - (3 - number) * DAY_S
+        os.utime(world.blobs.path_of(f"batches/anyone/{number}"), (moment, moment))
+    world.tidy(storage_cap_bytes=1000)
+    assert list(world.blobs.list("batches")) == ["batches/anyone/2"]

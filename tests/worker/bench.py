@@ -79,10 +79,11 @@ class Bench:
             self.context.blobs.put(f"fields/{sha256}/field.safetensors", sha256[:1].encode())
             self.context.records.update_field(sha256, state="ready")
 
-    def submit(self, do: str, job_id: str = "j1", owner: str = ANONYMOUS) -> JobRecord:
+    def submit(self, do: str, job_id: str = "j1", owner: str = ANONYMOUS, **changes: object) -> JobRecord:
         """Record and queue a job whose engine shall do this."""
         now = self.context.records.now()
-        request = request_record(reference_of(owner, SCENE), reference_of(owner, OBJECT), do)
+        object_ = None if "candidates" in changes else reference_of(owner, OBJECT)
+        request = request_record(reference_of(owner, SCENE), object_, do, **changes)
         record, created = self.context.records.create_job(
             JobRecord(job_id, "registration", "accepted", request, {}, now, now), 100
         )

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from regnf_core.field_notes import FieldNotes
 from regnf_core.options import RegistrationOptions
-from regnf_worker.engine import CoreEngine
+from regnf_worker.engine import Candidate, CoreEngine
 from tests.requests import registration_request
 
 START = [[0.0, -2.0, 0.0, 0.5], [2.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
@@ -41,6 +43,28 @@ def test_the_request_reaches_the_engine(
     assert options == RegistrationOptions()
     assert box.size.tolist() == [1, 1, 1]
     assert (None if warm.T_object_scene is None else warm.T_object_scene.matrix().tolist()) == start
+
+
+@pytest.mark.parametrize("pictures", [True, False])
+def test_a_search_makes_clouds_for_its_pictures_alone(
+    pictures: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the winner, once the result is out."""
+    calls: list[Any] = []
+    found = SimpleNamespace(ranking=[SimpleNamespace(name="c" * 64)], result="a result")
+    monkeypatch.setattr("regnf_core.fields.build.open_field", lambda path, device: path.name)
+    monkeypatch.setattr("regnf_core.library.search_library", lambda *_, **how: calls.append(how) or found)
+    monkeypatch.setattr("regnf_core.viewing.ranking_document", lambda *_: [])
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_result", lambda *_, **__: ["result.json"])
+    monkeypatch.setattr("regnf_core.registration.with_late_clouds", lambda result, *given: given[:2])
+    monkeypatch.setattr("regnf_core.viewing.artifacts.write_pictures", lambda result, _: list(result))
+    request = registration_request("a" * 64, None, options=RegistrationOptions(), pictures=pictures)
+    several = [Candidate(sha256 * 64, partial(Path, sha256), "a model") for sha256 in "bc"]
+    made = CoreEngine("cpu").search(Path("scene"), several, request, lambda phase, share: None, tmp_path, {})
+    assert calls == [{"clouds": False}]
+    assert (made.names, bool(made.to_come)) == (["result.json"], pictures)
+    if pictures:
+        assert made.finish() == ["scene", "c"]
 
 
 def test_workers_share_the_memory_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

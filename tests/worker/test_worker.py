@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from regnf_core.options import RegistrationOptions
 from regnf_state.manifest import read_manifest
 from regnf_state.records import FieldRecord
 from tests.processes import alive, children_of
@@ -270,3 +271,56 @@ def test_the_real_gate_rejects_what_is_no_field(tmp_path: Path) -> None:
         assert (rejected.state, rejected.error["reason"]) == ("rejected", "FORMAT_NOT_RECOGNIZED")
         assert list(table.context.blobs.list("fields")) == []
         assert "Traceback" not in table.log()
+
+
+@pytest.mark.parametrize("pictures", [True, False])
+def test_a_search_makes_pictures_where_they_are_wanted(table: Bench, pictures: bool) -> None:
+    table.start_worker()
+    table.submit("succeed", candidates=(OBJECT, SCENE), options=RegistrationOptions(), pictures=pictures)
+    assert table.finished().status == "successful", table.log()
+    manifest = read_manifest(table.context.blobs, "j1")
+    assert manifest is not None
+    named = {*manifest.pending, *(one.name for one in manifest.artifacts)}
+    assert named == ({"result.json", "preview.png"} if pictures else {"result.json"})
+    eventually(lambda: not read_manifest(table.context.blobs, "j1").pending, "all pictures")  # type: ignore[union-attr]
+
+
+BEGINNINGS = [
+    ("os:setpgrp", "OSError"),
+    ("regnf_worker.kernel:prefer_as_oom_victim", "RuntimeError"),
+    ("regnf_worker.kernel:give_way", "MemoryError"),
+    ("regnf_worker.worker_pipe:hold", "OSError"),
+    ("regnf_worker.job_limits:JobLimits.hold_here", "ValueError"),
+    ("regnf_worker.scratch:Scratch.use", "OSError"),
+    ("random:seed", "KeyboardInterrupt"),
+]
+"""What a job's process does before its job."""
+
+
+@pytest.mark.parametrize(
+    ("breaks", "raises", "reason"),
+    [*((*each, "INTERNAL") for each in BEGINNINGS), ("pathlib:Path.mkdir", "OSError", "STORAGE_FULL")],
+)
+def test_a_process_that_cannot_begin_takes_nothing_with_it(table: Bench, breaks: str, raises: str, reason: str) -> None:
+    """The worker, its folder, its registration and the pictures of the job before stay; the job says what is wrong."""
+    table.environment |= {"TINY_BREAKS": breaks, "TINY_RAISES": raises}
+    worker = table.start_worker()
+    table.submit("draw_for_ever", "drawn")
+    assert table.finished("drawn").status == "successful"
+    (drawing,) = children_of(worker.pid)
+    folders = sorted(table.context.settings.scratch_dir.glob("*"))
+    (table.context.settings.state_dir / "break").touch()
+    table.submit("succeed")
+    failed = table.finished()
+    assert (failed.status, (failed.error or {}).get("reason")) == ("failed", reason), table.log()
+    assert alive(drawing)
+    assert worker.poll() is None
+    assert sorted(table.context.settings.scratch_dir.glob("*")) == folders
+    assert table.context.queue.live_workers() == 1
+    manifest = read_manifest(table.context.blobs, "drawn")
+    assert manifest is not None
+    assert (manifest.pending, manifest.missing) == (("preview.png",), ())
+    (table.context.settings.state_dir / "break").unlink()
+    table.submit("succeed", "next")
+    assert table.finished("next").status == "successful"
+    assert alive(drawing)

@@ -9,7 +9,7 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -25,7 +25,7 @@ from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
 from regnf_worker.attempt import run_attempt
 from regnf_worker.context import Context
-from regnf_worker.engine import Made
+from regnf_worker.engine import Candidate, Made
 
 Report = Callable[[str, float], None]
 
@@ -60,8 +60,24 @@ class TinyEngine:
             return Made(names, ["preview.png"], lambda: self.iterate(lambda *_: None) or [])  # type: ignore[func-returns-value]
         return Made(names)
 
-    def search(self, *_: Any) -> Made:
-        raise AssertionError("no job here has candidates")
+    def search(
+        self,
+        scene: Path,
+        candidates: Sequence[Candidate],
+        request: RegistrationRequest,
+        report: Report,
+        folder: Path,
+        notes: Any,
+    ) -> Made:
+        """Finds the first; its picture, where one is wanted, is made of the candidates' own bytes."""
+        getattr(self, request.detection.label or "")(report)
+        (folder / "result.json").write_text(json.dumps({"object": candidates[0].sha256}))
+
+        def finish() -> list[str]:
+            (folder / "preview.png").write_bytes(b"".join(one.open().read_bytes() for one in candidates))
+            return ["preview.png"]
+
+        return Made(["result.json"], ["preview.png"], finish) if request.pictures else Made(["result.json"])
 
     def render(
         self,
@@ -84,10 +100,14 @@ class TinyEngine:
         (folder / EDITED_FIELD).write_bytes(scene.read_bytes())
         return ["frame-0000.png", EDITED_FIELD, "result.json"]
 
-    def make_model(self, *_: Any) -> None:
-        raise AssertionError("no job here names a preset")
+    def make_model(self, field: Path, options: Any, target: Path) -> None:
+        target.write_bytes(field.read_bytes())
 
-    read_model = symmetry = make_model
+    def read_model(self, path: Path) -> bytes:
+        return path.read_bytes()
+
+    def symmetry(self, model: bytes) -> dict[str, Any]:
+        return {"order": 1, "axis": None, "continuous": False}
 
     def succeed(self, report: Report) -> None:
         report("optimizing", 0.5)

@@ -173,6 +173,7 @@ class CoreEngine:
         from regnf_core.fields.build import open_field
         from regnf_core.geometry.box import OrientedBox
         from regnf_core.library import LibraryObject, search_library
+        from regnf_core.registration import with_late_clouds
         from regnf_core.viewing import ranking_document
         from regnf_core.viewing.artifacts import PICTURES, write_pictures, write_result
 
@@ -182,20 +183,20 @@ class CoreEngine:
             return lambda: open_field(one.open(), self.device)
 
         unusable = {one.sha256: one.fault for one in candidates if one.fault is not None}
-        found = search_library(
-            open_field(scene, self.device),
-            OrientedBox.from_quaternion(**asdict(request.detection)),
-            [LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None],
-            request.options,
-            request.seed,
-            report,
-        )
-        report("exporting", 0.95)
+        place, options = open_field(scene, self.device), request.options
+        box = OrientedBox.from_quaternion(**asdict(request.detection))
+        objects = {
+            one.sha256: LibraryObject(one.sha256, opener(one), one.model) for one in candidates if one.model is not None
+        }
+        found = search_library(place, box, [*objects.values()], options, request.seed, report, clouds=False)
         winner, ranking = found.ranking[0].name, ranking_document(found.ranking, unusable)
         said: dict[str, Any] = {"object_name": winner, "candidates": ranking, "fields": _fields(notes, winner)}
         names = write_result(found.result, folder, **said)
-        pictures = Made(names, PICTURES, lambda: write_pictures(found.result, folder))
-        return pictures if request.pictures else Made(names)
+
+        def finish() -> list[str]:
+            return write_pictures(with_late_clouds(found.result, place, objects[winner].field(), box, options), folder)
+
+        return Made(names, PICTURES, finish) if request.pictures else Made(names)
 
     def render(
         self,

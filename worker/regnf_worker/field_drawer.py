@@ -20,7 +20,6 @@ from itertools import groupby
 from redis import Redis
 from redis.exceptions import RedisError
 
-from regnf_core.parent_process import die_with_parent
 from regnf_state.ownership import owner_of
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.settings import Settings
@@ -97,10 +96,7 @@ class FieldDrawer:
             if reference is None:
                 return
             self._until = time.monotonic() + _LONGEST_S
-            parent = os.getpid()
-            self._child = os.fork()
-            if self._child == 0:
-                self._run(parent, reference)
+            self._child = kernel.forked(lambda: self._run(reference))
 
     def _next(self) -> str | None:
         """Of one caller at random the field that somebody wanted to see last."""
@@ -108,20 +104,12 @@ class FieldDrawer:
         lines = [next(fields) for _, fields in groupby(undrawn, owner_of)]
         return random.choice(lines) if lines else None  # noqa: S311 -- for fairness, not for secrecy
 
-    def _run(self, parent: int, reference: str) -> None:
-        """What the child does. Does not return."""
-        status = 1
-        try:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-            die_with_parent(parent)
-            kernel.prefer_as_oom_victim()
-            kernel.give_way(self._niceness)
-            self._limits.hold_here()
-            resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_S, _PROCESSOR_S + 1))
-            self._draw(reference)
-            status = 0
-        except BaseException:
-            logger.exception("field %s is not drawn: its process ends", reference)
-        finally:
-            os._exit(status)
+    def _run(self, reference: str) -> None:
+        """What the child does."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        kernel.prefer_as_oom_victim()
+        kernel.give_way(self._niceness)
+        self._limits.hold_here()
+        resource.setrlimit(resource.RLIMIT_CPU, (_PROCESSOR_S, _PROCESSOR_S + 1))
+        self._draw(reference)

@@ -5,6 +5,7 @@ It also reports kills for memory.
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import time
@@ -15,10 +16,13 @@ from typing import Literal, NamedTuple
 
 from regnf_core.parent_process import die_with_parent
 
+RAISED = 70
+"""Status of a forked process that ended with an exception: Redis or storage was away. Native code ends with others."""
 _OOM_SCORE = "500"
 _EXIT_POLL_S = 0.005
 _COUNTERS = ("/proc/vmstat", "/sys/fs/cgroup/memory.events", "/sys/fs/cgroup/memory/memory.oom_control")
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+logger = logging.getLogger(__name__)
 
 
 class Exit(NamedTuple):
@@ -49,18 +53,38 @@ def wait_for_exit(child: int, ended: int, seconds: float) -> Exit | Literal["spo
         time.sleep(_EXIT_POLL_S)  # the kernel closes a process' files a moment before it can be waited for
 
 
-def in_child(work: Callable[[], None]) -> bool:
-    """Do something in a forked process and wait for it. Whether it came to its end."""
+def forked(work: Callable[[], object]) -> int:
+    """Do something in a copy of this process, which ends with it; the copy's process id. Raises OSError: none was made.
+
+    The copy always ends here, with status 0 or ``RAISED``. Nothing of what it inherited runs in it: no ``finally`` and
+    no ``except`` of its parent's, which would clear away what the parent still needs.
+    """
     parent = os.getpid()
-    child = os.fork()
-    if child == 0:
-        status = 1
-        try:
-            die_with_parent(parent)
-            work()
-            status = 0
-        finally:
+    status = RAISED
+    try:
+        child = os.fork()
+        if child:
+            return child
+        die_with_parent(parent)
+        work()
+        status = 0
+    except BaseException:  # also a handler of signals that raises, as RQ's does, before ``work`` has set its own
+        if os.getpid() == parent:
+            raise
+        logger.exception("a forked process ends")
+    finally:
+        if os.getpid() != parent:
             os._exit(status)
+    raise AssertionError("a forked process goes on")
+
+
+def in_child(work: Callable[[], object]) -> bool:
+    """Do something in a forked process and wait for it. Whether it came to its end; False where none could be made."""
+    try:
+        child = forked(work)
+    except OSError as error:
+        logger.error("no process could be made: %s", error)
+        return False
     return os.waitpid(child, 0)[1] == 0
 
 

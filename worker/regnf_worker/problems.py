@@ -50,6 +50,13 @@ def are_files_away(error: Exception) -> bool:
     return isinstance(error, OSError) and error.errno in _AWAY
 
 
+def start_refused(error: OSError) -> str | None:
+    """The reason of a job for which no process could be started, where there is one of its own."""
+    if error.errno in _FULL:
+        return "STORAGE_FULL"
+    return "STORAGE_UNAVAILABLE" if are_files_away(error) else None
+
+
 def new_incident() -> str:
     """A word by which a person finds a fault in the log."""
     return uuid4().hex[:12]

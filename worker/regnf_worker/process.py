@@ -28,7 +28,6 @@ from rq.utils import now
 from rq.worker import WorkerStatus
 
 from regnf_core.importing.gate.fair_clock import LONGEST
-from regnf_core.parent_process import die_with_parent
 from regnf_state.queue import IMPORT_QUEUE_NAME, QUEUE_NAME, Kind, Work
 from regnf_state.records import UnreadableRecordError
 from regnf_state.redis import payload
@@ -41,6 +40,7 @@ from regnf_worker.field_drawer import Draw, FieldDrawer
 from regnf_worker.finishing import ChildAtPictures, Finishing
 from regnf_worker.job_limits import JobLimits
 from regnf_worker.late_entries import LateEntries
+from regnf_worker.problems import start_refused
 from regnf_worker.resilient_worker import ResilientWorker
 from regnf_worker.rest import give_up_rest
 from regnf_worker.scratch import Scratch
@@ -55,8 +55,6 @@ _IDLE_REPORT_S = 30
 _LATE_GRACE_S = 10.0
 """After its time limit a job has this long to write down that it was too slow; then it is killed."""
 _IMPORT_MARGIN_S = 30
-_RAISED = 70
-"""Status of a job's process that ended with an exception: Redis or storage was away. Native code ends with others."""
 
 
 class RegnfWorker(ResilientWorker):
@@ -96,7 +94,7 @@ class RegnfWorker(ResilientWorker):
         self._job_limits = JobLimits.of(context.settings)
         self._finishing = Finishing()
         self._drawer = FieldDrawer(redis, context.settings, draw)
-        self._exceeded: str | None = None
+        self._because: str | None = None
         self._niceness = 0
         self._started = 0.0
         self._limit_s = 0.0
@@ -147,7 +145,7 @@ class RegnfWorker(ResilientWorker):
         job.timeout = self._limit_s = self._limits[work.kind]
         self._started = time.monotonic()
         self._late = self._given_back = False
-        self._exceeded = None
+        self._because = None
         oom_kills = kernel.oom_kills()
         self._niceness = self._niceness_of(work)
         self.begin_job(job)
@@ -185,40 +183,24 @@ class RegnfWorker(ResilientWorker):
             return 0
 
     def main_work_horse(self, job: Any, queue: Any) -> None:
-        """What the child does: it runs one of our functions, never what RQ would import. Does not return."""
-        status = _RAISED
-        try:
-            random.seed()
-            self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
-            self._is_horse = True
-            work = Work.named(queue.name, job.id)
-            self.prepare_job_execution(job)
-            with self.death_penalty_class(job.timeout, JobTimeoutException):
-                self._functions[work.kind](work.argument, work.attempt, self.name)
-            status = 0
-        except BaseException:
-            self.log.exception("job %s: its process ends", job.id)
-        finally:
-            os._exit(status)
+        """What the child does: it runs one of our functions, never what RQ would import."""
+        random.seed()
+        self.setup_work_horse_signals()  # type: ignore[no-untyped-call]
+        self._is_horse = True
+        work = Work.named(queue.name, job.id)
+        self.prepare_job_execution(job)
+        with self.death_penalty_class(job.timeout, JobTimeoutException):
+            self._functions[work.kind](work.argument, work.attempt, self.name)
 
     def _run_child(self, job: Any, queue: Any, folder: Path) -> kernel.Exit | None:
         """Fork a child for the job and wait for its end; None when it has said that the worker may go on."""
         limited = queue.name != IMPORT_QUEUE_NAME  # an import's process has limits of its own
-        ended, held_by_child = os.pipe()
-        parent = os.getpid()
-        child = os.fork()
-        if child == 0:
-            os.setpgrp()
-            die_with_parent(parent)
-            kernel.prefer_as_oom_victim()
-            kernel.give_way(self._niceness)
-            os.close(ended)
-            worker_pipe.hold(held_by_child)
-            if limited:
-                self._job_limits.hold_here()
-            self._scratch.use(folder)
-            self.main_work_horse(job, queue)
-        os.close(held_by_child)
+        try:
+            child, ended = self._start_child(job, queue, folder, limited)
+        except OSError as error:
+            self.log.error("job %s: no process could be made for it: %s", job.id, error)
+            self._because = start_refused(error)
+            return kernel.Exit(None)
         with suppress(OSError):
             os.setpgid(child, child)  # the child does so too: whoever is first, before anybody kills its group
         self._horse_pid = child
@@ -234,6 +216,31 @@ class RegnfWorker(ResilientWorker):
             return None
         os.close(ended)
         return exit_
+
+    def _start_child(self, job: Any, queue: Any, folder: Path, limited: bool) -> tuple[int, int]:
+        """Make the job's folder and its process: the process id, and a pipe that says when it has ended. Raises
+        OSError."""
+        self._scratch.make(folder)
+        ended, held_by_child = os.pipe()
+
+        def run() -> None:
+            os.setpgrp()
+            kernel.prefer_as_oom_victim()
+            kernel.give_way(self._niceness)
+            os.close(ended)
+            worker_pipe.hold(held_by_child)
+            if limited:
+                self._job_limits.hold_here()
+            self._scratch.use(folder)
+            self.main_work_horse(job, queue)
+
+        try:
+            return kernel.forked(run), ended
+        except OSError:
+            os.close(ended)
+            raise
+        finally:
+            os.close(held_by_child)
 
     def _let_finish(self, work: Work, child: int, ended: int, folder: Path) -> None:
         """Leave a child to itself whose result is out; the one before it is waited for, so there is one at most."""
@@ -258,8 +265,8 @@ class RegnfWorker(ResilientWorker):
             self._given_back = True
             self.kill_horse()
         elif limited:
-            self._exceeded = self._job_limits.exceeded_by(self._horse_pid, folder)
-            if self._exceeded is not None:
+            self._because = self._job_limits.exceeded_by(self._horse_pid, folder)
+            if self._because is not None:
                 self.kill_horse()
 
     def _settle(self, work: Work, ended: kernel.Exit, out_of_memory: bool) -> None:
@@ -269,7 +276,7 @@ class RegnfWorker(ResilientWorker):
             late=self._late or time.monotonic() - self._started >= self._limit_s,
             out_of_memory=out_of_memory,
             given_back=self._given_back,
-            exceeded=self._exceeded,
+            because=self._because,
             crashed_near_limit=work.kind == "registration" and self._crashed_near_limit(ended),
             limits=self._job_limits,
         )
@@ -291,7 +298,7 @@ class RegnfWorker(ResilientWorker):
 
     def _crashed_near_limit(self, ended: kernel.Exit) -> bool:
         """Whether a process has ended by itself, by no exception of ours, with most of its memory in use."""
-        crashed = bool(ended.status) and os.waitstatus_to_exitcode(ended.status or 0) != _RAISED
+        crashed = bool(ended.status) and os.waitstatus_to_exitcode(ended.status or 0) != kernel.RAISED
         return crashed and self._job_limits.is_near(ended.peak_memory)
 
     # the worker itself

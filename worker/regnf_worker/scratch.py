@@ -31,8 +31,13 @@ class Scratch:
         self._left: list[Path] = []
 
     def of_job(self) -> Path:
-        """A folder for one job, which its process makes with ``use``."""
+        """The name of a folder for one job; ``make`` makes it."""
         return self.folder / f"job-{uuid4().hex}"
+
+    @staticmethod
+    def make(folder: Path) -> None:
+        """Make a job's folder. Raises OSError: the disk is full, or the volume away."""
+        folder.mkdir(mode=0o700)
 
     def drop(self, folder: Path) -> None:
         """Delete whatever a job has left. What cannot be deleted now goes with ``drop_left``."""
@@ -56,10 +61,9 @@ class Scratch:
 
     @staticmethod
     def use(folder: Path) -> None:
-        """Have this process' temporary files made here. Raises OSError."""
+        """Have this process' temporary files made here."""
         import tempfile
 
-        folder.mkdir(mode=0o700)
         os.environ["TMPDIR"] = str(folder)
         tempfile.tempdir = str(folder)
 

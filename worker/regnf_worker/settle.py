@@ -36,8 +36,9 @@ class ChildExit:
     out_of_memory: bool = False
     given_back: bool = False
     """The worker itself was told to stop and ended its job."""
-    exceeded: str | None = None
-    """The worker ended it for this: JOB_MEMORY_LIMIT, JOB_DISK_LIMIT."""
+    because: str | None = None
+    """The worker ended it, or could not begin it, for this: JOB_MEMORY_LIMIT, JOB_DISK_LIMIT, STORAGE_FULL,
+    STORAGE_UNAVAILABLE."""
     crashed_near_limit: bool = False
     """It ended by itself, not well, after it had used most of the memory that it may: native code that gets no memory
     aborts."""
@@ -47,15 +48,15 @@ class ChildExit:
     @property
     def worth_another_try(self) -> bool:
         """Usually Redis or storage was away, or somebody killed it; it was neither too slow nor too large."""
-        if self.late or self.exceeded or self.reason() == "JOB_MEMORY_LIMIT":
+        if self.late or self.because not in (None, "STORAGE_UNAVAILABLE") or self.reason() == "JOB_MEMORY_LIMIT":
             return False
         return self.signal is None or (self.signal in _FROM_OUTSIDE and not self.out_of_memory)
 
     def reason(self) -> str:
         if self.late:
             return "JOB_TIMEOUT"
-        if self.exceeded:
-            return self.exceeded
+        if self.because:
+            return self.because
         if self.crashed_near_limit and self.signal not in _FROM_OUTSIDE:
             return "JOB_MEMORY_LIMIT"
         if self.out_of_memory and self.signal == signal.SIGKILL:

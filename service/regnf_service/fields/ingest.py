@@ -102,13 +102,13 @@ def room_for_bytes(services: Services, caller: str, again: FieldRecord | None = 
     """How many bytes the caller may have under way: its quota less what it has stored. None: any number.
 
     A field that is sent ``again`` takes no more than it has. Uploads that are kept after their import make room; pieces
-    of uploads that are not finished take some.
+    of uploads that are not finished take some, and so do batches.
     """
     most = services.quota.stored_bytes
     if most is None:
         return None
     stored = services.records.stored(caller)[1] - services.originals.bytes_of(caller)
-    stored += services.pieces.bytes_of(caller)
+    stored += services.pieces.bytes_of(caller) + services.batches.bytes_of(caller)
     return most - stored + (0 if again is None else again.kept_bytes)
 
 

@@ -1,104 +1,102 @@
-"""Taking a batch in: each line is checked by itself, and what is wrong with one refuses no other."""
+"""Taking a batch in: each line is read by itself, and what is wrong with one refuses no other."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from regnf_core.engine_revision import ENGINE_REVISION
-from regnf_service.batches.feeder import Requests
-from regnf_service.http.batch_lines import LINE_BYTES, Line
+from regnf_service.batches import Line, Posting
+from regnf_service.http.batch_lines import LINE_BYTES, TextLine
 from regnf_service.http.by_reference import asked_by_reference
-from regnf_service.http.problems import problem_of
+from regnf_service.http.library_selection import CallersLibrary
 from regnf_service.http.schemas.batches import BatchPair
 from regnf_service.http.schemas.reading import read_model
-from regnf_service.http.schemas.registrations import RegisterRequest
-from regnf_service.http.strict_json import parse_json
-from regnf_service.jobs.cost_limits import check_cost
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.batch_records import Batch, Pair, pair_text
-from regnf_state.blobs.base import BlobWriter
-from regnf_state.registration_request import RegistrationRequest
 
 _ID_DIGITS = 32
-_PROBLEMS_SHOWN = 32
+_LINES_AT_ONCE = 50
+_BYTES_AT_ONCE = 64 * 1024
+Read = tuple[Line, TextLine, BatchPair | None]
 
 
-def read_again(services: Services, caller: str, request: dict[str, Any]) -> tuple[RegistrationRequest, dict[str, str]]:
-    """A kept line's request, and the fields that it names. Raises Problem."""
-    return asked_by_reference(services, caller, read_model(RegisterRequest, json.dumps(request).encode()))
-
-
-REQUESTS = Requests(read_again, problem_of)
-"""What the feeder is given."""
+def portions(lines: Iterable[TextLine]) -> Iterator[list[TextLine]]:
+    """A few at a time, so that other callers' requests are read in between."""
+    few: list[TextLine] = []
+    size = 0
+    for line in lines:
+        few.append(line)
+        size += len(line.text or b"")
+        if len(few) == _LINES_AT_ONCE or size >= _BYTES_AT_ONCE:
+            yield few
+            few, size = [], 0
+    if few:
+        yield few
 
 
 class Intake:
-    """Reads the lines of one batch into ``pairs``. Blocking. Its memory does not grow with the lines, but for keys."""
+    """Reads the lines of one batch. Blocking: ``read`` needs no store, ``take`` does. The library is looked up once."""
 
-    def __init__(self, services: Services, caller: str, pairs: BlobWriter) -> None:
+    def __init__(self, services: Services, caller: str) -> None:
         self._services = services
         self._caller = caller
-        self._pairs = pairs
-        self._count = 0
-        self._refused = 0
-        self._problems: list[dict[str, Any]] = []
+        self._library = CallersLibrary(services, caller)
+        self._lines: list[Line] = []
         self._keys: dict[str, int] = {}
-        self._identity = hashlib.sha256(f"batch {ENGINE_REVISION}\n".encode())
+        self._count = 0
+        self._identity = hashlib.sha256(f"batch {ENGINE_REVISION} {caller}\n".encode())
 
-    def take(self, lines: Sequence[Line]) -> None:
-        """Check these lines and write them down. Raises Problem TOO_MANY_PAIRS, OSError."""
+    def read(self, texts: Sequence[TextLine]) -> list[Read]:
+        """These lines as requests; with an error those that are none. Raises Problem TOO_MANY_PAIRS."""
         most = self._services.settings.max_batch_pairs
-        for line in lines:
-            self._count += 1
-            if self._count > most:
-                raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", headers=CLOSE)
-            self._pairs.write(pair_text(self._pair(line)))
+        self._count += len(texts)
+        if self._count > most:
+            extra = {"fitting_lines": most}
+            raise Problem("TOO_MANY_PAIRS", f"A batch has at most {most} lines.", headers=CLOSE, extra=extra)
+        return [self._read(text) for text in texts]
 
-    def finish(self, created: float) -> Batch:
-        """The batch of all lines. Raises Problem BATCH_EMPTY."""
-        if not self._count:
+    def take(self, read: Sequence[Read]) -> None:
+        """Find the objects that the requests mean, and keep the lines."""
+        for line, text, spec in read:
+            if spec is not None:
+                try:
+                    line.asked, line.named = asked_by_reference(self._library, spec)
+                except Problem as problem:
+                    line.error = problem.document()
+            if line.asked is not None:
+                self._identify([line.key, line.asked.values()])
+            else:
+                self._identify([hashlib.sha256(text.text or b"").hexdigest(), (line.error or {}).get("reason")])
+            self._lines.append(line)
+
+    def finish(self) -> Posting:
+        """All lines, to become jobs. Raises Problem BATCH_EMPTY."""
+        if not self._lines:
             raise Problem("BATCH_EMPTY")
-        batch_id = self._identity.hexdigest()[:_ID_DIGITS]
-        return Batch(batch_id, self._caller, created, self._count, self._refused, self._problems)
+        return Posting(self._services, self._caller, self._identity.hexdigest()[:_ID_DIGITS], self._lines)
 
-    def _pair(self, line: Line) -> Pair:
+    def _read(self, text: TextLine) -> Read:
+        line = Line(text.number)
         try:
-            key, asked, request = self._read(line)
+            spec = self._spec(text)
         except Problem as problem:
-            error = problem.document()
-            self._refused += 1
-            if len(self._problems) < _PROBLEMS_SHOWN:
-                self._problems.append({"line": line.number, "error": error})
-            self._identify([hashlib.sha256(line.text or b"").hexdigest(), error["reason"]])
-            return Pair(self._count, line.number, 0, None, None, error)
-        self._keys.update({key: line.number} if key is not None else {})
-        self._identify([key, asked.values()])
-        return Pair(self._count, line.number, 0, key, request)
+            line.error = problem.document()
+            return line, text, None
+        line.key = spec.key
+        return line, text, spec
 
-    def _read(self, line: Line) -> tuple[str | None, RegistrationRequest, dict[str, Any]]:
-        """The line's key and request, and what is kept of it: entries of the library are taken as they are now.
-
-        Raises Problem: what POST /register would say.
-        """
-        if line.text is None:
+    def _spec(self, text: TextLine) -> BatchPair:
+        """Raises Problem: what POST /register would say."""
+        if text.text is None:
             raise Problem("LINE_TOO_LARGE", f"A line may have {LINE_BYTES} bytes.")
-        spec = read_model(BatchPair, line.text)
-        if spec.key is not None and spec.key in self._keys:
+        spec = read_model(BatchPair, text.text)
+        if spec.key is not None and self._keys.setdefault(spec.key, text.number) != text.number:
             fault = {"pointer": "/key", "detail": f"Line {self._keys[spec.key]} has the same key."}
             raise Problem("INVALID_REQUEST", errors=[fault])
-        asked, _ = asked_by_reference(self._services, self._caller, spec)
-        self._check(asked)
-        members = {name: value for name, value in parse_json(line.text).items() if name != "key"}
-        meant = {"object": asked.object, "candidates": asked.candidates and list(asked.candidates)}
-        return spec.key, asked, members | {name: value for name, value in meant.items() if value is not None}
-
-    def _check(self, asked: RegistrationRequest) -> None:
-        check_cost(self._services.settings, asked)
-        self._services.webhooks.check(self._caller, asked.webhook)
+        return spec
 
     def _identify(self, value: Any) -> None:
         text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)

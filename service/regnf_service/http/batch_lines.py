@@ -9,7 +9,7 @@ LINE_BYTES = 64 * 1024
 """A search among 512 candidates takes 35,000."""
 
 
-class Line(NamedTuple):
+class TextLine(NamedTuple):
     """One line that is not blank. number: in the body, from 1 on · text: None for one that is too long."""
 
     number: int
@@ -25,14 +25,14 @@ class LineReader:
         self._is_too_long = False
         self._number = 0
 
-    def feed(self, data: bytes) -> list[Line]:
+    def feed(self, data: bytes) -> list[TextLine]:
         """The lines that end in ``data``."""
         *ended, rest = data.split(b"\n")
         lines = [line for part in ended if (line := self._end(part)) is not None]
         self._add(rest)
         return lines
 
-    def finish(self) -> list[Line]:
+    def finish(self) -> list[TextLine]:
         """The last line, where no line feed ends it."""
         last = self._end(b"")
         return [] if last is None else [last]
@@ -44,18 +44,18 @@ class LineReader:
         else:
             self._held += part
 
-    def _end(self, part: bytes) -> Line | None:
+    def _end(self, part: bytes) -> TextLine | None:
         self._add(part)
         self._number += 1
         text, too_long = bytes(self._held).strip(), self._is_too_long
         self._held.clear()
         self._is_too_long = False
         if too_long:
-            return Line(self._number, None)
-        return Line(self._number, text) if text else None
+            return TextLine(self._number, None)
+        return TextLine(self._number, text) if text else None
 
 
-async def lines_of(chunks: AsyncIterator[bytes]) -> AsyncIterator[list[Line]]:
+async def lines_of(chunks: AsyncIterator[bytes]) -> AsyncIterator[list[TextLine]]:
     """The lines of a body, as many at a time as arrive together."""
     reader = LineReader()
     async for data in chunks:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from regnf_service.http.library_selection import objects_meant
+from regnf_service.http.library_selection import CallersLibrary
 from regnf_service.http.schemas.library import LibrarySelection
 from regnf_service.http.schemas.registrations import RegisterRequest
-from regnf_service.services import Services
 from regnf_state.registration_request import RegistrationRequest
 
 
-def asked_by_reference(
-    services: Services, caller: str, spec: RegisterRequest
-) -> tuple[RegistrationRequest, dict[str, str]]:
+def asked_by_reference(library: CallersLibrary, spec: RegisterRequest) -> tuple[RegistrationRequest, dict[str, str]]:
     """The job's request, and the fields that the caller must have beside the scene's, by where they are named.
 
     Raises Problem LIBRARY_ENTRY_NOT_FOUND, LIBRARY_EMPTY, LIBRARY_TOO_LARGE.
     """
-    object_, candidates = objects_meant(services, caller, spec.object, spec.candidates)
+    object_, candidates = library.objects_meant(spec.object, spec.candidates)
     named = {"/scene": spec.scene}
     if object_ is not None:
         named["/object"] = object_

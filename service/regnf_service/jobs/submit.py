@@ -107,6 +107,12 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
         if existing is not None:
             return existing
     _require_budget(services, caller, job_id)
+    return start(services, caller, asked, job_id)
+
+
+def start(services: Services, caller: str, asked: JobRequest, job_id: str, batch: str | None = None) -> JobRecord:
+    """The same once there is room, for a job whose id is known. batch: the id of the batch that starts it."""
+    request = asked.owned_by(caller)
     now = services.records.now()
     record, _ = services.records.create_job(
         JobRecord(
@@ -114,7 +120,7 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
             kind=kind_of(request),
             status="accepted",
             request=request.to_record(),
-            inputs=_inputs(asked),
+            inputs=_inputs(asked) | ({} if batch is None else {"batch": batch}),
             created=now,
             updated=now,
         ),

@@ -16,12 +16,11 @@ from redis import Redis
 
 from regnf_service.upkeep.lease import Term
 from regnf_state.batches import Batches
-from regnf_state.blobs.base import BlobStore
+from regnf_state.blobs.base import BlobEntry, BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pages import all_of
 from regnf_state.pieces import Pieces
 from regnf_state.records import ACTIVE, FieldRecord, JobRecord, UnreadableRecordError
-from regnf_state.redis.batch_index import BatchIndex
 from regnf_state.redis.keys import PREFIX
 from regnf_state.room import Room
 from regnf_state.settings import Settings
@@ -62,11 +61,11 @@ class Housekeeper:
         self._blobs = blobs
         self._redis = redis
         self._keep_unused_s = settings.unused_field_retention_s
-        self._keep_rejected_s = settings.retention_s
+        self._retention_s = settings.retention_s
         self._cap = settings.storage_cap_bytes
         self._room = Room(records, blobs, redis, settings)
         self._pieces = Pieces(blobs, settings)
-        self._batches = Batches(blobs, BatchIndex(redis), settings.retention_s)
+        self._batches = Batches(blobs)
 
     def run_if_due(self, term: Term) -> Removed:
         """A round, if the last one is an hour ago."""
@@ -83,7 +82,8 @@ class Housekeeper:
         if not self._records.generation.is_current():
             return Removed()  # records that Redis has lost must not look unused
         now = self._records.now()
-        temporary = self._blobs.sweep(_ORPHANED_AFTER_S) + self._pieces.expire(now) + self._batches.sweep(now)
+        temporary = self._blobs.sweep(_ORPHANED_AFTER_S) + self._pieces.expire(now)
+        self._batches.expire(now - self._retention_s, term.confirm)
         folders = self._folders()
         self._forget_expired(term)
         orphans = tuple(self._drop_orphans(term, folders))
@@ -91,13 +91,16 @@ class Housekeeper:
         dropped = [
             field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
         ]
-        total = sum(kept.bytes for kept in self._folders().values()) if self._cap is not None else 0
+        total = 0
+        if self._cap is not None:
+            total = sum(kept.bytes for kept in self._folders().values())
+            total += sum(entry.bytes for entry in self._batches.entries())
         more_jobs, more_fields = self._drop_beyond_cap(term, total, folders, now)
         return Removed((*dropped, *more_fields), tuple(more_jobs), orphans, temporary)
 
     def _is_old(self, used: float, field: FieldRecord, now: float) -> bool:
         if field.state == "rejected":
-            return field.updated + self._keep_rejected_s <= now
+            return field.updated + self._retention_s <= now
         return self._keep_unused_s is not None and used + self._keep_unused_s <= now
 
     def _folders(self) -> dict[str, Kept]:
@@ -171,7 +174,7 @@ class Housekeeper:
     def _drop_beyond_cap(
         self, term: Term, total: int, folders: dict[str, Kept], now: float
     ) -> tuple[list[str], list[str]]:
-        """Finished jobs and unused fields, oldest first, until the rest is within the cap."""
+        """Finished jobs, unused fields and batches, oldest first, until the rest is within the cap."""
         jobs: list[str] = []
         fields: list[str] = []
         if self._cap is None or total <= self._cap:
@@ -179,10 +182,15 @@ class Housekeeper:
         candidates: list[tuple[float, str, Any]] = [
             *((job.finished or 0.0, f"jobs/{job.id}", job) for job in self._finished_jobs()),
             *((used, f"fields/{field.sha256}", field) for used, field in self._unused_fields()),
+            *((entry.modified, entry.key, entry) for entry in self._batches.entries()),
         ]
         for touched, folder, record in sorted(candidates, key=lambda one: one[:2]):
             if total <= self._cap or touched + _UNTOUCHED_FOR_S > now:
                 break
+            if isinstance(record, BlobEntry):  # a batch: its jobs stay
+                self._blobs.delete(record.key)
+                total -= record.bytes
+                continue
             if isinstance(record, FieldRecord):
                 if not self._drop_field(term, record):
                     continue

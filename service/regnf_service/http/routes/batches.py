@@ -1,22 +1,18 @@
-"""Batches: thousands of registrations in one body, and their results as they come."""
+"""Batches: many registrations in one body, and their results in its order."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import AsyncIterator, Iterator
-from itertools import islice
 from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Query
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response
 
-from regnf_service.batches.cancelling import cancel, go_on
-from regnf_service.batches.lookup import Found, find_batch
+from regnf_service.batches import Posting, cancel, find_batch, is_waiting, results_page, state_of
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import body
-from regnf_service.http.batch_intake import Intake
+from regnf_service.http.batch_intake import Intake, portions
 from regnf_service.http.batch_lines import lines_of
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.pace import Pace
@@ -24,17 +20,17 @@ from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.routes.documentation import BATCH_LINKS, BINARY, FILE, header, refusals
 from regnf_service.http.schemas.batches import BatchDocument, BatchPage, BatchPair, BatchResult, ResultStatus
 from regnf_service.http.schemas.batches import batch_document as document_of
+from regnf_service.http.schemas.batches import summary_document as summary_of
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.turns import fair_key
 from regnf_service.http.waiting import wait_for
-from regnf_service.problem import CLOSE, RETRY_LATER, Problem
+from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.batch_records import Batch
-from regnf_state.blobs.base import BlobWriter
+from regnf_state.batches import Batch
 
 router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
-_LINES_AT_ONCE = 50
+_LINES_AT_ONCE = 20
 _MOST_LINES = 2**31 - 1
 """More than any batch has; what a query may ask for at most."""
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
@@ -46,9 +42,9 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
     response_model=BatchDocument,
     status_code=202,
     responses={
-        200: {"description": "The batch has ended, and none of its pairs has failed.", "links": BATCH_LINKS},
+        200: {"description": "None of its jobs waits or runs.", "links": BATCH_LINKS},
         202: {
-            "description": "The batch goes on.",
+            "description": "Its jobs wait or run.",
             "headers": {"Location": header("The batch.")},
             "links": BATCH_LINKS,
         },
@@ -62,8 +58,12 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "UPLOAD_INCOMPLETE",
             "UPLOAD_STALLED",
             "TOO_MANY_UPLOADS",
+            "QUOTA_ACTIVE_JOBS",
             "QUOTA_BATCHES",
-            "CONFLICT",
+            "QUOTA_STORED_BYTES",
+            "QUOTA_WORKER_SECONDS",
+            "QUEUE_FULL",
+            "RECORDS_FULL",
             "STORAGE_FULL",
         ),
     },
@@ -72,57 +72,49 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
 async def post_batch(request: Request, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:
     """JSON Lines: on each line what `POST /register` takes, with a `key` of your own if you like.
 
-    A line that is no request becomes a result with an error, and refuses no other. The same lines are the same batch:
-    posted again, one that was cancelled goes on, and one that has ended does its failed pairs again. Equal pairs are
-    one job. A few pairs at a time are handed to the queue, so that nobody waits for the whole batch.
+    Each line becomes a job as with `POST /register`; one that is no request is told among `errors`, and refuses no
+    other. Where the new jobs do not fit into your quota or the queue, nothing is started: `new_jobs` says how many they
+    are, `fitting_lines` how many of the first lines would fit. The same lines are the same batch: posted again, jobs
+    that failed or were cancelled start anew, and nothing is done twice.
     """
     if body.media_type(request) != MEDIA_TYPE:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send JSON Lines as {MEDIA_TYPE}.", headers=CLOSE)
     body.refuse_encoding(request)
     pace = Pace(services.settings)
     async with services.uploads.held(fair_key(request.scope, caller), pace):
-        with await in_thread(services.blobs.writer) as pairs:
-            batch = await _read(request, services, Intake(services, caller, pairs), pace)
-            found = await in_thread(_keep, services, batch, pairs)
-    services.batch_posted.set()
-    goes_on = found.state.status == "running"
-    answer = _answer(services, found, prefix, 202 if goes_on else 200)
-    answer.headers["Location"] = f"{prefix}/batches/{found.batch.id}"
+        posting = await _read(request, services, Intake(services, caller), pace)
+        few = [posting.lines[start : start + _LINES_AT_ONCE] for start in range(0, len(posting.lines), _LINES_AT_ONCE)]
+        for lines in few:
+            await in_thread(posting.check, lines)
+        await in_thread(posting.require_room)
+        for lines in few:
+            await in_thread(posting.submit, lines)
+        batch = await in_thread(posting.keep)
+    answer = await in_thread(_answer, services, batch, prefix, 202)
+    answer.headers["Location"] = f"{prefix}/batches/{batch.id}"
     return answer
 
 
-async def _read(request: Request, services: Services, intake: Intake, pace: Pace) -> Batch:
-    """The lines as they arrive, checked a few at a time beside the event loop."""
+async def _read(request: Request, services: Services, intake: Intake, pace: Pace) -> Posting:
+    """The lines as they arrive, a few at a time beside the event loop."""
     chunks = body.chunks(request, services.settings.max_batch_bytes, pace, "REQUEST_TOO_LARGE")
     async for lines in lines_of(chunks):
-        left = iter(lines)
-        while few := list(islice(left, _LINES_AT_ONCE)):
-            await to_thread.run_sync(intake.take, few, limiter=services.parse_limiter)
-    return intake.finish(await in_thread(services.records.now))
+        for few in portions(lines):
+            read = await to_thread.run_sync(intake.read, few, limiter=services.parse_limiter)
+            await in_thread(intake.take, read)
+    return intake.finish()
 
 
-def _keep(services: Services, batch: Batch, pairs: BlobWriter) -> Found:
-    """The batch, kept or known. Raises Problem QUOTA_BATCHES, CONFLICT."""
-    batches, most = services.batches, services.settings.quota_batches
-    batches.rebuild_if_needed()
-    if batches.find(batch.name) is None:
-        while batches.index.count(batch.owner) >= most:
-            oldest = batches.index.oldest_ended(batch.owner)
-            if oldest is None:
-                raise Problem("QUOTA_BATCHES", headers=RETRY_LATER)
-            batches.delete(oldest, services.settings.retention_s)
-    kept, created = batches.create(batch, pairs, batch.created)
-    return Found(kept, batches.state(kept.name) if created else go_on(services, kept))
-
-
-def _answer(services: Services, found: Found, prefix: str, status: int = 200) -> JSONResponse:
-    document = document_of(found.batch, found.state, services.settings.retention_s, prefix)
+def _answer(services: Services, batch: Batch, prefix: str, status: int = 200) -> JSONResponse:
+    """The batch; 200 in place of ``status`` where none of its jobs waits or runs."""
+    document = document_of(batch, state_of(services, batch), services.settings.retention_s, prefix)
+    status = status if document["status"] == "running" else 200
     return JSONResponse(document, status_code=status, headers={"Cache-Control": "no-cache"})
 
 
 @router.get(
     "/batches",
-    summary="Batches, newest first",
+    summary="Batches, those posted last first",
     response_model=BatchPage,
     responses=refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN"),
 )
@@ -136,8 +128,7 @@ def list_batches(
 ) -> Response:
     """A page may be short and not be the last: go on while there is a `next_page_token`."""
     page = services.batches.page(caller, limit, decode_token(page_token))
-    retention_s = services.settings.retention_s
-    documents = [document_of(one, services.batches.state(one.name), retention_s, prefix) for one in page.records]
+    documents = [summary_of(one, services.settings.retention_s, prefix) for one in page.records]
     return JSONResponse({"batches": documents, "next_page_token": encode_token(page.rest)})
 
 
@@ -145,7 +136,7 @@ def list_batches(
     "/batches/{id}",
     summary="A batch's state",
     response_model=BatchDocument,
-    responses=refusals("INVALID_QUERY", "BATCH_NOT_FOUND", "BATCH_EXPIRED"),
+    responses=refusals("INVALID_QUERY", "BATCH_NOT_FOUND"),
 )
 async def get_batch(
     id: str,  # noqa: A002 -- the contract's own word
@@ -154,24 +145,28 @@ async def get_batch(
     prefix: PrefixDep,
     wait: WaitQuery = 0,
 ) -> Response:
-    """With `wait`, the answer comes once the batch has ended."""
-    found = await wait_for(
-        lambda: find_batch(services, caller, id), lambda seen: seen.state.status != "running", wait, services, caller
-    )
-    return _answer(services, found, prefix)
+    """With `wait`, the answer comes once none of its jobs waits or runs."""
+    batch = await in_thread(find_batch, services, caller, id)
+    if wait:
+        look = services.records.active_among
+        await wait_for(lambda: look(batch.jobs), lambda active: not active, wait, services, caller)
+    return await in_thread(_answer, services, batch, prefix)
 
 
 @router.get(
     "/batches/{id}/results",
     summary="A batch's results, as far as they are there",
-    response_class=StreamingResponse,
+    response_class=Response,
     responses={
         200: {
-            "description": "JSON Lines, in the order in which the pairs have ended.",
+            "description": "JSON Lines, in the order of the pairs, up to the first that has not ended.",
             "content": {MEDIA_TYPE: {**BINARY, "x-line-schema": reference(BatchResult)}},
-            "headers": {"Batch-Status": header("The batch's `status`: unless it is `running`, no more will come.")},
+            "headers": {
+                "Batch-After": header("`after` of the next call."),
+                "Batch-Left": header("How many pairs follow: 0 on the last page."),
+            },
         },
-        **refusals("INVALID_QUERY", "BATCH_NOT_FOUND", "BATCH_EXPIRED"),
+        **refusals("INVALID_QUERY", "BATCH_NOT_FOUND"),
     },
 )
 async def batch_results(
@@ -179,35 +174,21 @@ async def batch_results(
     services: ServicesDep,
     caller: CallerDep,
     after: Annotated[int, Query(ge=0, le=_MOST_LINES, description="`number` of the last result that you have.")] = 0,
-    limit: Annotated[int | None, Query(ge=1, le=_MOST_LINES, description="How many lines at most.")] = None,
+    limit: Annotated[int, Query(ge=1, le=_MOST_LINES, description="How many lines at most.")] = _MOST_LINES,
     status: Annotated[ResultStatus | None, Query(description="Only pairs that have ended so.")] = None,
     wait: WaitQuery = 0,
 ) -> Response:
-    """A line each. A failed pair that was repeated has two: the later one counts.
+    """A line each. A page has some hundreds of lines, or a mebibyte: go on with `Batch-After` until `Batch-Left` is 0.
 
-    With `wait`, the answer comes once there is a result behind `after`, or the batch has ended.
+    With `wait`, the answer comes once the pair behind `after` has ended.
     """
-    found = await wait_for(
-        lambda: find_batch(services, caller, id),
-        lambda seen: seen.state.lines > after or seen.state.status != "running",
-        wait,
-        services,
-        caller,
-    )
-    lines = islice(_chosen(services, found, after, status), limit)
-    headers = {"Batch-Status": found.state.status, "Cache-Control": "no-cache"}
-    return StreamingResponse(_blocks(lines), media_type=MEDIA_TYPE, headers=headers)
-
-
-def _chosen(services: Services, found: Found, after: int, status: str | None) -> Iterator[bytes]:
-    lines = services.batches.results(found.batch.name, found.state, after)
-    return lines if status is None else (line for line in lines if json.loads(line)["status"] == status)
-
-
-async def _blocks(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
-    """The lines, some at a time, each time read in a thread."""
-    while block := await in_thread(lambda: b"".join(islice(lines, _LINES_AT_ONCE))):
-        yield block
+    batch = await in_thread(find_batch, services, caller, id)
+    if wait:
+        await wait_for(lambda: is_waiting(services, batch, after), lambda waits: not waits, wait, services, caller)
+    page = await in_thread(results_page, services, batch, after, limit, status)
+    left = max(0, len(batch.pairs) - page.after)
+    headers = {"Batch-After": str(page.after), "Batch-Left": str(left), "Cache-Control": "no-cache"}
+    return Response(page.text, media_type=MEDIA_TYPE, headers=headers)
 
 
 @router.post(
@@ -216,35 +197,30 @@ async def _blocks(lines: Iterator[bytes]) -> AsyncIterator[bytes]:
     response_model=BatchDocument,
     status_code=202,
     responses={
-        200: {"description": "It was dismissed already.", "model": BatchDocument},
-        **refusals("BATCH_NOT_FOUND", "BATCH_FINISHED", "BATCH_EXPIRED", "CONFLICT"),
+        200: {"description": "None of its jobs waits or runs.", "model": BatchDocument},
+        **refusals("BATCH_NOT_FOUND"),
     },
 )
 @blocking
 def cancel_batch(id: str, services: ServicesDep, caller: CallerDep, prefix: PrefixDep) -> JSONResponse:  # noqa: A002
-    """No further pair is handed out, and the jobs that it has started end. What is done stays, and is not repeated when
-    the batch is posted again."""
-    before = find_batch(services, caller, id)
-    if before.state.status == "dismissed":
-        return _answer(services, before, prefix)
-    after = cancel(services, before.batch)
-    if after.status == "finished":
-        raise Problem("BATCH_FINISHED")
-    return _answer(services, Found(before.batch, after), prefix, 202)
+    """The jobs that it has started and that wait or run are cancelled; waiting ones end at once, running ones within
+    seconds. Jobs that it found, started by another request, go on. What is done stays."""
+    batch = find_batch(services, caller, id)
+    cancelled = cancel(services, batch)
+    answer = _answer(services, batch, prefix)
+    answer.status_code = 202 if cancelled else 200
+    return answer
 
 
 @router.delete(
     "/batches/{id}",
-    summary="Forget a batch and its results",
+    summary="Forget a batch",
     status_code=204,
     response_class=Response,
-    responses=refusals("BATCH_NOT_FOUND", "BATCH_ACTIVE", "BATCH_EXPIRED"),
+    responses=refusals("BATCH_NOT_FOUND"),
 )
 @blocking
 def delete_batch(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
-    """Only one that has ended: cancel it first. Its jobs stay."""
-    found = find_batch(services, caller, id)
-    if found.state.status == "running":
-        raise Problem("BATCH_ACTIVE")
-    services.batches.delete(found.batch.name)
+    """Its jobs stay, and go on: cancel it first if they shall not."""
+    services.batches.delete(caller, find_batch(services, caller, id).id)
     return Response(status_code=204)

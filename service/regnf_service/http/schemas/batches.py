@@ -6,14 +6,17 @@ from typing import Any, Literal
 
 from pydantic import Field
 
+from regnf_service.batches import COUNTED, BatchState
 from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import Label, Links, Moment, Outgoing, ProblemDocument
 from regnf_service.http.schemas.registrations import RegisterRequest
 from regnf_service.http.schemas.results import AlternativeDocument, TransformDocument, UncertaintyDocument, Verdict
 from regnf_service.times import rfc3339
-from regnf_state.batch_records import COUNTED, Batch, BatchState
+from regnf_state.batches import Batch
+from regnf_state.batches import BatchSummary as Summary
 
 ResultStatus = Literal["successful", "failed", "refused"]
+_PROBLEMS_SHOWN = 32
 
 
 class BatchPair(RegisterRequest):
@@ -23,7 +26,7 @@ class BatchPair(RegisterRequest):
 
 
 class RefusedLine(Outgoing):
-    """A line that is no request."""
+    """A line that has become no job."""
 
     line: int = Field(description="In the body, from 1 on.")
     error: ProblemDocument
@@ -35,43 +38,45 @@ class BatchCounts(Outgoing):
     registered: int = 0
     ambiguous: int = 0
     rejected: int = 0
-    failed: int = Field(0, description="Their job or their fields failed. Posting the batch again repeats them.")
-    refused: int = Field(0, description="Their line is no request.")
+    failed: int = Field(
+        0, description="Their job failed, was cancelled, or is gone. Posting the batch again starts them anew."
+    )
+    refused: int = Field(0, description="Their line has become no job.")
 
 
-class BatchDocument(Outgoing):
-    """One batch."""
+class BatchSummary(Outgoing):
+    """What the list tells of a batch."""
 
     id: str
-    status: Literal["running", "finished", "dismissed"]
     pairs: int = Field(description="How many lines it has.")
-    waiting: int = Field(description="Pairs that were not handed to the queue.")
-    active: int = Field(description="Pairs whose job waits or runs, or whose result is about to be written.")
-    counts: BatchCounts
-    progress: float = Field(ge=0, le=1)
-    results: int = Field(description="How many lines `GET /batches/{id}/results` has.")
-    passes: int = Field(1, ge=1, description="One more each time that failed pairs are repeated.")
-    waits_for: str | None = Field(None, description="The reason of the limit that holds the next pair back.")
-    created_at: Moment
-    updated_at: Moment
-    finished_at: Moment | None = None
-    expires_at: Moment | None = Field(None, description="When a batch that has ended and its results will be gone.")
-    errors: list[RefusedLine] = Field([], description="The first lines that are no request, 32 at most.")
+    created_at: Moment = Field(description="When it was posted last.")
+    expires_at: Moment = Field(description="When it will be gone. Its jobs go by their own times.")
     links: Links
 
 
-class BatchPage(Outgoing):
-    """Batches, newest first."""
+class BatchDocument(BatchSummary):
+    """One batch."""
 
-    batches: list[BatchDocument]
+    status: Literal["running", "finished", "dismissed"] = Field(
+        description="`running` while a job of it waits or runs; then `dismissed` if jobs of it were cancelled."
+    )
+    active: int = Field(description="Pairs whose job waits or runs.")
+    counts: BatchCounts
+    progress: float = Field(ge=0, le=1)
+    errors: list[RefusedLine] = Field([], description="The first lines that have become no job, 32 at most.")
+
+
+class BatchPage(Outgoing):
+    """Batches, those posted last first."""
+
+    batches: list[BatchSummary]
     next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
 class BatchResult(Outgoing):
     """A line of a batch's results: a pair that has ended."""
 
-    number: int = Field(description="Of the result, from 1 on: `after` of the next call.")
-    pair: int = Field(description="Of the pair, from 1 on.")
+    number: int = Field(description="Of the pair, from 1 on: `after` of the next call.")
     line: int = Field(description="Of the pair in the body that was posted.")
     key: str | None
     job: str | None = Field(description="The job, with all of the result and its files.")
@@ -86,29 +91,29 @@ class BatchResult(Outgoing):
     error: ProblemDocument | None = Field(None, description="Unless `status` is `successful`.")
 
 
-def batch_document(batch: Batch, state: BatchState, retention_s: float, prefix: str) -> dict[str, Any]:
-    """The batch as it travels."""
-    done = sum(state.counts.values())
+def summary_document(batch: Summary, retention_s: float, prefix: str) -> dict[str, Any]:
+    """What a list tells of a batch, as it travels."""
     return {
         "id": batch.id,
-        "status": state.status,
         "pairs": batch.pairs,
-        "waiting": max(0, batch.pairs - done - len(state.open)),
-        "active": len(state.open) if state.status == "running" else 0,
-        "counts": {name: state.counts.get(name, 0) for name in COUNTED},
-        "progress": min(1.0, done / batch.pairs),
-        "results": state.lines,
-        "passes": state.passes,
-        "waits_for": state.waits_for,
         "created_at": rfc3339(batch.created),
-        "updated_at": rfc3339(state.updated),
-        "finished_at": rfc3339(state.finished),
-        "expires_at": None if state.finished is None else rfc3339(state.finished + retention_s),
-        "errors": batch.problems,
-        "links": _links(state, f"{prefix}/batches/{batch.id}"),
+        "expires_at": rfc3339(batch.created + retention_s),
+        "links": _links(f"{prefix}/batches/{batch.id}"),
     }
 
 
-def _links(state: BatchState, address: str) -> Links:
-    links = {"self": address, "results": f"{address}/results"}
-    return links | ({"cancel": f"{address}/cancel"} if state.status == "running" else {})
+def batch_document(batch: Batch, state: BatchState, retention_s: float, prefix: str) -> dict[str, Any]:
+    """The batch as it travels."""
+    pairs = len(batch.pairs)
+    refused = [{"line": pair.line, "error": pair.error} for pair in batch.pairs if pair.error is not None]
+    return summary_document(Summary(batch.id, batch.created, pairs), retention_s, prefix) | {
+        "status": state.status,
+        "active": state.active,
+        "counts": {name: state.counts.get(name, 0) for name in COUNTED},
+        "progress": (pairs - state.active) / pairs,
+        "errors": refused[:_PROBLEMS_SHOWN],
+    }
+
+
+def _links(address: str) -> Links:
+    return {"self": address, "results": f"{address}/results", "cancel": f"{address}/cancel"}
