@@ -47,7 +47,7 @@ HINTS: dict[str, str] = {
     "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
     "files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",
-    "ARCHIVE_LINK": "Pack the run again with `tar --dereference`, or as a zip.",
+    "ARCHIVE_LINK": "Pack the run again with what the link leads to: `tar --dereference`, or `zip -r` without `-y`.",
     "ARCHIVE_NESTED": "Unpack the outer archive, and give the inner one.",
     "SETTINGS_NOT_RECOGNIZED": "docs/import-gate.md lists the settings of each trainer.",
     "SETTINGS_UNSAFE": "Write the values themselves into the file, or say them in a description.",

@@ -309,3 +309,14 @@ def test_pieces_are_of_one_file(world: World) -> None:
     headers = {"Content-Range": "bytes 700-1999/2400"}
     assert_refused(world.client.put(f"/fields/{NAME}", content=DATA[700:2000], headers=headers), 400, "INVALID_HEADER")
     assert put(world, 700, 2000).status_code == 201
+
+
+def test_pieces_that_are_deleted_while_they_are_put_together(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(world, 0, 2000, headers={"Upload-Complete": "?0"})
+
+    def gone(*_: object) -> Iterator[bytes]:
+        raise FileNotFoundError
+        yield b""
+
+    monkeypatch.setattr(Pieces, "blocks", gone)
+    assert_refused(finish(world), 409, "UPLOAD_NOT_FINISHED")

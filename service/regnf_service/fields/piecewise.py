@@ -97,8 +97,11 @@ async def _assembled(services: Services, caller: str, sha256: str, beside: Besid
     with services.under_way.claim(caller, room, found.total) as claim:
         async with open_upload(services, claim) as upload:
             blocks = services.pieces.blocks(caller, sha256)
-            while (block := await in_thread(next, blocks, b"")) != b"":
-                await upload.feed(block)
+            try:
+                while (block := await in_thread(next, blocks, b"")) != b"":
+                    await upload.feed(block)
+            except FileNotFoundError as error:  # they were deleted in between
+                raise _at("UPLOAD_NOT_FINISHED", 0) from error
             received = await upload.finish()
             if received.sha256 != sha256:
                 await in_thread(services.pieces.drop, caller, sha256)
