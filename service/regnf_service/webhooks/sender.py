@@ -113,8 +113,13 @@ def _look_up(host: str, port: int, asked: asyncio.Future[list[str]]) -> None:
     except (OSError, UnicodeError):
         found = []
     addresses = list(dict.fromkeys(str(entry[4][0]) for entry in found))
+
+    def tell() -> None:
+        if not asked.done():
+            asked.set_result(addresses)
+
     with suppress(RuntimeError):  # the loop was closed in the meantime
-        asked.get_loop().call_soon_threadsafe(lambda: asked.done() or asked.set_result(addresses))
+        asked.get_loop().call_soon_threadsafe(tell)
 
 
 class HttpSender:

@@ -137,20 +137,17 @@ class RegistrationSpec(Incoming):
         )
 
 
-def _drop_defaults(schema: dict[str, Any]) -> None:
+def _one_of_both(schema: dict[str, Any]) -> None:
+    # within allOf: of a bare oneOf with nothing but `required` in it, generators of clients make Any
+    schema["allOf"] = [{"oneOf": [{"required": ["object"]}, {"required": ["candidates"]}]}]
     for name in ("object", "candidates"):
         schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
 
 
 class RegisterRequest(RegistrationSpec):
-    """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among.
+    """One registration: which scene, where in it, and which object to lay onto it, or which ones to choose among."""
 
-    Exactly one of `object` and `candidates` is given.
-    """
-
-    # That is said in words alone: of a oneOf with nothing but `required` in it, generators of clients make no type.
-
-    model_config = ConfigDict(json_schema_extra=_drop_defaults)
+    model_config = ConfigDict(json_schema_extra=_one_of_both)
 
     scene: Reference = Field(description="The scene's field.")
     object: Annotated[
