@@ -47,7 +47,7 @@ HINTS: dict[str, str] = {
     "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
     "files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",
-    "ARCHIVE_LINK": "Pack the run again with `tar --dereference`, or as a zip.",
+    "ARCHIVE_LINK": "Pack the run again with what the link leads to: `tar --dereference`, or `zip -r` without `-y`.",
     "ARCHIVE_NESTED": "Unpack the outer archive, and give the inner one.",
     "SETTINGS_NOT_RECOGNIZED": "docs/import-gate.md lists the settings of each trainer.",
     "SETTINGS_UNSAFE": "Write the values themselves into the file, or say them in a description.",
@@ -75,6 +75,16 @@ HINTS: dict[str, str] = {
     "JOB_MEMORY_LIMIT": "Use fewer rays or samples, or a smaller field; or set a higher limit for the service "
     "(REGNF_JOB_MEMORY_BYTES).",
     "JOB_DISK_LIMIT": "Use fewer rays or samples, or set a higher limit for the service (REGNF_JOB_SCRATCH_BYTES).",
+    "IMPORT_TIMEOUT": "Send it again when the service has less to do, or set a longer time limit for the service "
+    "(REGNF_IMPORT_TIMEOUT_S).",
+    "IMPORT_TOO_COSTLY": "Make the field smaller (fewer triangles, nodes or layers), or set a higher limit for the "
+    "service (REGNF_IMPORT_WORK_S).",
+    "IMPORT_OUT_OF_MEMORY": "Make the file smaller (a coarser mesh or grid), use a machine with more memory, or set a "
+    "higher limit for the service (REGNF_IMPORT_MEMORY_BYTES).",
+    "IMPORT_OUTPUT_TOO_LARGE": "Make the field smaller: a coarser mesh or grid.",
+    "IMPORT_CRASHED": "Try it once more. If it ends so again, the service's log has the last words of the import.",
+    "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",
+    "STORAGE_FULL": "Free space on the disk, or delete fields and jobs, then send it again.",
     "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
 }
 """Errors may carry a hint of their own, which says more."""

@@ -1,7 +1,8 @@
 """Uploads that come in pieces: those that have arrived wait in the blob store for the rest.
 
-A piece lies under the caller, the field's SHA-256 and the offset at which it begins. What has arrived is the longest
-row of pieces without a gap, so front ends need to know nothing of each other. A piece that broke off leaves nothing.
+A piece lies under the caller, the field's SHA-256, the offset at which it begins and the size of the whole. What has
+arrived is the longest row of pieces without a gap, so front ends need to know nothing of each other. A piece that broke
+off leaves nothing.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ _BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class Unfinished:
-    """One upload that has begun. offset: how many bytes have arrived, without a gap · bytes: what all pieces hold."""
+    """One upload that has begun. offset: how many bytes have arrived, without a gap · total: how many the whole has, by
+    its first piece · bytes: what all pieces hold."""
 
     folder: str
     offset: int
+    total: int
     pieces: int
     bytes: int
     modified: float
@@ -40,9 +43,9 @@ class Pieces:
         self._kept_s = settings.keep_pieces_s
         self._most_bytes = settings.keep_pieces_bytes
 
-    def key(self, caller: str, sha256: str, offset: int) -> str:
+    def key(self, caller: str, sha256: str, offset: int, total: int) -> str:
         """Where a piece lies."""
-        return f"{_folder(caller, sha256)}/{offset:015d}"
+        return f"{_folder(caller, sha256)}/{offset:015d}-{total}"
 
     def find(self, caller: str, sha256: str) -> Unfinished:
         """What has arrived of one upload; of one that never began, nothing."""
@@ -54,7 +57,7 @@ class Pieces:
         found = self.find(caller, sha256)
         offset = 0
         while offset < found.offset:
-            with self._blobs.open(self.key(caller, sha256, offset)) as file:
+            with self._blobs.open(self.key(caller, sha256, offset, found.total)) as file:
                 while block := file.read(_BLOCK):
                     offset += len(block)
                     yield block
@@ -96,9 +99,12 @@ def _folder(caller: str, sha256: str) -> str:
 
 
 def _unfinished(folder: str, entries: Sequence[BlobEntry]) -> Unfinished:
-    offset = 0
+    offset = total = 0
     for entry in entries:  # sorted by their offsets
-        if int(entry.key.rpartition("/")[2]) == offset:
+        begins, of = map(int, entry.key.rpartition("/")[2].split("-"))
+        total = total or of
+        if (begins, of) == (offset, total):
             offset += entry.bytes
-    total = sum(entry.bytes for entry in entries)
-    return Unfinished(folder, offset, len(entries), total, max((entry.modified for entry in entries), default=0.0))
+    held = sum(entry.bytes for entry in entries)
+    modified = max((entry.modified for entry in entries), default=0.0)
+    return Unfinished(folder, offset, total, len(entries), held, modified)

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Rebuilds service/web/vendor/three.bundle.min.js: the parts of three.js that the result page imports, in one module.
+# Rebuilds service/regnf_service/web/vendor/three.bundle.min.js: the parts of three.js that the result page imports, in one module.
 # The npm package of three.js ships no minified modules, and its add-ons import it by the bare name `three`, which a
 # browser resolves only through an inline import map; one bundle needs neither. Needs npm; run it to change versions.
 set -euo pipefail
@@ -8,7 +8,7 @@ three_version=0.187.0
 esbuild_version=0.28.2
 
 cd "$(dirname "$0")/.."
-vendor="$PWD/service/web/vendor"
+vendor="$PWD/service/regnf_service/web/vendor"
 work="$(mktemp -d)"
 trap 'rm -rf "$work"' EXIT
 
@@ -21,4 +21,4 @@ cp node_modules/three/LICENSE "$vendor/three.LICENSE"
 
 cd "$vendor"
 sha256sum three.bundle.min.js
-echo "Put this digest and three $three_version into service/web/vendor/README.md." >&2
+echo "Put this digest and three $three_version into service/regnf_service/web/vendor/README.md." >&2

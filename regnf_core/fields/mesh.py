@@ -114,7 +114,7 @@ class MeshField:
     @property
     def area(self) -> float:
         """Total area of the triangles."""
-        return float(self._normals_and_areas()[1].sum())
+        return float(self._normals_and_areas(self.faces)[1].sum())
 
     @property
     def device(self) -> torch.device:
@@ -146,7 +146,7 @@ class MeshField:
         with np.errstate(divide="ignore", invalid="ignore"):
             gradient = (queries - closest) * (sign / distance)[:, None]
         touching = distance < _ON_SURFACE
-        gradient[touching] = self._normals_and_areas()[0][triangles[touching].reshape(-1)]
+        gradient[touching] = self._normals_and_areas(self.faces[triangles[touching].reshape(-1)])[0]
         return _as_float32(sign * distance), _as_float32(gradient)
 
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:
@@ -163,7 +163,7 @@ class MeshField:
 
     def sample_surface(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
         """``count`` points (count, 3), uniform over the surface's area."""
-        areas = self._normals_and_areas()[1]
+        areas = self._normals_and_areas(self.faces)[1]
         chosen = rng.choice(len(self.faces), size=count, p=areas / areas.sum())
         a, b = rng.random((2, count, 1))
         flip = a + b > 1.0
@@ -180,9 +180,9 @@ class MeshField:
         winding.init(self.vertices, self.faces)
         return nearest, winding
 
-    def _normals_and_areas(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Unit normals (F, 3) and areas (F,) of the triangles."""
-        corner, first, second = (self.vertices[self.faces[:, i]] for i in range(3))
+    def _normals_and_areas(self, faces: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Unit normals (F, 3) and areas (F,) of these triangles (F, 3)."""
+        corner, first, second = (self.vertices[faces[:, i]] for i in range(3))
         cross = np.cross(first - corner, second - corner)
         norm = np.linalg.norm(cross, axis=1)
         return cross / np.maximum(norm, 1e-300)[:, None], norm / 2.0

@@ -10,7 +10,7 @@ Keys in use:
     jobs/{id}/{attempt}/{artifact}         what an attempt wrote; the manifest names the attempt that counts
     jobs/{id}/manifest.json                written after the result, atomically: what it lists counts
     jobs/{id}/rest.json                    the same for pictures and clouds, which come later
-    uploads/{caller}/{sha256}/{offset}     the pieces of an upload that is not finished: see regnf_state.pieces
+    uploads/{caller}/{sha256}/{offset}-{total}   the pieces of an upload that is not finished: see regnf_state.pieces
     batches/...                            batches of registrations and their results: see regnf_state.batches
     journal/jobs/{id}/{attempt}-{event}    what was accepted and how it ended: see regnf_state.journal.journal
     journal/fields/{sha256}                a field's record as it was last written

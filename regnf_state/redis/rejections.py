@@ -1,9 +1,8 @@
 """Why an owner's uploads were rejected, kept after their fields are gone: the same bytes are not imported again for it.
 
-A rejection follows from the bytes, their description and the version of the gate. What the machine had its part in (its
-load, memory, storage, a worker's death) may end otherwise next time, so it is kept for a short time only: long enough
-that a file which costs the workers minutes cannot be sent again and again. Each owner has rejections of its own. Those
-of others would tell it, by how soon the answer comes, what others have sent.
+Kept is what follows from the bytes, their description and the version of the gate. What a limit, a setting or the
+machine had its part in (load, memory, storage, a worker's death) may end otherwise next time: it is never kept. Each
+owner has rejections of its own. Those of others would tell it, by how soon the answer comes, what others have sent.
 """
 
 from __future__ import annotations
@@ -14,23 +13,18 @@ from typing import Any
 
 from regnf_core import __version__
 from regnf_core.engine_revision import ENGINE_REVISION
+from regnf_core.importing.gate.report import OF_THE_FILE
 from regnf_state.records import FieldRecord
 from regnf_state.redis.documents import RedisDocuments
 from regnf_state.redis.keys import PREFIX
 
 _KEPT_S = 24 * 3600
-_OF_THE_MACHINE_KEPT_S = 600
-_OF_THE_MACHINE = frozenset(
-    {"IMPORT_TIMEOUT", "IMPORT_CRASHED", "IMPORT_OUT_OF_MEMORY", "IMPORT_OUTPUT_TOO_LARGE", "OUT_OF_MEMORY"}
-)
-_NEVER = frozenset({"INTERNAL", "STORAGE_FULL", "STORAGE_UNAVAILABLE", "WORKER_LOST"})
-"""The service's own faults: nobody is refused for them."""
 _MOST = 256
 _PUT = """
 redis.call('SET', KEYS[2], ARGV[1], 'EX', ARGV[2])
 redis.call('ZADD', KEYS[1], ARGV[3], KEYS[2])
-redis.call('EXPIRE', KEYS[1], ARGV[4])
-for _, key in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1 - tonumber(ARGV[5]))) do
+redis.call('EXPIRE', KEYS[1], ARGV[2])
+for _, key in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1 - tonumber(ARGV[4]))) do
   redis.call('DEL', key)
   redis.call('ZREM', KEYS[1], key)
 end
@@ -50,13 +44,11 @@ class RedisRejections(RedisDocuments):
     """The part of the record store that is about rejections. Each owner's oldest go first."""
 
     def remember_rejection(self, field: FieldRecord, error: dict[str, Any]) -> None:
-        """Keep why this upload was rejected, unless the service itself was at fault."""
-        reason = error.get("reason")
-        if reason in _NEVER:
+        """Keep why this upload was rejected, if that lies in the file."""
+        if error.get("reason") not in OF_THE_FILE:
             return
-        kept_s = _OF_THE_MACHINE_KEPT_S if reason in _OF_THE_MACHINE else _KEPT_S
         keys = [_index(field.owner), _key(field)]
-        self._redis.eval(_PUT, 2, *keys, json.dumps(error), kept_s, repr(self.now()), _KEPT_S, _MOST)
+        self._redis.eval(_PUT, 2, *keys, json.dumps(error), _KEPT_S, repr(self.now()), _MOST)
 
     def known_rejection(self, field: FieldRecord) -> dict[str, Any] | None:
         """Why the same upload was rejected lately."""

@@ -1,11 +1,14 @@
 """The messages that are still to be sent, in Redis: entered together with the end of a job, so that none is lost.
 
-A job has a message for each of its webhooks, named by the job, its attempt and the webhook's place among them.
+A job has a message for each of its webhooks, named by the job, its attempt and the webhook's place among them. The
+messages of a caller to one receiver wait in a line of their own, and the lines take turns.
 """
 
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, Literal, cast, get_args
 
@@ -18,16 +21,28 @@ from regnf_state.redis.documents import Command, is_wrong_type, text
 from regnf_state.redis.keys import PREFIX
 
 logger = logging.getLogger(__name__)
-_DUE = f"{PREFIX}webhooks:due"
+_LINES = f"{PREFIX}webhooks:lines"
+"""The lines that may have messages, by when each had its turn last."""
 _LEASE_S = 60
 """A message that was taken and neither delivered nor put off for so long was taken by a process that died."""
 _CLAIM = """
 local time = redis.call('TIME')
 local now = time[1] + time[2] / 1e6
-local due = redis.call('ZRANGEBYSCORE', KEYS[1], '-inf', now, 'LIMIT', 0, 1)
-if not due[1] then return false end
-redis.call('ZADD', KEYS[1], now + ARGV[1], due[1])
-return due[1]
+local passed_over = {}
+for i = 3, #ARGV do passed_over[ARGV[i]] = true end
+for _, line in ipairs(redis.call('ZRANGE', KEYS[1], 0, -1)) do
+  if not passed_over[line] and not passed_over[string.match(line, '^[^ ]*')] then
+    local key = ARGV[2] .. line
+    local due = redis.call('ZRANGEBYSCORE', key, '-inf', now, 'LIMIT', 0, 1)
+    if due[1] then
+      redis.call('ZADD', key, now + ARGV[1], due[1])
+      redis.call('ZADD', KEYS[1], now, line)
+      return {line, due[1]}
+    end
+    if redis.call('EXISTS', key) == 0 then redis.call('ZREM', KEYS[1], line) end
+  end
+end
+return false
 """
 _SETTLE = """
 if ARGV[1] == '' then redis.call('ZREM', KEYS[1], ARGV[2]) else redis.call('ZADD', KEYS[1], 'XX', ARGV[1], ARGV[2]) end
@@ -54,26 +69,48 @@ class Delivery:
 _UNREADABLE = Delivery("failed", last_error="RECORD_UNREADABLE")
 
 
+def due_key(line: str) -> str:
+    """Where the messages of a line wait, by when each is due."""
+    return f"{PREFIX}webhooks:due:{line}"
+
+
+def line_of(caller: str, url: str) -> str:
+    """The line that a message waits in: a caller's messages to one receiver. The lines take turns."""
+    return f"{caller} {re.split('[/?#]', url.partition('://')[2], maxsplit=1)[0].lower()}"
+
+
 def _state_key(job_id: str, place: int) -> str:
     return f"{PREFIX}webhook:{job_id}:{place}"
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message about the end of an attempt. place: of its receiver among the job's webhooks."""
+    """A message about the end of an attempt. place: of its receiver among the job's webhooks · line: as ``line_of``."""
 
     job_id: str
     attempt: int
     place: int
+    line: str
 
     @classmethod
-    def named(cls, name: str) -> Message:
+    def named(cls, name: str, line: str) -> Message:
         """The message of this name."""
         job_id, attempt, place = name.rsplit("-", 2)
-        return cls(job_id, int(attempt), int(place))
+        return cls(job_id, int(attempt), int(place), line)
+
+    @classmethod
+    def about(cls, record: JobRecord, place: int) -> Message:
+        """The message about the record's end to one of its receivers."""
+        return cls(record.id, record.attempt, place, line_of(record.owner, record.webhooks[place]))
+
+    @property
+    def caller(self) -> str:
+        """Whose job it is."""
+        return self.line.partition(" ")[0]
 
     @property
     def name(self) -> str:
+        """Its name in its line."""
         return f"{self.job_id}-{self.attempt}-{self.place}"
 
 
@@ -83,11 +120,12 @@ def entering(before: JobRecord | None, after: JobRecord, expires: float) -> list
     first = len(before.webhooks) if before is not None and known else 0
     commands: list[Command] = []
     for place in range(first, len(after.webhooks)):
-        key, message = _state_key(after.id, place), Message(after.id, after.attempt, place).name
+        key, message = _state_key(after.id, place), Message.about(after, place)
         commands += [
-            ("ZADD", _DUE, repr(after.finished), message),
+            ("ZADD", due_key(message.line), repr(after.finished), message.name),
+            ("ZADD", _LINES, "NX", "0", message.line),
             ("DEL", key),
-            ("HSET", key, "message", message, "state", "pending", "sends", "0"),
+            ("HSET", key, "message", message.name, "state", "pending", "sends", "0"),
             ("PEXPIREAT", key, str(int(expires * 1000))),
         ]
     return commands
@@ -97,8 +135,8 @@ def forgetting(record: JobRecord) -> list[Command]:
     """What drops the messages of a job that is deleted or started anew."""
     commands: list[Command] = []
     for place in range(len(record.webhooks)):
-        message = Message(record.id, record.attempt, place).name
-        commands += [("ZREM", _DUE, message), ("DEL", _state_key(record.id, place))]
+        message = Message.about(record, place)
+        commands += [("ZREM", due_key(message.line), message.name), ("DEL", _state_key(record.id, place))]
     return commands
 
 
@@ -110,16 +148,20 @@ class RedisOutbox:
         self._claim = redis.register_script(_CLAIM)
         self._settle = redis.register_script(_SETTLE)
 
-    def claim(self) -> Message | None:
-        """A message that is due, for this process alone for a minute; None when there is none."""
+    def claim(self, passed_over: Collection[str] = ()) -> Message | None:
+        """A message that is due, for this process alone for a minute; None when there is none.
+
+        Of the line that has waited longest for its turn. passed_over: lines, and callers, that do not get one.
+        """
         while True:
-            name: Any = self._claim(keys=[_DUE], args=[_LEASE_S])
-            if name is None:
+            found: Any = self._claim(keys=[_LINES], args=[_LEASE_S, due_key(""), *passed_over])
+            if found is None:
                 return None
+            line, name = map(text, found)
             try:
-                return Message.named(text(name))
+                return Message.named(name, line)
             except ValueError:
-                self._redis.zrem(_DUE, name)
+                self._redis.zrem(due_key(line), name)
                 count(self._redis, "records_unreadable", "webhook")
                 logger.error("a message about a job has a name that cannot be read: it is dropped")
 
@@ -132,7 +174,7 @@ class RedisOutbox:
         due = "" if delivery.next_at is None else repr(delivery.next_at)
         fields = [part for pair in shown.items() for part in pair]
         key = _state_key(message.job_id, message.place)
-        self._settle(keys=[_DUE, key], args=[due, message.name, *fields])
+        self._settle(keys=[due_key(message.line), key], args=[due, message.name, *fields])
         count(self._redis, "webhook_sends", outcome)
 
     def deliveries(self, record: JobRecord) -> list[Delivery]:
@@ -146,7 +188,8 @@ class RedisOutbox:
 
     def waiting(self) -> int:
         """How many messages are still to be sent."""
-        return int(self._redis.zcard(_DUE))
+        lines: Any = self._redis.zrange(_LINES, 0, -1)
+        return sum(int(self._redis.zcard(due_key(text(line)))) for line in lines)
 
 
 def _delivery(answer: Any) -> Delivery:

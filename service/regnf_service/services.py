@@ -12,7 +12,7 @@ from redis import Redis
 from regnf_service.bytes_under_way import UnderWay
 from regnf_service.concurrency import Slots, Waiters
 from regnf_service.job_watch import JobWatch
-from regnf_service.upload_slots import UploadSlots
+from regnf_service.upload_slots import Assemblies, UploadSlots
 from regnf_service.webhooks.policy import Webhooks
 from regnf_state.batches import Batches
 from regnf_state.blobs.base import BlobStore
@@ -27,6 +27,8 @@ from regnf_state.settings import Settings
 
 _UPLOAD_THREADS = 4
 _LOOK_THREADS = 2
+_ASSEMBLIES = 4
+"""Each holds a copy of a whole upload for a moment."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,11 @@ class Services:
     def uploads(self) -> UploadSlots:
         """Uploads that are under way."""
         return UploadSlots(self.settings.max_uploads_per_caller)
+
+    @cached_property
+    def assembling(self) -> Assemblies:
+        """Uploads whose pieces are being put together."""
+        return Assemblies(_ASSEMBLIES)
 
     @cached_property
     def under_way(self) -> UnderWay:

@@ -102,5 +102,20 @@ class UploadSlots:
             self._held.pop(caller, None)
 
 
+class Assemblies:
+    """Who may put an upload's pieces together: one of a caller at a time, ``most`` of all. For one event loop."""
+
+    def __init__(self, most: int) -> None:
+        self._all = asyncio.Semaphore(most)
+        self._lines: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+    @asynccontextmanager
+    async def turn(self, caller: str) -> AsyncIterator[None]:
+        """Waits for the caller's turn, which lasts as long as the context."""
+        line = self._lines.setdefault(caller, asyncio.Lock())
+        async with line, self._all:
+            yield
+
+
 def _refusal() -> Problem:
     return Problem("TOO_MANY_UPLOADS", headers=RETRY_LATER | CLOSE)

@@ -12,7 +12,7 @@ from typing import Any
 import anyio
 import pytest
 
-from regnf_state.blobs.base import StorageFullError
+from regnf_state.blobs.base import StorageFullError, StorageUnavailableError
 from tests.contract.bad_input import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
 
@@ -179,6 +179,7 @@ def test_a_client_that_stalls_is_told_and_forgotten(world: World, tmp_path: Any,
     [
         (StorageFullError(errno.ENOSPC, "full"), 507, "STORAGE_FULL"),
         (OSError(errno.EIO, "broken"), 503, "STORAGE_UNAVAILABLE"),
+        (StorageUnavailableError(errno.ENODEV, "away"), 503, "STORAGE_UNAVAILABLE"),
     ],
 )
 def test_storage_that_fails_keeps_nothing(

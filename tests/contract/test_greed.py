@@ -9,6 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
+from regnf_core.importing.gate.report import OF_THE_CIRCUMSTANCES
 from regnf_state.ownership import reference_of
 from regnf_state.problems import problem_document
 from regnf_state.records import FieldRecord
@@ -160,7 +161,14 @@ def test_bytes_that_were_rejected_are_not_imported_again(shared: Callable[..., W
 
 @pytest.mark.parametrize(
     ("reason", "seconds"),
-    [("FIELD_SHAPES_MISMATCH", 86400), ("IMPORT_TIMEOUT", 600), ("WORKER_LOST", None), ("INTERNAL", None)],
+    [
+        ("FIELD_SHAPES_MISMATCH", 86400),
+        *((reason, None) for reason in sorted(OF_THE_CIRCUMSTANCES)),
+        ("OUT_OF_MEMORY", None),
+        ("WORKER_LOST", None),
+        ("INTERNAL", None),
+        ("A_REASON_OF_A_LATER_RELEASE", None),
+    ],
 )
 def test_how_long_a_rejection_holds(shared: Callable[..., World], reason: str, seconds: int | None) -> None:
     world = shared()

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
 import httpx
 import pytest
 from redis import Redis
 
+from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.pieces import MOST_PIECES, Pieces
 from tests.contract.bad_input import announced
 from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
@@ -136,7 +140,7 @@ def test_settings_go_with_pieces(world: World) -> None:
 def test_settings_before_all_pieces_lose_nothing(world: World) -> None:
     put(world, 0, 700)
     files: dict[str, Any] = {"upload": (None, NAME), "settings": ("config.yml", b"method: neus")}
-    assert_refused(world.client.post("/fields", files=files), 400, "DIGEST_MISMATCH")
+    assert assert_refused(world.client.post("/fields", files=files), 409, "UPLOAD_NOT_FINISHED")["offset"] == 700
     assert ask(world).json()["offset"] == 700
 
 
@@ -180,7 +184,7 @@ def test_each_caller_has_pieces_of_its_own(worlds: Callable[..., World]) -> None
 
 def test_an_upload_has_so_many_pieces_at_most(world: World) -> None:
     for offset in range(MOST_PIECES):
-        world.blobs.put(f"uploads/anonymous/{NAME}/{offset:015d}", b"x")
+        world.blobs.put(f"uploads/anonymous/{NAME}/{offset:015d}-2000", b"x")
     assert_refused(put(world, MOST_PIECES, 2000), 409, "TOO_MANY_PIECES")
 
 
@@ -202,3 +206,117 @@ def test_uploads_that_do_not_go_on_expire(world: World, any_redis: Redis) -> Non
     assert pieces.expire(now) == 0
     assert pieces.expire(now + world.settings.keep_pieces_s + 60) == 1
     assert world.blobs.blobs == {}
+
+
+class Writers:
+    """What the store is asked to write, the journal aside; and how many such writers are open at once."""
+
+    def __init__(self, world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.bytes = self.most_open = 0
+        inner, lock, opened = world.blobs.writer, Lock(), set[int]()
+
+        @contextmanager
+        def writer() -> Iterator[LocalBlobWriter]:
+            with inner() as made:
+                write = made.write
+
+                def counted(data: bytes) -> int:
+                    if len(data) >= 1000:
+                        with lock:
+                            self.bytes += len(data)
+                            opened.add(id(made))
+                            self.most_open = max(self.most_open, len(opened))
+                    return write(data)
+
+                made.write = counted  # type: ignore[method-assign]
+                yield made
+                with lock:
+                    opened.discard(id(made))
+
+        monkeypatch.setattr(world.blobs, "writer", writer)
+
+
+def finish(world: World, name: str = NAME) -> httpx.Response:
+    """Ask for the field of the pieces that have come, in a request of 200 bytes."""
+    return world.client.post("/fields", files={"upload": (None, name)})
+
+
+@pytest.mark.parametrize("arrived", [0, 700, 1999])
+def test_to_finish_what_has_not_arrived_writes_nothing(
+    world: World, monkeypatch: pytest.MonkeyPatch, arrived: int
+) -> None:
+    if arrived:
+        put(world, 0, arrived)
+    writers = Writers(world, monkeypatch)
+    for _ in range(5):
+        assert assert_refused(finish(world), 409, "UPLOAD_NOT_FINISHED")["offset"] == arrived
+    assert writers.bytes == 0
+
+
+def test_wrong_bytes_are_put_together_once(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    wait = {"Upload-Complete": "?0"}
+    put(world, 0, 700, headers=wait)
+    headers = {"Content-Range": "bytes 700-1999/2000", **wait}
+    assert world.client.put(f"/fields/{NAME}", content=DATA[:1300], headers=headers).status_code == 202
+    writers = Writers(world, monkeypatch)
+    assert_refused(finish(world), 400, "DIGEST_MISMATCH")
+    assert world.blobs.blobs == {}
+    for _ in range(3):
+        assert_refused(finish(world), 409, "UPLOAD_NOT_FINISHED")
+    assert writers.bytes == 2000
+
+
+def test_requests_to_finish_at_once_make_one_copy(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(world, 0, 2000, headers={"Upload-Complete": "?0"})
+    writers = Writers(world, monkeypatch)
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda _: finish(world), range(8)))
+    assert sorted(answer.status_code for answer in answers) == [200] * 7 + [201]
+    assert writers.bytes == 2000
+    assert list(world.blobs.blobs) == [f"fields/{NAME}/original"]
+
+
+def test_uploads_of_a_caller_are_put_together_one_after_the_other(
+    worlds: Callable[..., World], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = worlds()
+    files = [field_bytes(f"file {number}", 2000) for number in range(6)]
+    for data in files:
+        put(world, 0, 2000, data, {"Upload-Complete": "?0"})
+    writers = Writers(world, monkeypatch)
+    with ThreadPoolExecutor(6) as threads:
+        answers = list(threads.map(lambda data: finish(world, sha256(data)), files))
+    assert [answer.status_code for answer in answers] == [201] * 6
+    assert writers.most_open == 1
+
+
+def test_what_the_field_has_no_room_for_is_not_put_together(
+    worlds: Callable[..., World], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = worlds(max_imports_per_caller=1, quota_stored_bytes=4000)
+    put(world, 0, 2000, headers={"Upload-Complete": "?0"})
+    other = field_bytes("other", 900)
+    assert world.client.put(f"/fields/{sha256(other)}", content=other).status_code == 201
+    writers = Writers(world, monkeypatch)
+    assert_refused(finish(world), 429, "QUOTA_IMPORTS")
+    assert writers.bytes == 0
+    assert world.client.delete(f"/fields/{sha256(other)}").status_code == 204
+    assert finish(world).status_code == 201, "the field takes the place of its pieces in the quota"
+
+
+def test_pieces_are_of_one_file(world: World) -> None:
+    put(world, 0, 700)
+    headers = {"Content-Range": "bytes 700-1999/2400"}
+    assert_refused(world.client.put(f"/fields/{NAME}", content=DATA[700:2000], headers=headers), 400, "INVALID_HEADER")
+    assert put(world, 700, 2000).status_code == 201
+
+
+def test_pieces_that_are_deleted_while_they_are_put_together(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    put(world, 0, 2000, headers={"Upload-Complete": "?0"})
+
+    def gone(*_: object) -> Iterator[bytes]:
+        raise FileNotFoundError
+        yield b""
+
+    monkeypatch.setattr(Pieces, "blocks", gone)
+    assert_refused(finish(world), 409, "UPLOAD_NOT_FINISHED")

@@ -49,7 +49,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         count(redis, "queue_payloads_refused", "regnf")
         count(redis, "jobs_evicted")
         count(redis, "records_unreadable", "job")
-        RedisOutbox(redis).settle(Message("ended", 1, 0), Delivery("delivered"))
+        RedisOutbox(redis).settle(Message("ended", 1, 0, "anonymous hooks.example"), Delivery("delivered"))
         connections = Connections(most=1, most_of_site=1, most_unread=1)
         connections.ended["all"] += 1
         metrics = Metrics(services, connections)

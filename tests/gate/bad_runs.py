@@ -7,6 +7,7 @@ import gzip
 import io
 import json
 import lzma
+import stat
 import tarfile
 import zipfile
 from collections.abc import Callable
@@ -61,6 +62,21 @@ def in_tar(**kinds: dict[str, object]) -> Callable[[Seeds], bytes]:
 def named(name: str) -> Callable[[Seeds], bytes]:
     """A tar file of a run with a member of this name."""
     return lambda s: tar_bytes([(CHECKPOINT, s.archive), (name, b"x")])
+
+
+def in_zip_as(kind: int) -> Callable[[Seeds], bytes]:
+    """A run whose settings are a file of this kind."""
+
+    def make(s: Seeds) -> bytes:
+        odd = zipfile.ZipInfo("run/config.yml")
+        odd.external_attr = (kind | 0o777) << 16
+        made = io.BytesIO()
+        with zipfile.ZipFile(made, "w") as archive:
+            archive.writestr(CHECKPOINT, s.archive)
+            archive.writestr(odd, "/etc/passwd")
+        return made.getvalue()
+
+    return make
 
 
 def zip_of(name: str) -> Callable[[Seeds], bytes]:
@@ -150,6 +166,9 @@ RUNS: Files = {
         lambda s: tar_bytes([(CHECKPOINT, s.archive)]) + b"more",
         "rejected ARCHIVE_TRAILING_DATA",
     ),
+    "a zip, a symbolic link": (in_zip_as(stat.S_IFLNK), "rejected ARCHIVE_LINK"),
+    "a zip, a device": (in_zip_as(stat.S_IFCHR), "rejected ARCHIVE_SPECIAL_FILE"),
+    "a zip, a pipe": (in_zip_as(stat.S_IFIFO), "rejected ARCHIVE_SPECIAL_FILE"),
     "a tar, a symbolic link": (
         in_tar(**{"run/config.yml": {"type": tarfile.SYMTYPE, "linkname": "/etc/passwd"}}),
         "rejected ARCHIVE_LINK",

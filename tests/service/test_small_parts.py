@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import hashlib
 import json
 from collections.abc import Callable
@@ -15,12 +16,14 @@ from hypothesis import strategies as st
 
 from regnf_service.http.digests import announced_digest, is_sha256
 from regnf_service.http.paging import decode_token, encode_token
+from regnf_service.http.problems import problem_of
 from regnf_service.http.ranges import ByteRange, parse_range
 from regnf_service.http.routes.submitting import preferred_wait
 from regnf_service.http.strict_json import parse_json
 from regnf_service.jobs import identity
 from regnf_service.jobs.identity import digest, job_id_of
 from regnf_service.problem import Problem, json_pointer
+from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.reasons import REASONS
 from tests.requests import registration_request
 
@@ -183,3 +186,15 @@ def test_every_reason_is_an_error_with_a_sentence() -> None:
         assert 400 <= reason.status <= 599
         assert reason.title
         assert reason.meaning.endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (FileNotFoundError(errno.ENOENT, "deleted in the meantime"), "NOT_FOUND"),
+        (StorageUnavailableError(errno.ENOENT, "the volume is away"), "STORAGE_UNAVAILABLE"),
+        (OSError(errno.EIO, "broken"), "STORAGE_UNAVAILABLE"),
+    ],
+)
+def test_what_was_deleted_in_the_meantime_is_no_outage(error: OSError, reason: str) -> None:
+    assert problem_of(error).reason == reason

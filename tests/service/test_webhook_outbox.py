@@ -9,21 +9,20 @@ from contextlib import contextmanager
 import pytest
 from redis import Redis
 
-from regnf_service.webhooks.deliverer import Deliverer
 from regnf_state.redis.client import connect
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.webhook_outbox import Message, RedisOutbox
-from tests.service.webhook_receiver import Receiver, ask, deliverer, delivery, finish
+from regnf_state.redis.webhook_outbox import Message, RedisOutbox, line_of
+from tests.service.webhook_receiver import OneByOne, Receiver, ask, deliverer, delivery, due, finish
 
 
 def test_a_message_outlives_who_took_it(redis: Redis, receiver: Receiver) -> None:
     """A process that dies after it took a message: another sends it once a minute is over, not before."""
     finish(redis, receiver.address)
-    assert RedisOutbox(redis).claim() == Message("j1", 1, 0)
+    assert RedisOutbox(redis).claim() == Message("j1", 1, 0, line_of("alice", receiver.address))
     assert not deliverer(redis, [receiver.address]).run_once()
-    score = float(redis.zscore("regnf:webhooks:due", "j1-1-0"))  # type: ignore[arg-type]
+    score = float(redis.zscore(due(receiver.address), "j1-1-0"))  # type: ignore[arg-type]
     assert score == pytest.approx(RedisRecordStore(redis).now() + 60, abs=20)
-    redis.zadd("regnf:webhooks:due", {"j1-1-0": 0})
+    redis.zadd(due(receiver.address), {"j1-1-0": 0})
     assert deliverer(redis, [receiver.address]).run_once()
     assert len(receiver.received) == 1
 
@@ -33,7 +32,7 @@ def test_many_deliverers_send_each_message_once(redis: Redis, redis_url: str, re
         finish(redis, receiver.address, name=f"job{number}")
 
     @contextmanager
-    def one() -> Iterator[Deliverer]:
+    def one() -> Iterator[OneByOne]:
         with connect(redis_url) as own:
             yield deliverer(own, [receiver.address])
 
@@ -61,7 +60,8 @@ def test_a_job_that_is_deleted_or_started_anew_takes_its_message_along(redis: Re
     assert (outbox.waiting(), delivery(redis).state) == (1, "pending")
     store.delete_job("j1")
     assert (outbox.waiting(), redis.exists("regnf:webhook:j1:0")) == (0, 0)
-    redis.zadd("regnf:webhooks:due", {"gone-1-0": 0})
+    redis.zadd(due(receiver.address), {"gone-1-0": 0})
+    redis.zadd("regnf:webhooks:lines", {line_of("alice", receiver.address): 0})
     assert deliverer(redis, [receiver.address]).run_once()
     assert (receiver.received, outbox.waiting()) == ([], 0)
 

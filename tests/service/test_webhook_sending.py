@@ -10,7 +10,7 @@ from redis import Redis
 
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
-from tests.service.webhook_receiver import KEY, Receiver, deliverer, delivery, finish, hmac_by_hand
+from tests.service.webhook_receiver import KEY, Receiver, deliverer, delivery, due, finish, hmac_by_hand
 
 
 def test_a_name_that_resolves_to_a_private_address_is_not_followed(redis: Redis, receiver: Receiver) -> None:
@@ -65,7 +65,7 @@ def test_pauses_grow_and_end(redis: Redis, receiver: Receiver) -> None:
         assert (found.state, found.sends, found.next_at is not None) == ("pending", sends, True)
         assert found.next_at == pytest.approx(now + pause, abs=20)
         assert not sent.run_once(), "not before its time"
-        redis.zadd("regnf:webhooks:due", {"j1-1-0": 0})
+        redis.zadd(due(receiver.address), {"j1-1-0": 0})
     assert sent.run_once()
     found = delivery(redis)
     assert (found.state, found.sends, found.next_at, outbox.waiting()) == ("failed", 3, None, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import threading
@@ -19,7 +20,7 @@ from regnf_service.webhooks.targets import AllowList
 from regnf_state.ownership import reference_of
 from regnf_state.records import JobRecord
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox
+from regnf_state.redis.webhook_outbox import Delivery, RedisOutbox, due_key, line_of
 
 KEY = bytes(range(24))
 
@@ -69,17 +70,36 @@ def receiver() -> Iterator[Receiver]:
         thread.join()
 
 
-def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> Deliverer:
+class OneByOne:
+    """Delivers in this thread, one message after the other."""
+
+    def __init__(self, inner: Deliverer) -> None:
+        self._inner = inner
+
+    def run_once(self) -> bool:
+        """Whether a message was due."""
+        message = self._inner.claim()
+        if message is not None:
+            asyncio.run(self._inner.deliver(message))
+        return message is not None
+
+
+def deliverer(redis: Redis, allowed: list[str], back_off_s: tuple[float, ...] = (0.0, 0.0)) -> OneByOne:
     hosts = AllowList(allowed)
     secrets = read_secrets([f"alice:{SECRET}"], None)
     store, outbox = RedisRecordStore(redis), RedisOutbox(redis)
-    return Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s)
+    return OneByOne(Deliverer(store, outbox, HttpSender(hosts.permits), hosts, secrets, back_off_s))
 
 
-def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1") -> JobRecord:
-    """A job of alice's with a webhook, ended."""
+def due(url: str) -> str:
+    """The key of the line in which alice's messages to this address wait."""
+    return due_key(line_of("alice", url))
+
+
+def finish(redis: Redis, url: str, status: str = "successful", name: str = "j1", owner: str = "alice") -> JobRecord:
+    """A job with a webhook, ended."""
     store = RedisRecordStore(redis)
-    request = {"scene": reference_of("alice", "a" * 64), "webhook": {"url": url}}
+    request = {"scene": reference_of(owner, "a" * 64), "webhook": {"url": url}}
     now = store.now()
     record, _ = store.create_job(JobRecord(name, "registration", "accepted", request, {}, now, now), 10)
     error = {"reason": "NO_SURFACE_IN_DETECTION", "detail": "text"} if status == "failed" else None

@@ -13,7 +13,7 @@ from regnf_state.manifest import read_manifest
 from regnf_state.records import Quota, UnreadableRecordError
 from regnf_state.redis.counters import COUNTERS_KEY, Counters
 from regnf_state.redis.jobs import RedisRecordStore
-from regnf_state.redis.webhook_outbox import RedisOutbox
+from regnf_state.redis.webhook_outbox import RedisOutbox, due_key, line_of
 from tests.state.journal_world import World, fresh_world
 from tests.state.record_makers import OBJECT, SCENE, change, field, finished, job, started
 
@@ -200,12 +200,14 @@ def test_what_an_owner_has_counts_as_nothing_where_it_is_damaged(
 
 
 def test_a_damaged_message_does_not_keep_the_others(store: RedisRecordStore, redis: Redis) -> None:
-    redis.zadd("regnf:webhooks:due", {"nonsense": 1.0, "j1-1-0": 2.0})
+    line = line_of("anonymous", "https://hooks.example/x")
+    redis.zadd(due_key(line), {"nonsense": 1.0, "j1-1-0": 2.0})
+    redis.zadd("regnf:webhooks:lines", {line: 0, "anonymous gone.example": 0})
     outbox = RedisOutbox(redis)
     message = outbox.claim()
     assert message is not None
     assert message.job_id == "j1"
-    assert redis.zscore("regnf:webhooks:due", "nonsense") is None
+    assert redis.zscore(due_key(line), "nonsense") is None
     record = job(store)
     record.request["webhook"] = {"url": "https://hooks.example"}
     redis.hset("regnf:webhook:j1:0", mapping={"state": "?", "sends": "many"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +24,11 @@ def test_files_hold_no_inline_code_and_no_foreign_address() -> None:
 def test_vendored_bundle_is_the_noted_one() -> None:
     digest = hashlib.sha256((WEB / "vendor" / "three.bundle.min.js").read_bytes()).hexdigest()
     assert f"`{digest}`" in (WEB / "vendor" / "README.md").read_text()
+    root = Path(__file__).resolve().parents[2]
+    script = (root / "scripts" / "vendor_three.sh").read_text()
+    named = re.findall(r"service[\w./]*/vendor\b", script)
+    assert named
+    assert {(root / name).resolve() for name in named} == {(WEB / "vendor").resolve()}
 
 
 @pytest.mark.parametrize("page", [path.name for path in WEB.glob("*.html")])

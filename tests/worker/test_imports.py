@@ -3,6 +3,9 @@
 import json
 from pathlib import Path
 
+import pytest
+
+from regnf_core.errors import FieldFormatError
 from regnf_worker.context import Context
 from regnf_worker.imports import run_import_attempt
 from regnf_worker.settle import ChildExit, settle_import
@@ -59,6 +62,32 @@ def test_an_upload_after_a_deletion_owes_nothing_to_the_import_before_it(context
     assert list(context.blobs.list("")) == [f"fields/{SHA}/original"]
     run_import_attempt(context, SHA, field(context).attempt, "other", tiny_importer)
     assert field(context).state == "ready"
+
+
+@pytest.mark.parametrize(
+    ("reason", "setting"),
+    [
+        ("IMPORT_TIMEOUT", "REGNF_IMPORT_TIMEOUT_S"),
+        ("IMPORT_TOO_COSTLY", "REGNF_IMPORT_WORK_S"),
+        ("IMPORT_OUT_OF_MEMORY", "REGNF_IMPORT_MEMORY_BYTES"),
+        ("FIELD_NOT_RECOGNIZED", None),
+    ],
+)
+def test_a_limit_is_told_with_its_setting_and_is_not_remembered(
+    context: Context, reason: str, setting: str | None
+) -> None:
+    begin_import(context)
+    before = field(context)
+
+    def importer(*_: object, **__: object) -> dict[str, object]:
+        raise FieldFormatError("longer than 120 s", reason=reason)
+
+    run_import_attempt(context, SHA, 1, "w", importer)
+    error = field(context).error
+    assert error is not None
+    assert error["detail"] == ("longer than 120 s" if setting is None else f"longer than 120 s ({setting})")
+    assert setting is None or setting in error["hint"]
+    assert (context.records.known_rejection(before) is None) == (setting is not None)
 
 
 def test_a_report_for_another_description_does_not_count(context: Context) -> None:

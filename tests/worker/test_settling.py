@@ -86,6 +86,9 @@ def test_a_killed_import_rejects_its_field(context: Context, end: ChildExit, rea
     error = field(context).error
     assert error is not None
     assert (field(context).state, error["reason"]) == ("rejected", reason)
+    if end.late:
+        assert "120 s" in error["detail"]
+        assert "REGNF_IMPORT_TIMEOUT_S" in error["detail"]
     assert list(context.blobs.list("")) == []
 
 

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from rq.timeouts import JobTimeoutException
 
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.problems import problem_document
@@ -23,7 +22,6 @@ from regnf_worker.scratch import Scratch
 @pytest.mark.parametrize(
     ("error", "reason"),
     [
-        (JobTimeoutException(), "JOB_TIMEOUT"),
         (MemoryError(), "OUT_OF_MEMORY"),
         (RuntimeError("CUDA out of memory. Tried to allocate"), "OUT_OF_MEMORY"),
         (StorageFullError(errno.ENOSPC, "full"), "STORAGE_FULL"),

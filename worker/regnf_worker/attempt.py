@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from redis.exceptions import RedisError
+from rq.timeouts import JobTimeoutException
 
 from regnf_core.errors import CancelledError, RegnfError
 from regnf_state.blobs.base import StorageUnavailableError
@@ -28,7 +29,7 @@ from regnf_worker.fields import Fields, FieldsNotReadyError
 from regnf_worker.heartbeat import Heartbeat
 from regnf_worker.job_limits import JobLimits, held_memory_limit, open_reserve
 from regnf_worker.kernel import give_way
-from regnf_worker.problems import are_files_away, fault, new_incident
+from regnf_worker.problems import are_files_away, fault, new_incident, refusal, timeout
 from regnf_worker.registration import register
 from regnf_worker.rendering import render
 from regnf_worker.rest import Published, finish_result
@@ -87,7 +88,9 @@ def _published(
         logger.error("job %s attempt %d failed: %s", job_id, attempt, error)
         _fail(context, job_id, attempt, problem_document(error.reason))
     except RegnfError as error:
-        _fail(context, job_id, attempt, problem_document(error.reason, str(error), hint=error.hint))
+        _fail(context, job_id, attempt, refusal(error))
+    except JobTimeoutException:
+        _fail(context, job_id, attempt, timeout("JOB_TIMEOUT", context.settings.job_timeout_s))
     except Exception as error:
         if are_files_away(error):
             raise

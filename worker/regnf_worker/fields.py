@@ -63,5 +63,6 @@ class Fields:
         settings = self._context.settings
         longest = 2 * (settings.import_timeout_s + settings.lost_after_s)
         if field.state == "validating" and self._context.records.now() - field.updated > longest:
-            raise InvalidInputError(f"field {name} was not imported in time", reason="FIELD_IMPORT_TIMEOUT")
+            message = f"field {name} was not imported within {longest:g} s (twice REGNF_IMPORT_TIMEOUT_S and more)"
+            raise InvalidInputError(message, reason="FIELD_IMPORT_TIMEOUT")
         return field

@@ -19,11 +19,10 @@ from regnf_core.field_candidates import Candidate
 from regnf_state.blobs.base import StorageUnavailableError
 from regnf_state.originals import candidate_key, delete_all_but_upload, delete_upload, original_key, settings_key
 from regnf_state.ownership import owner_of
-from regnf_state.problems import problem_document
 from regnf_state.records import CANDIDATES, ORIGINAL_UNTIL, FieldRecord, SettingsFile, StaleAttemptError
 from regnf_worker.context import Context
 from regnf_worker.engine import Importer
-from regnf_worker.problems import are_files_away, fault, new_incident
+from regnf_worker.problems import are_files_away, fault, new_incident, refusal, timeout
 from regnf_worker.retry import retry_until_available
 
 _CLAIM_KEPT_S = 24 * 3600
@@ -59,11 +58,11 @@ def run_import_attempt(context: Context, sha256: str, attempt: int, worker: str,
         raise
     except RegnfError as error:
         asked = error.candidates if isinstance(error, FieldFormatError) else ()
-        _refuse(context, sha256, attempt, problem_document(error.reason, str(error), hint=error.hint), asked)
+        _refuse(context, sha256, attempt, refusal(error), asked)
     except StaleAttemptError as error:
         _retire(context, sha256, attempt, error)
     except JobTimeoutException:
-        _refuse(context, sha256, attempt, problem_document("IMPORT_TIMEOUT"))
+        _refuse(context, sha256, attempt, timeout("IMPORT_TIMEOUT", context.settings.import_timeout_s))
     except Exception as error:
         if are_files_away(error):
             raise

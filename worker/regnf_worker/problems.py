@@ -6,8 +6,7 @@ import errno
 from typing import Any
 from uuid import uuid4
 
-from rq.timeouts import JobTimeoutException
-
+from regnf_core.errors import RegnfError
 from regnf_state.blobs.base import StorageFullError
 from regnf_state.problems import problem_document
 from regnf_worker.job_limits import JobLimits
@@ -15,10 +14,31 @@ from regnf_worker.job_limits import JobLimits
 OVER_LIMIT = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "temporary files"}
 """Reasons of jobs that were over a limit, and of what."""
 _LIMIT_OF = {"JOB_MEMORY_LIMIT": "memory", "JOB_DISK_LIMIT": "scratch"}
+_SETTING_OF = {
+    "IMPORT_TIMEOUT": "REGNF_IMPORT_TIMEOUT_S",
+    "IMPORT_TOO_COSTLY": "REGNF_IMPORT_WORK_S",
+    "IMPORT_OUT_OF_MEMORY": "REGNF_IMPORT_MEMORY_BYTES",
+    "JOB_TIMEOUT": "REGNF_JOB_TIMEOUT_S",
+}
+"""The settings of the limits, by the reasons that go with them."""
 _GIB = 1 << 30
 _OUT_OF_MEMORY_PHRASES = ("can't allocate memory", "out of memory", "cannot allocate memory", "bad_alloc")
 _FULL = {errno.ENOSPC, errno.EDQUOT}
 _AWAY = {errno.ENOENT, errno.EIO, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EROFS, errno.ESTALE}
+
+
+def refusal(error: RegnfError) -> dict[str, Any]:
+    """The problem of one of regnf's own refusals. Where a setting of the service set the limit, it is named."""
+    setting = _SETTING_OF.get(error.reason)
+    detail = str(error) if setting is None else f"{error} ({setting})"
+    return problem_document(error.reason, detail, hint=error.hint)
+
+
+def timeout(reason: str, limit_s: float) -> dict[str, Any]:
+    """The problem of work that the worker stopped: JOB_TIMEOUT or IMPORT_TIMEOUT."""
+    what = "job" if reason == "JOB_TIMEOUT" else "import"
+    detail = f"the {what} took longer than the {limit_s:g} s that it may ({_SETTING_OF[reason]})"
+    return problem_document(reason, detail)
 
 
 def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> dict[str, Any]:
@@ -26,8 +46,6 @@ def fault(error: Exception, incident: str, limits: JobLimits | None = None) -> d
 
     limits: those that hold for this process, if any do.
     """
-    if isinstance(error, JobTimeoutException):
-        return problem_document("JOB_TIMEOUT")
     if is_out_of_memory(error):
         of_gpu = "cuda" in str(error).lower()
         return problem_document("OUT_OF_MEMORY") if limits is None or of_gpu else over_limit("JOB_MEMORY_LIMIT", limits)

@@ -15,7 +15,7 @@ from regnf_worker.context import Context
 from regnf_worker.edited_fields import keep_edited_field
 from regnf_worker.imports import claim_import, reject
 from regnf_worker.job_limits import JobLimits
-from regnf_worker.problems import OVER_LIMIT, over_limit
+from regnf_worker.problems import OVER_LIMIT, over_limit, timeout
 from regnf_worker.rest import give_up_rest
 
 logger = logging.getLogger(__name__)
@@ -106,7 +106,7 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
         logger.warning("job %s attempt %d is to be run again", job_id, attempt)
         return
     else:
-        changes = {"status": "failed", "error": _problem(end)}
+        changes = {"status": "failed", "error": _problem(context, end)}
     context.records.update_job(job_id, attempt, **changes)
     logger.warning("job %s attempt %d: its process is gone (%s): %s", job_id, attempt, end, changes["status"])
 
@@ -126,12 +126,14 @@ def settle_import(context: Context, sha256: str, attempt: int, worker: str, end:
         context.queue.enqueue_import(sha256, again.attempt)
         return
     logger.warning("import %s attempt %d: its process is gone (%s)", sha256, attempt, end)
-    reason = end.reason()
-    reject(context, sha256, attempt, problem_document("IMPORT_TIMEOUT") if reason == "JOB_TIMEOUT" else _problem(end))
+    late = timeout("IMPORT_TIMEOUT", context.settings.import_timeout_s)
+    reject(context, sha256, attempt, late if end.late else _problem(context, end))
 
 
-def _problem(end: ChildExit) -> dict[str, Any]:
+def _problem(context: Context, end: ChildExit) -> dict[str, Any]:
     reason = end.reason()
+    if end.late:
+        return timeout(reason, context.settings.job_timeout_s)
     if end.limits is not None and reason in OVER_LIMIT:
         return over_limit(reason, end.limits)
     return problem_document(reason, _DETAILS.get(reason))

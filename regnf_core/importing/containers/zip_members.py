@@ -7,6 +7,7 @@ nowhere to hide a second archive or an overlap, and every entry lies where it is
 from __future__ import annotations
 
 import re
+import stat
 import struct
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -82,6 +83,10 @@ def _central_headers(data: memoryview, directory: Directory, methods: Collection
 def _check_header(header: Header, data_end: int, methods: Collection[int]) -> None:
     if header.flags & _ENCRYPTION_FLAGS:
         raise malformed("an entry is encrypted", "ARCHIVE_ENCRYPTED")
+    if stat.S_ISLNK(header.mode):
+        raise malformed("the archive holds a link; pack what it leads to (zip without -y)", "ARCHIVE_LINK")
+    if stat.S_IFMT(header.mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
+        raise malformed("the archive holds something else than plain files", "ARCHIVE_SPECIAL_FILE")
     if header.method not in methods:
         raise malformed("an entry is compressed in a way that is not taken", "ARCHIVE_COMPRESSED_ENTRY")
     if header.flags & ~(_DESCRIPTOR_FLAG | _UTF8_FLAG | _deflate_flags(header)):

@@ -44,7 +44,8 @@ class Directory:
 
 @dataclass(frozen=True)
 class Header:
-    """One entry's header, central or local. ``end`` is where the header's own bytes end."""
+    """One entry's header, central or local. ``end`` is where the header's own bytes end · mode: of the file on a Unix
+    system, its kind included, 0 where that is not said; a central header says it."""
 
     name: bytes
     flags: int
@@ -54,6 +55,7 @@ class Header:
     size: int
     local_offset: int
     end: int
+    mode: int = 0
 
 
 def read_directory_end(data: Bytes) -> Directory:
@@ -108,7 +110,8 @@ def read_central_header(data: Bytes, at: int, limit: int) -> Header:
         raise malformed("a central header is not one that torch.save writes")
     wide = _zip64_values(data[name_at + name_length : end])
     size, packed, offset = (_widened(value, wide) for value in (size, packed, offset))
-    return Header(bytes(data[name_at : name_at + name_length]), flags, method, crc32, packed, size, offset, end)
+    name, mode = bytes(data[name_at : name_at + name_length]), values[15] >> 16
+    return Header(name, flags, method, crc32, packed, size, offset, end, mode)
 
 
 def read_local_header(data: Bytes, at: int, limit: int) -> Header:

@@ -254,16 +254,16 @@ def run(
         return convert_file(upload, out_dir, description, limits, picture, beside)
     except AmbiguousError as error:
         if ask_by_picture:
-            _draw_asked(error, out_dir, limits.wall_s - (time.monotonic() - started))
+            _draw_asked(error, out_dir, limits.longest_s - (time.monotonic() - started))
         asked = [{"name": one.name, "description": one.say} for one in error.asked]
         return {"reason": error.reason, "detail": str(error), "candidates": asked}
     except FieldFormatError as error:
         return {"reason": error.reason, "detail": str(error)}
     except MemoryError:
-        return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": "the conversion needs more memory than it may have"}
+        return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": limits.no_memory()}
     except OSError as error:
         if error.errno == errno.ENOMEM:
-            return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": "the conversion needs more memory than it may have"}
+            return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": limits.no_memory()}
         if error.errno not in _OUTPUT_ERRORS:
             raise
         return {"reason": _OUTPUT_ERRORS[error.errno], "detail": os.strerror(error.errno)}

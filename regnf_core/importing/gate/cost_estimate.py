@@ -35,7 +35,7 @@ def require_affordable(converted: ConvertedField, limits: ImportLimits) -> float
         seconds = _share_and_seconds(converted.readings, limits)[1]
     else:
         seconds = seconds_of(converted.description, converted.tensors, calls_of_check(SAMPLES))
-    require_within(seconds, limits.work_s)
+    require_within(seconds, limits.refused_beyond_s)
     description = parse_description(converted.description)
     if isinstance(description, OnnxDescription):
         require_room(onnx_bytes(description, converted.tensors), limits.memory_bytes)

@@ -62,10 +62,10 @@ def import_field(
     """Turn an uploaded file into ``out_dir``/field.safetensors, in a throw-away process that can reach nothing.
 
     description: what the uploader says that the file does not; see UploadDescription. On failure nothing is left in
-    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little. picture: leave a picture
-    of the field in ``out_dir``/preview.png too, if it can be made in good time; it implies ask_by_picture: leave in the
-    error one of each function that the file may stand for. settings: the trainer's own, one file or an archive of
-    several. cameras: where those stood whose images the field was made from, likewise.
+    ``out_dir``, which is made if need be. Blocks for at most ``limits.wall_s`` and a little, where that is set.
+    picture: leave a picture of the field in ``out_dir``/preview.png too, if it can be made in good time; it implies
+    ask_by_picture: leave in the error one of each function that the file may stand for. settings: the trainer's own,
+    one file or an archive of several. cameras: where those stood whose images the field was made from, likewise.
     The upload may be an archive of a whole run; then it brings its settings along.
 
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
@@ -96,11 +96,11 @@ def _import_once(
 ) -> ImportReport:
     """One child, within what is left of the time since ``started``. Raises _KilledError, and as ``import_field``."""
     work = Path(tempfile.mkdtemp(prefix=".import-", dir=out_dir))
-    left_s = max(0.0, limits.wall_s - (time.monotonic() - started))
+    left_s = max(0.0, limits.longest_s - (time.monotonic() - started))
     try:
         command = [sys.executable, "-I", "-B", "-c", _ENTRY, str(_ROOT), str(work.resolve()), *map(str, files)]
         outcome = run_child(command, request, work, _environment(), left_s, limits.file_bytes + _PICTURE_BYTES)
-        values = _values_of(outcome, work)
+        values = _values_of(outcome, work, limits, time.monotonic() - started)
         report = _report(values, outcome, limits, work / FIELD_NAME, time.monotonic() - started)
         os.replace(work / FIELD_NAME, out_dir / FIELD_NAME)
         if json.loads(request)["picture"] and is_sound_picture(work / PICTURE_NAME):
@@ -140,18 +140,23 @@ def _environment() -> dict[str, str]:
     return {"PATH": os.defpath, "LANG": "C.UTF-8", **dict.fromkeys(counts, "1")}
 
 
-def _values_of(outcome: ChildOutcome, work: Path) -> dict[str, Any]:
-    """The report's values, or the error that the child's end stands for. work: where it may have left pictures."""
+def _values_of(outcome: ChildOutcome, work: Path, limits: ImportLimits, seconds: float) -> dict[str, Any]:
+    """The report's values, or the error that the child's end stands for. work: where it may have left pictures.
+
+    seconds: how long it ran.
+    """
     if outcome.stopped == "late" or outcome.signal == signal.SIGXCPU:
-        raise FieldFormatError("the import took too long", reason="IMPORT_TIMEOUT")
+        used = f"stopped after {seconds:.1f} s and {outcome.cpu_seconds:.1f} s of processor time"
+        raise FieldFormatError(f"the import took longer than {limits.longest_s:g} s: {used}", reason="IMPORT_TIMEOUT")
     if outcome.stopped == "output":
-        raise FieldFormatError("the import writes more than it may", reason="IMPORT_OUTPUT_TOO_LARGE")
+        told = f"the import writes more than the {limits.file_bytes >> 20} MiB that it may"
+        raise FieldFormatError(told, reason="IMPORT_OUTPUT_TOO_LARGE")
     if outcome.stopped is None and outcome.signal == signal.SIGKILL:
         raise _KilledError
     values = _parse(outcome.stdout) if outcome.exit_status == 0 else None
     if values is None:
         if any(sign in outcome.stderr for sign in _OUT_OF_MEMORY_SIGNS):
-            raise FieldFormatError("the import needs more memory than it may have", reason="IMPORT_OUT_OF_MEMORY")
+            raise FieldFormatError(limits.no_memory(), reason="IMPORT_OUT_OF_MEMORY")
         ending = f"status {outcome.exit_status}, signal {outcome.signal}, stopped {outcome.stopped}"
         _log.error("import process failed (%s): %s", ending, outcome.stderr[-4000:].decode("utf-8", "replace"))
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,6 +17,7 @@ from regnf_core.fields.build import build_field
 from regnf_core.importing.arrays import StoredArray
 from regnf_core.importing.cost.calls import Calls
 from regnf_core.importing.gate.cost_estimate import seconds_of
+from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.observing.trajectory import Array, Trajectory
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
@@ -34,14 +36,14 @@ def observed_by_cameras(
     tensors: Mapping[str, StoredArray],
     trajectory: Trajectory,
     said: UploadDescription,
-    work_s: float,
+    limits: ImportLimits,
 ) -> Observed:
     """What the cameras saw of the field of ``description``, as its file keeps it, within an estimated time.
 
     Raises FieldFormatError: CAMERAS_OF_ANOTHER_FRAME, IMPORT_TOO_COSTLY, FIELD_NOT_FINITE.
     """
     own = {name: array for name, array in tensors.items() if name != OBSERVATION}
-    points = _points(description, own, work_s)
+    points = _points(description, own, limits)
     field = _own_field(description, own)
     cameras = trajectory.pinhole().moved(torch.from_numpy(_into_function(description, trajectory, said)))
     try:
@@ -50,15 +52,15 @@ def observed_by_cameras(
         raise FieldFormatError(str(error), reason=error.reason) from error
 
 
-def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], work_s: float) -> int:
+def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], limits: ImportLimits) -> int:
     """How many points may be evaluated. Raises FieldFormatError (IMPORT_TOO_COSTLY) for too few."""
     plain = {**description, OBSERVATION: None}
     asked = seconds_of(plain, tensors, Calls((_ASKED,), ()))
-    points = int(min(_MOST_POINTS, _SHARE * work_s * _ASKED / max(asked, 1e-9)))
-    if points < _LEAST_POINTS:
+    points = int(min(_MOST_POINTS, _SHARE * limits.work_s * _ASKED / max(asked, 1e-9)))
+    if points < _LEAST_POINTS and math.isfinite(limits.refused_beyond_s):
         message = f"lines of sight take {_LEAST_POINTS} evaluations at least; there is time for an estimated {points}"
         raise FieldFormatError(message, reason="IMPORT_TOO_COSTLY")
-    return points
+    return max(points, _LEAST_POINTS)
 
 
 def _own_field(description: Mapping[str, Any], tensors: Mapping[str, StoredArray]) -> SdfField:

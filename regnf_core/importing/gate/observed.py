@@ -50,5 +50,5 @@ def _by_cameras(
     from regnf_core.importing.gate.plausibility import without_new_code  # loads torch
 
     with without_new_code():
-        found = observed_by_cameras(converted.description, converted.tensors, cameras, read.description, limits.work_s)
+        found = observed_by_cameras(converted.description, converted.tensors, cameras, read.description, limits)
     return observed_field(converted, *found, f"by lines of sight from {len(cameras)} cameras")

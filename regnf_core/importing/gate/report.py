@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,18 +14,68 @@ MIB = 1024 * 1024
 class ImportLimits:
     """Bounds of one import. Beyond any of them it ends with a reason, and nothing of it stays."""
 
-    wall_s: float = 120.0
-    """Seconds from start to end; then IMPORT_TIMEOUT."""
-    cpu_s: int = 240
-    """Processor seconds; then IMPORT_TIMEOUT."""
+    wall_s: float | None = None
+    """Seconds from start to end, by a fair clock; then IMPORT_TIMEOUT. None: as long as it takes, which is right for a
+    person's own file on the person's own machine."""
     work_s: float = 60.0
-    """Seconds of one core that the field's evaluation is estimated to take; then IMPORT_TOO_COSTLY, at once."""
+    """Seconds of one core for the field's evaluation. What is estimated to take longer is tried at fewer points; with
+    ``wall_s`` it is refused with IMPORT_TOO_COSTLY, at once."""
     memory_bytes: int = 8192 * MIB
     """Address space, the mapped upload (and about 1 GiB of libraries) included; then IMPORT_OUT_OF_MEMORY."""
     tensor_bytes: int = 4096 * MIB
     """All tensors of the field together, as float32; then TENSOR_TOO_LARGE."""
     file_bytes: int = 4096 * MIB
     """Largest file the import may write; then IMPORT_OUTPUT_TOO_LARGE."""
+
+    @property
+    def longest_s(self) -> float:
+        """``wall_s``; without it, infinity."""
+        return math.inf if self.wall_s is None else self.wall_s
+
+    @property
+    def refused_beyond_s(self) -> float:
+        """``work_s``; without ``wall_s``, infinity."""
+        return math.inf if self.wall_s is None else self.work_s
+
+    def no_memory(self) -> str:
+        """What is said beyond the limit on memory."""
+        return f"the import needs more than the {self.memory_bytes >> 20} MiB of memory that it may have"
+
+
+_WORDS_OF_THE_FILE = """
+    AMBIGUOUS_RUN ARCHIVE_BYTE_ORDER ARCHIVE_COMPRESSED_ENTRY ARCHIVE_CRC_MISMATCH ARCHIVE_DEFLATE_MALFORMED
+    ARCHIVE_DUPLICATE_ENTRY ARCHIVE_ENCRYPTED ARCHIVE_ENTRY_NAME ARCHIVE_ENTRY_OUT_OF_BOUNDS
+    ARCHIVE_HEADER_MISMATCH ARCHIVE_HIDDEN_DATA ARCHIVE_LINK ARCHIVE_MALFORMED ARCHIVE_MULTI_DISK ARCHIVE_NESTED
+    ARCHIVE_NO_PICKLE ARCHIVE_OVERLAP ARCHIVE_PREFIXED_DATA ARCHIVE_SPECIAL_FILE ARCHIVE_TOO_LARGE
+    ARCHIVE_TOO_MANY_ENTRIES ARCHIVE_TORCHSCRIPT ARCHIVE_TRAILING_DATA BOUNDS_INVALID CAMERAS_INTRINSICS_MISSING
+    CAMERAS_MALFORMED CAMERAS_NOT_RECOGNIZED CAMERAS_NOT_SUPPORTED CAMERAS_OF_ANOTHER_FRAME FAMILY_NOT_SUPPORTED
+    FIELD_IMPLAUSIBLE FIELD_INDEX_INVALID FIELD_KIND_UNKNOWN FIELD_NOT_A_FUNCTION FIELD_NOT_FINITE
+    FIELD_NOT_RECOGNIZED FIELD_SHAPES_MISMATCH FILE_EMPTY FILE_TRUNCATED FORMAT_NOT_RECOGNIZED
+    FORMAT_NOT_SUPPORTED HASH_GRID_NOT_RECOGNIZED INVALID_DESCRIPTION LATENT_MISSING LAYOUT_AMBIGUOUS
+    LEGACY_MALFORMED LEGACY_TORCH_FILE MESH_EXTERNAL_REFERENCE MESH_INVALID MESH_TOO_LARGE NO_ZERO_LEVEL
+    NPY_MALFORMED NPY_OBJECT_ARRAY ONNX_EXTERNAL_DATA ONNX_GRAPH_INVALID ONNX_MALFORMED ONNX_NOT_SUPPORTED
+    PICKLE_INTEGER_TOO_LARGE PICKLE_MALFORMED PICKLE_OPCODE_NOT_ALLOWED PICKLE_PROTOCOL PICKLE_STRING_TOO_LARGE
+    PICKLE_TOO_COMPLEX PICKLE_TOO_DEEP PICKLE_TOO_LARGE PICKLE_TRAILING_DATA POINT_CLOUD_WITHOUT_NORMALS
+    RAW_PICKLE RUN_TOO_LARGE RUN_WITHOUT_CHECKPOINT SAFETENSORS_DUPLICATE_KEY SAFETENSORS_HEADER_MALFORMED
+    SAFETENSORS_HEADER_TOO_LARGE SAFETENSORS_LAYOUT SAFETENSORS_TOO_MANY_TENSORS SAFE_FORMAT_INVALID
+    SAFE_FORMAT_VERSION SETTINGS_CONTRADICT_TENSORS SETTINGS_MALFORMED SETTINGS_NOT_RECOGNIZED
+    SETTINGS_TOO_LARGE SETTINGS_UNSAFE SQLITE_MALFORMED SQLITE_NOT_PLAIN TENSOR_DEVICE TENSOR_DTYPE
+    TENSOR_EXPECTED TENSOR_MISSING TENSOR_NOT_DENSE TENSOR_NOT_FINITE TENSOR_SHAPE TENSOR_STORAGE_MISMATCH
+    TENSOR_STORAGE_MISSING TENSOR_TOO_LARGE TRUNCATION_UNKNOWN UNSAFE_GLOBAL_IN_WEIGHTS
+"""
+OF_THE_FILE = frozenset(_WORDS_OF_THE_FILE.split())
+"""Reasons that follow from the bytes and what was said of them: the same upload ends so again, whenever it is tried."""
+OF_THE_CIRCUMSTANCES = frozenset(
+    {
+        "IMPORT_CRASHED",
+        "IMPORT_OUTPUT_TOO_LARGE",
+        "IMPORT_OUT_OF_MEMORY",
+        "IMPORT_TIMEOUT",
+        "IMPORT_TOO_COSTLY",
+        "STORAGE_FULL",
+    }
+)
+"""Reasons in which a limit, a setting or the machine's load has a part: tried again, the same upload may be taken."""
 
 
 @dataclass(frozen=True)

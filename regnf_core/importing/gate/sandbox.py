@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import resource
 import signal
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from regnf_core.importing.gate.fair_clock import LONGEST
 from regnf_core.importing.gate.landlock import restrict_files
 from regnf_core.importing.gate.report import ImportLimits
 from regnf_core.importing.gate.system_calls import refuse_system_calls
@@ -97,7 +99,6 @@ def _drop_capabilities(libc: ctypes.CDLL) -> bool:
 def _limit_resources(limits: ImportLimits, threads: bool) -> None:
     wanted = [
         (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_CPU, limits.cpu_s),
         (resource.RLIMIT_AS, limits.memory_bytes),
         (resource.RLIMIT_FSIZE, limits.file_bytes),
         (resource.RLIMIT_NOFILE, _OPEN_FILES),
@@ -105,6 +106,8 @@ def _limit_resources(limits: ImportLimits, threads: bool) -> None:
         (resource.RLIMIT_MSGQUEUE, 0),
         (resource.RLIMIT_SIGPENDING, 0),
     ]
+    if limits.wall_s is not None:  # several threads need less time than they use of the processors
+        wanted.append((resource.RLIMIT_CPU, math.ceil(LONGEST * limits.wall_s)))
     if not threads:  # the kernel counts those of all processes of the user, so it is none or no limit
         wanted.append((resource.RLIMIT_NPROC, 0))
     for kind, value in wanted:

@@ -153,7 +153,7 @@ async def store_upload(
     reference = reference_of(caller, received.sha256)
     known = await in_thread(_known, services, reference)
     if known is not None and known.state != "rejected":
-        return await in_thread(_keep, services, known, beside)
+        return await in_thread(keep_held, services, known, beside)
     if known is not None and known.original_until is not None:
         await in_thread(services.originals.drop, known)  # nobody must let go of what is stored below
     field = await in_thread(_field, services, reference, upload, received, beside)
@@ -168,7 +168,8 @@ async def store_upload(
     return await in_thread(_record, services, field, beside)
 
 
-def _keep(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
+def keep_held(services: Services, known: FieldRecord, beside: Beside) -> StoredUpload:
+    """A field that the caller has already. Raises Problem FIELD_DESCRIPTION_DIFFERS."""
     if not beside.is_nothing and not beside.is_function_of(known):
         raise Problem("FIELD_DESCRIPTION_DIFFERS")
     if beside.label is not None and beside.label != known.label:
@@ -203,7 +204,7 @@ def _record(services: Services, field: FieldRecord, beside: Beside) -> StoredUpl
         # another upload of the same bytes came first and is imported already
         services.blobs.delete(original_key(field.sha256))
     if not created:
-        return _keep(services, record, beside)
+        return keep_held(services, record, beside)
     if record.state == "validating":
         services.queue.enqueue_import(record.sha256, record.attempt)
     return StoredUpload(record, created=True)

@@ -10,7 +10,7 @@ from typing import Any
 from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_service.bytes_under_way import Claim
 from regnf_service.concurrency import in_thread
-from regnf_service.fields.ingest import Beside, StoredUpload, held_field, store_upload
+from regnf_service.fields.ingest import Beside, StoredUpload, check_room, held_field, keep_held, store_upload
 from regnf_service.fields.uploads import Received, Upload, closing, open_upload
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
@@ -40,12 +40,14 @@ class PieceUpload(Upload):
 
 
 async def check_piece(services: Services, caller: str, sha256: str, piece: PieceRange) -> None:
-    """Refuse a piece before it comes. Raises Problem UPLOAD_OFFSET_MISMATCH, TOO_MANY_PIECES."""
+    """Refuse a piece before it comes. Raises Problem UPLOAD_OFFSET_MISMATCH, INVALID_HEADER, TOO_MANY_PIECES."""
     found = await in_thread(services.pieces.find, caller, sha256)
     if piece.first is None:
         return
     if piece.first != found.offset:
         raise _at("UPLOAD_OFFSET_MISMATCH", found.offset)
+    if found.total not in (0, piece.total):
+        raise Problem("INVALID_HEADER", f"The pieces before are of a file of {found.total} bytes.", headers=CLOSE)
     if found.pieces >= MOST_PIECES:
         raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.", headers=CLOSE)
 
@@ -65,29 +67,46 @@ async def keep_piece(
     if received.bytes != piece.length or piece.first is None:
         raise Problem("UPLOAD_INCOMPLETE", "The body has not the bytes that Content-Range names.", headers=CLOSE)
     await in_thread(services.pieces.make_room, caller, sha256, piece.first + received.bytes)
-    await upload.commit(services.pieces.key(caller, sha256, piece.first))
+    await upload.commit(services.pieces.key(caller, sha256, piece.first, piece.total))
 
 
 async def finish_pieces(services: Services, caller: str, sha256: str, beside: Beside | None = None) -> StoredUpload:
     """Make the field of the pieces, which then go.
 
-    Raises Problem DIGEST_MISMATCH, UPLOAD_NOT_FINISHED where no piece is held, and what ``store_upload`` raises.
+    The pieces are read only when all are here and the field has room, one upload of a caller after the other: until the
+    field is recorded there are two copies of the bytes. Raises Problem UPLOAD_NOT_FINISHED, DIGEST_MISMATCH (the pieces
+    go), and what ``check_room`` and ``store_upload`` raise.
     """
-    with services.under_way.claim(caller, None, None) as claim:
-        async with open_upload(services, claim) as upload:
-            blocks = services.pieces.blocks(caller, sha256)
-            while (block := await in_thread(next, blocks, b"")) != b"":
-                await upload.feed(block)
-            if not claim.arrived:
-                raise _at("UPLOAD_NOT_FINISHED", 0)
-            received = await upload.finish()
-            if received.sha256 != sha256:
-                if beside is None:  # with what goes beside it, the last piece may not be here yet
-                    await in_thread(services.pieces.drop, caller, sha256)
-                raise Problem("DIGEST_MISMATCH")
-            taken = await store_upload(services, caller, upload, received, beside)
+    async with services.assembling.turn(caller):
+        known = await in_thread(held_field, services, caller, sha256)
+        if known is not None:
+            taken = await in_thread(keep_held, services, known, beside or Beside())
+        else:
+            taken = await _assembled(services, caller, sha256, beside)
     await in_thread(services.pieces.drop, caller, sha256)
     return taken
+
+
+async def _assembled(services: Services, caller: str, sha256: str, beside: Beside | None) -> StoredUpload:
+    found = await in_thread(services.pieces.find, caller, sha256)
+    if not found.total or found.offset != found.total:
+        raise _at("UPLOAD_NOT_FINISHED", found.offset)
+    room = await in_thread(check_room, services, caller, sha256)
+    if room is not None:
+        room += found.bytes  # the field takes their place
+    with services.under_way.claim(caller, room, found.total) as claim:
+        async with open_upload(services, claim) as upload:
+            blocks = services.pieces.blocks(caller, sha256)
+            try:
+                while (block := await in_thread(next, blocks, b"")) != b"":
+                    await upload.feed(block)
+            except FileNotFoundError as error:  # they were deleted in between
+                raise _at("UPLOAD_NOT_FINISHED", 0) from error
+            received = await upload.finish()
+            if received.sha256 != sha256:
+                await in_thread(services.pieces.drop, caller, sha256)
+                raise Problem("DIGEST_MISMATCH")
+            return await store_upload(services, caller, upload, received, beside)
 
 
 async def arrived(services: Services, caller: str, sha256: str) -> int:

@@ -48,7 +48,7 @@ _UNUSED = ("HTTPValidationError", "ValidationError")
 def build_contract(app: FastAPI) -> dict[str, Any]:
     """The contract of an app's routes, OpenAPI 3.1."""
     contract = get_openapi(
-        title="regnf",
+        title="regnf API",
         version=__version__,
         description=_DESCRIPTION,
         routes=app.routes,

@@ -61,6 +61,8 @@ def problem_of(error: Exception) -> Problem:
             return Problem("STORE_UNAVAILABLE", headers=RETRY_LATER)
         case StorageFullError():
             return Problem("STORAGE_FULL", headers=RETRY_LATER)
+        case FileNotFoundError():  # the store answers: what was there a moment ago has been deleted
+            return Problem("NOT_FOUND")
         case OSError():
             return Problem("STORAGE_UNAVAILABLE", headers=RETRY_LATER)
         case _:

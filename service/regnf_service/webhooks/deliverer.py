@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Collection
 from dataclasses import replace
 
+from anyio import CapacityLimiter, to_thread
+
 from regnf_service.times import rfc3339
-from regnf_service.webhooks.sender import Sender, SendError
+from regnf_service.webhooks.sender import HttpSender, SendError
 from regnf_service.webhooks.signing import Secrets, signed_headers
 from regnf_service.webhooks.targets import AllowList
 from regnf_state.record_store import RecordStore
@@ -22,16 +25,20 @@ _GONE = 410
 
 
 class Deliverer:
-    """Call ``run_once`` again and again, from as many threads and processes as like."""
+    """Call ``claim`` and ``deliver`` again and again, for as many messages at once as like, in many processes.
+
+    threads: for calls of the stores, which block; None: any.
+    """
 
     def __init__(
         self,
         records: RecordStore,
         outbox: RedisOutbox,
-        sender: Sender,
+        sender: HttpSender,
         allowed: AllowList,
         secrets: Secrets,
         back_off_s: tuple[float, ...] = BACK_OFF_S,
+        threads: CapacityLimiter | None = None,
     ) -> None:
         self._records = records
         self._outbox = outbox
@@ -39,37 +46,46 @@ class Deliverer:
         self._allowed = allowed
         self._secrets = secrets
         self._back_off_s = back_off_s
+        self._threads = threads
 
-    def run_once(self) -> bool:
-        """Send one message that is due; False when none is. Raises RedisError: the message comes up again."""
-        message = self._outbox.claim()
-        if message is None:
-            return False
+    def claim(self, passed_over: Collection[str] = ()) -> Message | None:
+        """A message that is due, None when none is. It comes up again if it is not delivered within a minute.
+
+        passed_over: lines and callers whose messages wait. Raises RedisError.
+        """
+        return self._outbox.claim(passed_over)
+
+    async def deliver(self, message: Message) -> None:
+        """Send a message and write down how that went. Raises RedisError: the message comes up again."""
+        found = await to_thread.run_sync(self._look_up, message, limiter=self._threads)
+        if found is not None:
+            record, known, now = found
+            sent = await self._send(record, message.place, now)
+            told = replace(known, sends=known.sends + 1, next_at=None)
+            await to_thread.run_sync(self._settle, message, told, *sent, limiter=self._threads)
+
+    def _look_up(self, message: Message) -> tuple[JobRecord, Delivery, float] | None:
+        """What the message is about, how it fared so far, and the store's time; None where it is not to be sent."""
         try:
             record = self._records.get_job(message.job_id)
         except UnreadableRecordError as error:
             if error.newer:
-                return True  # it comes up again in a minute: a process of the later release may send it
+                return None  # it comes up again in a minute: a process of the later release may send it
             record = None
         if record is None or not _is_about(message, record):
             self._outbox.settle(message, Delivery("failed", last_error="JOB_GONE"))
-            return True
-        known = self._outbox.deliveries(record)[message.place]
-        sent = self._send(record, message.place)
-        self._settle(message, replace(known, sends=known.sends + 1, next_at=None), *sent)
-        return True
+            return None
+        return record, self._outbox.deliveries(record)[message.place], self._records.now()
 
-    def _send(self, record: JobRecord, place: int) -> tuple[int | None, str | None]:
+    async def _send(self, record: JobRecord, place: int, now: float) -> tuple[int | None, str | None]:
         """Status of the answer, or a word for why there was none."""
         url, keys = record.webhooks[place], self._secrets.get(record.owner)
         if not keys or not self._allowed.allows(url):
             return None, "WEBHOOK_NOT_ALLOWED"
         body = payload(record)
-        headers = signed_headers(keys, message_id(record, place), int(self._records.now()), body) | {
-            "Content-Type": "application/json"
-        }
+        headers = signed_headers(keys, message_id(record, place), int(now), body) | {"Content-Type": "application/json"}
         try:
-            return self._sender.send(url, headers, body), None
+            return await self._sender.send(url, headers, body), None
         except SendError as error:
             return None, error.reason
 

@@ -53,6 +53,21 @@ def test_queries_share_the_trees(monkeypatch: pytest.MonkeyPatch) -> None:
     assert field.signed_distance(torch.zeros(1, 3)).item() < -0.49
 
 
+def test_a_query_looks_at_the_normals_of_touched_triangles_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scan has a million triangles: what looks at all of them for each batch of points takes most of the time."""
+    mesh = sphere()
+    field = MeshField(mesh["vertices"], mesh["faces"])
+    given = []
+    inner = MeshField._normals_and_areas
+    monkeypatch.setattr(
+        MeshField, "_normals_and_areas", lambda self, faces: given.append(len(faces)) or inner(self, faces)
+    )
+    on_surface = torch.from_numpy(field.vertices[:1])
+    _, gradient = field.signed_distance_and_gradient(torch.cat((torch.zeros(5, 3, dtype=torch.float64), on_surface)))
+    assert given == [1]
+    assert float(gradient[-1] @ torch.nn.functional.normalize(on_surface[0], dim=0).float()) > 0.9
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

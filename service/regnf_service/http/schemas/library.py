@@ -113,7 +113,7 @@ class EntryDocument(Outgoing):
         None,
         description="Null: nothing is said, and none was detected yet. A worker looks for it.",
     )
-    bounds: Any = Field(None, description="Of the field: lowest and highest corner.")
+    bounds: list[list[float]] | None = Field(None, description="Of the field: lowest and highest corner.")
     added_at: Moment
     updated_at: Moment
     links: Links

@@ -138,7 +138,8 @@ class RegistrationSpec(Incoming):
 
 
 def _one_of_both(schema: dict[str, Any]) -> None:
-    schema["oneOf"] = [{"required": ["object"]}, {"required": ["candidates"]}]
+    # within allOf: of a bare oneOf with nothing but `required` in it, generators of clients make Any
+    schema["allOf"] = [{"oneOf": [{"required": ["object"]}, {"required": ["candidates"]}]}]
     for name in ("object", "candidates"):
         schema["properties"][name].pop("default")  # null is what leaving it out means, nothing to send
 

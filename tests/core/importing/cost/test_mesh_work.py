@@ -38,7 +38,9 @@ def test_overlapping_triangles_are_refused_before_a_distance_is_computed(
     """The winding number of 2,000 points alone would take half a minute and more."""
     monkeypatch.setattr("igl.FastWindingNumberBVH", lambda: pytest.fail("a tree was built"))
     path = saved(tmp_path, stl(COSTLY[name]))
-    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(work_s=20.0)), "IMPORT_TOO_COSTLY")
+    assert_refused(
+        lambda: convert_file(path, tmp_path, None, ImportLimits(wall_s=100, work_s=20.0)), "IMPORT_TOO_COSTLY"
+    )
 
 
 def test_a_sound_mesh_of_as_many_triangles_is_quick() -> None:

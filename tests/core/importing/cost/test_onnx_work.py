@@ -151,7 +151,7 @@ def test_costly_graphs_are_refused_before_anything_is_evaluated(
     monkeypatch.setattr("regnf_core.fields.build.open_field", lambda _: pytest.fail("it was opened"))
     path = saved(tmp_path, costly(name).SerializeToString())
     assert path.stat().st_size < 12_000
-    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits()), "IMPORT_TOO_COSTLY")
+    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(wall_s=100)), "IMPORT_TOO_COSTLY")
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
@@ -159,7 +159,7 @@ def test_a_costly_graph_through_the_gate_says_both_numbers(tmp_path: Path) -> No
     path = saved(tmp_path, costly("large products one after the other").SerializeToString())
     assert path.stat().st_size < 2_000
     with pytest.raises(FieldFormatError, match=r"estimated \d+ s of a core; 60 s are allowed") as caught:
-        import_field(path, tmp_path / "out")
+        import_field(path, tmp_path / "out", None, ImportLimits(wall_s=100))
     assert caught.value.reason == "IMPORT_TOO_COSTLY"
 
 
@@ -168,7 +168,7 @@ def test_a_costly_graph_is_refused_before_torch_is_loaded(tmp_path: Path) -> Non
     path = saved(tmp_path, costly("large products one after the other").SerializeToString())
     program = (
         "import sys; from pathlib import Path; from regnf_core.importing.gate import convert;"
-        "told = convert.run(Path(sys.argv[1]), Path(sys.argv[2]), None, convert.ImportLimits());"
+        "told = convert.run(Path(sys.argv[1]), Path(sys.argv[2]), None, convert.ImportLimits(wall_s=100));"
         "print(told['reason'], 'torch' in sys.modules)"
     )
     command = [sys.executable, "-c", program, str(path), str(tmp_path)]
@@ -179,7 +179,9 @@ def test_a_costly_graph_is_refused_before_torch_is_loaded(tmp_path: Path) -> Non
 def test_the_limit_is_the_callers(tmp_path: Path) -> None:
     text, initializers = GRAPHS["Gemm"]
     path = saved(tmp_path, model(text, initializers | HALF).SerializeToString())
-    assert_refused(lambda: convert_file(path, tmp_path, None, ImportLimits(work_s=1e-3)), "IMPORT_TOO_COSTLY")
+    assert_refused(
+        lambda: convert_file(path, tmp_path, None, ImportLimits(wall_s=100, work_s=1e-3)), "IMPORT_TOO_COSTLY"
+    )
 
 
 UNTOLD: dict[str, tuple[str, Initializers]] = {

@@ -31,7 +31,7 @@ BUDGET = 1 << 24
 PARTS = ("container", "pickle", "tensors", "header", "settings")
 """The stages that see a part of the gate; all others begin with a whole file."""
 _TAKEN = "taken"
-_LIMITS = ImportLimits(tensor_bytes=BUDGET)
+_LIMITS = ImportLimits(wall_s=100, tensor_bytes=BUDGET)
 _QUIET = (
     "object.",
     "sys._getframe",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -197,11 +198,16 @@ def test_the_child_works_in_a_folder_of_its_own(tmp_path: Path) -> None:
 
 
 def test_resources_are_limited(tmp_path: Path) -> None:
-    limits = ImportLimits(cpu_s=7, memory_bytes=1 << 30, file_bytes=1000)
+    limits = ImportLimits(wall_s=3.2, memory_bytes=1 << 30, file_bytes=1000)
     limited = ("CPU", "AS", "FSIZE", "CORE", "NOFILE", "NPROC", "MEMLOCK", "MSGQUEUE", "SIGPENDING")
     names = tuple(f"RLIMIT_{name}" for name in limited)
     program = CONFINE + f"print(json.dumps([resource.getrlimit(getattr(resource, n))[0] for n in {names!r}]))"
     assert tell(tmp_path, program, limits) == [7, 1 << 30, 1000, 0, 64, 0, 0, 0, 0]
+
+
+def test_without_a_limit_on_time_the_processor_has_none(tmp_path: Path) -> None:
+    program = CONFINE + "print(json.dumps(resource.getrlimit(resource.RLIMIT_CPU)[0]))"
+    assert tell(tmp_path, program, ImportLimits()) == resource.getrlimit(resource.RLIMIT_CPU)[0]
 
 
 def test_there_are_no_privileges_and_none_can_be_gained(tmp_path: Path) -> None:

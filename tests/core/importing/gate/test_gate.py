@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import errno
 import json
+import math
 import re
 import subprocess
 import sys
@@ -15,11 +17,12 @@ from typing import Any
 import pytest
 import torch
 
+import regnf_core
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.importing.gate import gate
 from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
-from regnf_core.importing.gate.report import MIB
+from regnf_core.importing.gate.report import MIB, OF_THE_CIRCUMSTANCES, OF_THE_FILE
 from tests.core.importing.archives import assert_refused, saved, text, torch_zip
 from tests.core.importing.checkpoints import checkpoint, write_small_checkpoint
 from tests.core.importing.test_safetensors_upload import layout
@@ -122,6 +125,55 @@ def test_a_missing_upload_is_the_callers_error(tmp_path: Path) -> None:
 def test_a_late_import_is_ended(upload: Path, tmp_path: Path) -> None:
     assert_refused(lambda: import_field(upload, tmp_path, None, ImportLimits(wall_s=0.05)), "IMPORT_TIMEOUT")
     assert_nothing_left(tmp_path)
+
+
+def test_a_late_import_says_how_long_it_had(upload: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        FieldFormatError, match=r"longer than 0\.05 s: stopped after [\d.]+ s and [\d.]+ s of processor"
+    ):
+        import_field(upload, tmp_path, None, ImportLimits(wall_s=0.05))
+
+
+def test_a_persons_own_import_has_no_limit_on_time() -> None:
+    """Neither by the clock, nor by the processor, nor by an estimate."""
+    limits = ImportLimits()
+    assert (limits.longest_s, limits.refused_beyond_s) == (math.inf, math.inf)
+    assert ImportLimits(wall_s=9, work_s=5).refused_beyond_s == 5
+
+
+NO_REASONS = frozenset(
+    {
+        "COLOR_0",
+        "COLOR_ASSUMED",
+        "COLOR_LEFT_OUT",
+        "FIELD_NAME",
+        "IGL_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "REGNF_NATIVE",
+    }
+)
+"""Words of the same form that name warnings, files, attributes and variables of the environment."""
+
+
+def test_every_reason_is_of_the_file_or_of_the_circumstances() -> None:
+    """A new reason must be put into one of the two: only those of the file are remembered."""
+    root = Path(regnf_core.__file__).parent
+    sources = [path for part in ("importing", "schema", "fields") for path in (root / part).rglob("*.py")]
+    known = OF_THE_FILE | OF_THE_CIRCUMSTANCES
+    words = {
+        node.value: path.name
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if re.fullmatch(r"[A-Z][A-Z0-9]*(_[A-Z0-9]+)+", node.value)
+    }
+    assert len(words) > 90
+    assert {word: name for word, name in words.items() if word not in known | NO_REASONS} == {}
+    assert not OF_THE_FILE & OF_THE_CIRCUMSTANCES
+    assert not known & NO_REASONS
+    assert known - words.keys() == {"CAMERAS_OF_ANOTHER_FRAME"}, "raised by regnf_core.surface.observing"
 
 
 def test_a_hanging_import_with_closed_streams_is_ended(
