@@ -17,3 +17,9 @@ VERDICT_REASONS: dict[str, str] = {
     " pose.",
 }
 """By the stable UPPER_SNAKE word that results carry as ``verdict_reason``."""
+
+
+def verdict_in_words(reason: str, limit: str = "") -> str:
+    """The reason's sentence and, where a limit was not kept, both of its numbers."""
+    said = VERDICT_REASONS.get(reason, "")
+    return f"{said} ({limit[:1].upper()}{limit[1:]}.)".strip() if limit else said

@@ -56,7 +56,7 @@ def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[o
     assert document["verdict"] == "registered"
     assert document["metrics"]["rotation_error_rad"] < 0.03
     folder = tmp_path / "new" / "out"
-    np.testing.assert_allclose(np.load(folder / "transform.npy"), document["T_object_scene"]["matrix"])
+    np.testing.assert_allclose(np.load(folder / "T_scene_object.npy"), document["T_scene_object"]["matrix"])
     assert {"result.json", "aligned.ply", "preview.png"} <= {path.name for path in folder.iterdir()}
     assert all(path.is_file() for path in folder.iterdir())  # nothing half done is left
     assert f"wrote {folder}: result.json, preview.png" in outcome.stderr

@@ -90,7 +90,7 @@ def test_the_usual_preset_over_the_wire_and_a_second_look_from_its_result(
     files = {entry["name"]: entry["url"] for entry in result["artifacts"]}
     assert {"scene_points.ply", "object_points.ply", "residuals.npz", "trace.json"} <= set(files)
     assert arrived(live_client, files["preview.png"]).content.startswith(b"\x89PNG\r\n\x1a\n")
-    matrix = np.load(BytesIO(live_client.get(files["transform.npy"]).content), allow_pickle=False)
+    matrix = np.load(BytesIO(live_client.get(files["T_scene_object.npy"]).content), allow_pickle=False)
     np.testing.assert_array_equal(matrix, result["T_object_scene"]["matrix"])
     start = {"options": {}, "initial_transform": result["T_object_scene"]}
     second = finished(live_client, submit(live_client, demo_fields, **start).json()["id"])
