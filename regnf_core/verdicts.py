@@ -22,4 +22,4 @@ VERDICT_REASONS: dict[str, str] = {
 def verdict_in_words(reason: str, limit: str = "") -> str:
     """The reason's sentence and, where a limit was not kept, both of its numbers."""
     said = VERDICT_REASONS.get(reason, "")
-    return f"{said} ({limit[:1].upper()}{limit[1:]}.)".strip() if limit else said
+    return f"{said} {limit[:1].upper()}{limit[1:]}.".strip() if limit else said

@@ -133,4 +133,5 @@ class Registered(RegistrationResult):
         data = "" if png is None else base64.b64encode(png).decode()
         picture = f"<img alt='registration' src='data:image/png;base64,{data}'>" if data else ""
         words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}."
-        return f"<div><p>{words}</p><table><caption>T_scene_object, the object's pose in the scene</caption>{rows}</table>{picture}</div>"
+        caption = "<caption>T_scene_object, the object's pose in the scene</caption>"
+        return f"<div><p>{words}</p><table>{caption}{rows}</table>{picture}</div>"

@@ -6,7 +6,6 @@ Nothing is evaluated for it: the held-out samples tell it that the verdict rests
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from regnf_core.geometry.pose_distance import distinct
 from regnf_core.options import RobustOptions

@@ -12,9 +12,9 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.geometry.metrics import (
     add_s,
     errors_against_truth,
-    paper_errors,
     euler_rmse,
     mssd,
+    paper_errors,
     rotation_error,
     scale_error,
     translation_rmse,

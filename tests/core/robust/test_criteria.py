@@ -124,8 +124,8 @@ def test_no_answer_below_the_minimum_is_accepted(
 @pytest.mark.parametrize(
     ("probability", "least", "said"),
     [
-        (0.6411, 0.7, "probability 0.641, at least 0.7 is asked for"),
-        (0.69996, 0.7, "probability 0.69996, at least 0.7 is asked for"),  # and not "0.7, at least 0.7"
+        (0.6411, 0.7, "probability 0.641, at least 0.7 is needed"),
+        (0.69996, 0.7, "probability 0.69996, at least 0.7 is needed"),  # and not "0.7, at least 0.7"
     ],
 )
 def test_a_rejection_says_the_number_and_its_limit(probability: float, least: float, said: str) -> None:
