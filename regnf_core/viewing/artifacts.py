@@ -50,7 +50,9 @@ def write_result(
     symmetries: Symmetries | None = None,
     **said: Any,
 ) -> list[str]:
-    """What was found: trace.json, T_scene_object.npy (4x4), considered.npz (what the held-out samples say of each pose that was judged, if the result has it), result.json. said: as ``result_document``."""
+    """What was found: trace.json, T_scene_object.npy (4x4), considered.npz (what the held-out samples say of each pose
+    that was judged, if the result has it), result.json. said: as ``result_document``.
+    """
     _write_json(directory / "trace.json", trace_document(result.trace))
     np.save(directory / "T_scene_object.npy", result.T_scene_object.matrix().double().cpu().numpy())
     document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -67,6 +70,19 @@ def test_it_does_not_depend_on_where_the_scenes_origin_is(far: float) -> None:
     )  # a (7, 7) about a far origin holds the center's variance in its last digits
     for name in ("center_scene", "rotation_deg"):
         assert there[name] == pytest.approx(here[name], rel=exact)
+
+
+def test_the_contracts_example_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    """The code of docs/api.md, run, and the same numbers from the engine."""
+    text = (Path(__file__).resolve().parents[3] / "docs" / "api.md").read_text(encoding="utf-8")
+    code = text.split("### The covariance")[1].split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {}
+    exec(code, names)
+    told = re.findall(r"#.*?(\[[\d. ]+\])", code)
+    assert capsys.readouterr().out.splitlines() == told
+    T, center = Sim3.from_matrix(torch.tensor(names["T"]).double()), torch.tensor(names["center"]).double()
+    found = uncertainty(torch.tensor(names["C"]), T, center)
+    assert found["center_scene"] == pytest.approx([0.002] * 3)
 
 
 POSE_IN_WORKING_FRAMES = Sim3.from_quaternion(1.3, [0.2, 0.1, -0.3, 0.9], [0.05, -0.1, 0.02])
