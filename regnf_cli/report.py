@@ -55,7 +55,7 @@ def show_result(document: dict[str, Any]) -> None:
 def show_pose(document: dict[str, Any]) -> None:
     """Print where the object stands in the scene, how large it is there, and how sure that is."""
     transform = document["T_scene_object"]
-    out.print("T_scene_object, the object's pose in the scene (object coordinates to scene coordinates)")
+    out.print("T_scene_object, the object's pose in the scene:")
     for row in transform["matrix"]:
         out.print("   " + " ".join(f"{value: .6f}" for value in row))
     sigmas = document.get("uncertainty") or {}
