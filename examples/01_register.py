@@ -20,4 +20,4 @@ scene, object_, detection = files
 box = OrientedBox.from_dict(json.loads(detection.read_text()))
 result = register(open_field(scene), open_field(object_), box)
 print(result.verdict, result.verdict_reason)
-print(result.T_object_scene.matrix())
+print(result.T_scene_object.matrix())

@@ -26,9 +26,9 @@ def line_of(pair: dict, outcome) -> str:
     if outcome.error is not None:
         return json.dumps({"id": pair["id"], "error": outcome.error.reason})
     result = outcome.result
-    pose = result.T_object_scene.to_dict()
+    pose = result.T_scene_object.to_dict()
     told = {"verdict": result.verdict, "reason": result.verdict_reason, "probability": result.probability}
-    return json.dumps({"id": pair["id"], **told, "T_object_scene": pose})
+    return json.dumps({"id": pair["id"], **told, "T_scene_object": pose})
 
 
 if len(sys.argv) != 3 or not Path(sys.argv[1]).is_file():

@@ -108,4 +108,5 @@ def _told(one: PairResult) -> dict[str, Any]:
     if one.error is not None:
         return {"job": one.job, **failure(one.error)}
     kept = one.model_dump(exclude={"index", "key", "error", "number", "pair", "line"}, exclude_none=True)
-    return kept | {"T_object_scene": {"matrix": kept["T_object_scene"], "scale": one.scale}}
+    scales = {"T_scene_object": 1.0 / (one.scale or 1.0), "T_object_scene": one.scale}
+    return kept | {name: {"matrix": kept[name], "scale": scale} for name, scale in scales.items()}

@@ -24,9 +24,10 @@ from regnf_cli.demo_data import demo_folder
 from regnf_cli.extras import require
 from regnf_cli.local_service import running_service
 from regnf_cli.remote import RemoteService
+from regnf_cli.report import show_pose
 
 MAX_ROTATION_RAD = 0.03
-MAX_TRANSLATION_SHARE = 0.03
+MAX_CENTER_SHARE = 0.03
 MAX_SCALE_SHARE = 0.02
 
 
@@ -112,20 +113,14 @@ def _show(result: dict[str, Any]) -> bool:
     """Print the transform and its errors; whether they are within the demo's bounds."""
     out.print(f"verdict      {result['verdict']} ({result['verdict_reason']})")
     out.print(f"             {result['verdict_detail']}")
-    out.print("T_object_scene, from the scene's coordinates to the library object's:")
-    for row in result["T_object_scene"]["matrix"]:
-        out.print("   " + " ".join(f"{value:10.6f}" for value in row))
+    show_pose(result)
     metrics = result["metrics"]
     errors = [
         ("rotation", metrics["rotation_error_rad"], MAX_ROTATION_RAD, "rad"),
-        ("translation", 100 * metrics["translation_error_share"], 100 * MAX_TRANSLATION_SHARE, "% of the diameter"),
+        ("center", 100 * metrics["center_error_share"], 100 * MAX_CENTER_SHARE, "% of the diameter"),
         ("scale", 100 * metrics["scale_error_share"], 100 * MAX_SCALE_SHARE, "%"),
     ]
-    sigma = result["uncertainty"]
-    out.print(
-        f"uncertainty  {max(sigma['rotation_deg']):.2g} degrees, {sigma['scale_percent']:.2g} % in scale (1 sigma)"
-    )
-    out.print("error against the true transform")
+    out.print("error against the true pose")
     for name, value, bound, unit in errors:
         color = "green" if value <= bound else "red"
         out.print(f"   {name:<12} [{color}]{value:.4f}[/] {unit} (at most {bound:g})")

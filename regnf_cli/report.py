@@ -30,7 +30,7 @@ def show(document: dict[str, Any], as_json: bool, top: int = 0) -> None:
 
 
 def show_result(document: dict[str, Any]) -> None:
-    """Print what a result document says. Documents of other versions may lack everything but verdict and transform."""
+    """Print what a result document says. Documents of other versions may lack everything but verdict and pose."""
     verdict = escape(document["verdict"])
     out.print(
         f"verdict      [bold {_COLORS.get(verdict, 'red')}]{verdict}[/]  ({escape(document['verdict_reason'])})",
@@ -38,25 +38,39 @@ def show_result(document: dict[str, Any]) -> None:
     )
     if detail := document.get("verdict_detail"):
         _line("", detail)
-    metrics = document.get("metrics") or {}
-    if (probability := metrics.get("probability")) is not None:
-        _line("probability", f"{100 * probability:.1f} % that the pose is right")
-    if verdict == "ambiguous" and (listed := metrics.get("probability_listed")) is not None:
-        _line("", f"{100 * listed:.1f} % that one of the poses listed is right")
+    if (probability := document.get("probability")) is not None:
+        meant = "one of the poses listed" if verdict == "ambiguous" else "the pose"
+        _line("probability", f"{100 * probability:.1f} % that {meant} is right")
     if hint := document.get("verdict_hint"):
         _line("hint", hint)
     _show_warnings(document.get("fields") or {})
-    transform = document["T_object_scene"]
-    out.print("T_object_scene (scene coordinates to object coordinates)")
-    for row in transform["matrix"]:
-        out.print("   " + " ".join(f"{value: .6f}" for value in row))
-    _line("scale", f"{transform['scale']:.6f}")
-    _show_uncertainty(document.get("uncertainty"))
+    show_pose(document)
     if symmetry := document.get("symmetry"):
         _line("symmetry", symmetry_in_words(symmetry))
     _show_alternatives(document.get("alternatives") or [])
-    for name, value in document["metrics"].items():
+    for name, value in (document.get("metrics") or {}).items():
         _line(f"{name:<28}", f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+def show_pose(document: dict[str, Any]) -> None:
+    """Print where the object stands in the scene, how large it is there, and how sure that is."""
+    transform = document["T_scene_object"]
+    out.print("T_scene_object, the object's pose in the scene:")
+    for row in transform["matrix"]:
+        out.print("   " + " ".join(f"{value: .6f}" for value in row))
+    sigmas = document.get("uncertainty") or {}
+    if (center := document.get("center_scene")) is not None:
+        _line("center", f"{' '.join(f'{value:.4f}' for value in center)} in the scene{_give_or_take(sigmas)}")
+    deviation = sigmas.get("scale_percent")
+    give_or_take = "" if deviation is None else f", ± {deviation:.2g} %"
+    _line("scale", f"{1.0 / transform['scale']:.6f} object units for each scene unit{give_or_take}")
+    if sigmas:
+        _line("rotation", f"± {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
+        _line("", "± is one standard deviation")
+
+
+def _give_or_take(sigmas: dict[str, Any]) -> str:
+    return f", ± {_numbers(sigmas['center_scene'])} scene units" if sigmas else ""
 
 
 def show_ranking(document: dict[str, Any], top: int) -> None:
@@ -89,14 +103,6 @@ def _show_warnings(fields: dict[str, Any]) -> None:
     for name in ("scene", "object"):
         for warning in (fields.get(name) or {}).get("warnings") or ():
             _line("warning", f"{name}: {warning}")
-
-
-def _show_uncertainty(sigmas: dict[str, Any] | None) -> None:
-    if sigmas is None:
-        return
-    _line("1 sigma", f"rotation {_numbers(sigmas['rotation_deg'])} degrees about the object's x, y, z")
-    _line("", f"translation {_numbers(sigmas['translation'])} object units")
-    _line("", f"scale {_numbers([sigmas['scale_percent']])} %")
 
 
 def _show_alternatives(alternatives: list[dict[str, Any]]) -> None:

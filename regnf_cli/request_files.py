@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
 from regnf_core.geometry.similarity_check import similarity_fault
@@ -13,7 +15,8 @@ from regnf_core.json_faults import json_fault
 from regnf_core.options import Preset, RegistrationOptions
 
 Rows = list[list[float]]
-_TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates.'
+_TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates;'
+_TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordinates.'
 
 
 def read_detection(path: Path, index: int | None = None) -> Detection:
@@ -62,18 +65,21 @@ def read_options(path: Path | None, preset: Preset | None) -> dict[str, Any]:
 
 
 def read_transform(path: Path, what: str) -> Rows:
-    """The 4x4 T_object_scene in a file: rows, a transform object, or a document with a T_object_scene of either kind.
+    """The 4x4 T_object_scene in a file: rows, a transform object, or a document with a T_object_scene of either kind,
+    or with its inverse, T_scene_object.
 
     Raises InvalidInputError (INVALID_TRANSFORM) when there is none, or it is no similarity.
     """
     value = _read_json(path, what)
+    inverse = isinstance(value, dict) and "T_object_scene" not in value and "T_scene_object" in value
     if isinstance(value, dict):
-        value = value.get("T_object_scene", value)
+        value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
     rows: Any = value.get("matrix") if isinstance(value, dict) else value
     fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
     if fault:
         raise InvalidInputError(f"{what} {path}: {fault}", reason="INVALID_TRANSFORM", hint=_TRANSFORM)
-    return [[float(number) for number in row] for row in rows]
+    plain = [[float(number) for number in row] for row in rows]
+    return np.linalg.inv(plain).tolist() if inverse else plain
 
 
 def _read_json(path: Path, what: str) -> Any:

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field
 
 from regnf_client.answers import checked, refusal, service_error
 from regnf_client.fields import Asking, Deadline, FieldLike, known_sha256, upload
-from regnf_client.models import Alternative, Document, Matrix, Verdict
+from regnf_client.models import Alternative, Array, Document, Matrix, Verdict
 from regnf_client.registrations import Request
 from regnf_client.steps import Flow, Pause, call
 from regnf_client.worker_watch import look
@@ -78,7 +78,11 @@ class PairResult(Document):
     status: Literal["successful", "failed", "refused"]
     verdict: Verdict | None = None
     verdict_reason: str | None = None
+    probability: float | None = None
+    T_scene_object: Matrix | None = None
     T_object_scene: Matrix | None = None
+    center_scene: Array | None = None
+    uncertainty: dict[str, Any] | None = None
     alternatives: list[Alternative] = Field(default_factory=list)
     metrics: dict[str, float | None] = Field(default_factory=dict)
     object: str | None = None

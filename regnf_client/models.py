@@ -120,6 +120,7 @@ class Artifact(Document):
 class Alternative(Document):
     """Another pose that agrees with the data as well."""
 
+    T_scene_object: Matrix
     T_object_scene: Matrix
     score: float
     relation: str
@@ -133,6 +134,8 @@ class Candidate(Document):
     score: float | None = None
     verdict: Verdict | None = None
     verdict_reason: str | None = None
+    probability: float | None = None
+    T_scene_object: Matrix | None = None
     T_object_scene: Matrix | None = None
     source: str | None = None
 
@@ -148,11 +151,19 @@ class Result(Document):
     verdict_reason: str
     verdict_detail: str = ""
     verdict_hint: str = ""
-    T_object_scene: Matrix
+    probability: float | None = None
+    """That the pose, or one of the alternatives that place nearly the same surface, is right, 0..1: what the option
+    ``min_probability`` is compared with. None from the preset `paper`."""
     T_scene_object: Matrix
+    """The object's pose in the scene."""
+    T_object_scene: Matrix
+    center_scene: Array | None = None
+    """(3,), scene frame: where the object's center is."""
+    uncertainty: dict[str, Any] | None = None
+    """One standard deviation: ``center_scene``, scene units, ``rotation_deg``, ``scale_percent``."""
     alternatives: list[Alternative] = []
     covariance: Array | None = None
-    """(7, 7), in the order of ``covariance_ordering``."""
+    """(7, 7), in the order of ``covariance_ordering``; docs/api.md says what it is of."""
     covariance_ordering: list[str] | None = None
     metrics: dict[str, float | None] = {}
     object: str | None = None
@@ -166,16 +177,6 @@ class Result(Document):
     def scale(self) -> float:
         """Object units per scene unit."""
         return float(np.cbrt(np.linalg.det(self.T_object_scene[:3, :3])))
-
-    @property
-    def probability(self) -> float | None:
-        """That the pose is right, 0..1; None from the preset `paper`."""
-        return self.metrics.get("probability")
-
-    @property
-    def probability_listed(self) -> float | None:
-        """That the pose, or an alternative that places nearly the same surface, is right, 0..1; None from `paper`."""
-        return self.metrics.get("probability_listed")
 
     def apply(self, points: ArrayLike) -> Floats:
         """Points (N, 3) of the scene in the object's frame."""

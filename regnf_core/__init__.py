@@ -4,7 +4,7 @@
 
     box = OrientedBox.from_corners([-0.4, -0.3, 0.0], [0.1, 0.2, 0.4])
     result = register("outputs/room/neus/run/", "chair.ply", box)
-    result.T_object_scene.matrix()   # (4, 4): scene coordinates to object coordinates
+    result.T_scene_object.matrix()   # (4, 4): the object's pose in the scene
 
 Names are resolved on first use, so that importing a torch-free part (options, errors) does not load torch.
 """

@@ -33,9 +33,9 @@ HINTS: dict[str, str] = {
     "around more of the object.",
     "LARGE_RESIDUAL": "Most often it is another object. With the preset paper, try the preset robust or more "
     "iterations.",
-    "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote; docs/families.md lists what is taken.",
-    "FORMAT_NOT_SUPPORTED": "docs/families.md lists the files that are taken.",
-    "FIELD_NOT_RECOGNIZED": "docs/families.md lists the networks that are taken, and what a description may add.",
+    "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote; docs/import-gate.md lists what is taken.",
+    "FORMAT_NOT_SUPPORTED": "docs/import-gate.md lists the files that are taken.",
+    "FIELD_NOT_RECOGNIZED": "docs/import-gate.md lists the networks that are taken, and what a description may add.",
     "FILE_EMPTY": "Copy or download the file again.",
     "FILE_TRUNCATED": "Copy or download the file again, and compare its size with the original's.",
     "SAFE_FORMAT_INVALID": "The file is damaged, or no field of regnf. Copy it again, or give the checkpoint that it "
@@ -44,8 +44,8 @@ HINTS: dict[str, str] = {
     "'{\"accept_implausible\": true}'",
     "LAYOUT_AMBIGUOUS": "Settings beside the checkpoint decide it. Without them, look at each: `regnf inspect FILE "
     "--candidates FOLDER` draws them; over HTTP, the field's error has their pictures.",
-    "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/families.md lists the "
-    "files that are taken.",
+    "RUN_WITHOUT_CHECKPOINT": "Give the folder of one training run, or a file inside it; docs/import-gate.md lists "
+    "the files that are taken.",
     "AMBIGUOUS_RUN": "Give one of the files by itself, with the settings beside it.",
     "ARCHIVE_LINK": "Pack the run again with what the link leads to: `tar --dereference`, or `zip -r` without `-y`.",
     "ARCHIVE_NESTED": "Unpack the outer archive, and give the inner one.",

@@ -52,7 +52,7 @@ class Candidate:
     """What a search tells about one object.
 
     stage: the last stage that it reached · score: 0..1, smaller is better, comparable only within a stage. Verdict,
-    reason and transform are those of a registration, for ``refined`` objects; None for the others.
+    reason, transform and probability are those of a registration, for ``refined`` objects; None for the others.
     """
 
     name: str
@@ -61,6 +61,12 @@ class Candidate:
     verdict: Verdict | None = None
     verdict_reason: str | None = None
     T_object_scene: Sim3 | None = None
+    probability: float | None = None
+
+    @property
+    def T_scene_object(self) -> Sim3 | None:
+        """The object's pose in the scene; None for the others."""
+        return None if self.T_object_scene is None else self.T_object_scene.inverse()
 
 
 @dataclass(frozen=True)
@@ -148,10 +154,12 @@ def _ranking(
 ) -> list[Candidate]:
     """All objects, those that came farthest first."""
     first, score = library[refined[0].number].name, result.metrics["score"]
-    ranking = [Candidate(first, "refined", score, result.verdict, result.verdict_reason, result.T_object_scene)]
+    found = (result.verdict, result.verdict_reason, result.T_object_scene, result.probability)
+    ranking = [Candidate(first, "refined", score, *found)]
     for match in refined[1:]:
-        found, name = match.evaluation, library[match.number].name
-        ranking.append(Candidate(name, "refined", found.metrics["score"], found.verdict, found.reason, found.T))
+        other, name = match.evaluation, library[match.number].name
+        found = (other.verdict, other.reason, other.T, other.metrics["probability"])
+        ranking.append(Candidate(name, "refined", other.metrics["score"], *found))
     listed = {match.number for match in refined}
     ranking += [Candidate(library[c.number].name, "coarse", c.score) for c in coarse if c.number not in listed]
     listed |= {match.number for match in coarse}

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-_MEMBERS = ("verdict", "verdict_reason", "T_object_scene", "uncertainty", "alternatives")
+_MEMBERS = (
+    "verdict",
+    "verdict_reason",
+    "probability",
+    "T_scene_object",
+    "T_object_scene",
+    "center_scene",
+    "uncertainty",
+    "alternatives",
+)
 _SECONDS = "seconds_"
 
 

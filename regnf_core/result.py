@@ -44,14 +44,25 @@ class Alternative:
     score: float
     relation: str
 
+    @property
+    def T_scene_object(self) -> Sim3:
+        """The object's pose in the scene."""
+        return self.T_object_scene.inverse()
+
 
 @dataclass(frozen=True)
 class ConsideredPose:
-    """One pose that was refined and judged by itself, whatever rivals it has. reason: as of a verdict."""
+    """One pose that was refined and judged by itself, whatever rivals it has. reason, limit: as of a verdict."""
 
     T_object_scene: Sim3
     reason: str
     metrics: dict[str, float]
+    limit: str = ""
+
+    @property
+    def T_scene_object(self) -> Sim3:
+        """The object's pose in the scene."""
+        return self.T_object_scene.inverse()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +98,7 @@ class ObjectSymmetry:
 
 @dataclass(frozen=True)
 class RegistrationResult:
-    """The outcome of one registration. Transforms map scene coordinates to object coordinates."""
+    """The outcome of one registration. The object's pose in the scene is ``T_scene_object``."""
 
     verdict: Verdict
     verdict_reason: str
@@ -98,17 +109,25 @@ class RegistrationResult:
     object_samples: SurfaceSamples
     metrics: dict[str, float]
     """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
-    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more."""
+    field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more:
+    docs/reference/metrics.md."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
     """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""
     seed: int
     options: dict[str, Any]
+    center_object: Tensor
+    """(3,) float64, object frame: the centroid of the object's surface."""
+    verdict_limit: str = ""
+    """The limit that a rejected pose does not keep, in words, with both numbers; "" where there is none."""
     alternatives: list[Alternative] = field(default_factory=list)
     """The preset `robust` lists every distinct pose that matches the data equally well; empty unless ``ambiguous``."""
     covariance: Tensor | None = None
-    """(7, 7) float64 of (omega_x, omega_y, omega_z, dt_x, dt_y, dt_z, d log s): a left perturbation of T_object_scene,
-    s e^(d log s), exp(omega) R, t + dt; radians and object units. None from the preset `paper`."""
+    """(7, 7) float64 of (omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s): T_object_scene, x -> s R x + t, becomes
+    s exp(log_s), exp([omega]) R, t + dt; radians and object units. The turn and the growth are about t, the place of
+    the scene's origin: the farther that is from the object, the larger are the entries of t, however well the object's
+    place is known. :func:`regnf_core.viewing.uncertainty.center_covariance` gives that. None from the preset
+    `paper`."""
     symmetry: ObjectSymmetry | None = None
     """The object's own symmetries, found by registering it with itself. None from the preset `paper`."""
     considered: Considered | None = None
@@ -117,13 +136,18 @@ class RegistrationResult:
     """The scene's surface around the detection, for viewers."""
 
     @property
-    def probability(self) -> float | None:
-        """That the pose is right, 0..1: within 5 % of the object's diameter, or equal to that by the object's symmetry.
-        None from the preset `paper`."""
-        return self.metrics.get("probability")
+    def T_scene_object(self) -> Sim3:
+        """The object's pose in the scene."""
+        return self.T_object_scene.inverse()
 
     @property
-    def probability_listed(self) -> float | None:
-        """That T_object_scene, or one of the alternatives that place nearly the same surface, is right, 0..1: what the
-        verdict rests on. None from the preset `paper`."""
-        return self.metrics.get("probability_listed")
+    def center_scene(self) -> Tensor:
+        """(3,) float64, scene frame: where the object's center is."""
+        return self.T_scene_object.apply(self.center_object[None])[0]
+
+    @property
+    def probability(self) -> float | None:
+        """That the answer is right, 0..1: that the pose, or one of the alternatives that place nearly the same surface,
+        is within 5 % of the object's diameter, or equal to that by the object's symmetry. What the option
+        ``min_probability`` is compared with. None from the preset `paper`."""
+        return self.metrics.get("probability")

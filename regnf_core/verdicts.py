@@ -6,7 +6,7 @@ VERDICT_REASONS: dict[str, str] = {
     "SURFACES_AGREE": "Object and scene match on held-out points.",
     "SEVERAL_POSES_AGREE": "Several poses match the data equally well: this one and the alternatives.",
     "LOW_OVERLAP": "Too small a share of the two surfaces matches.",
-    "LARGE_RESIDUAL": "The surfaces are too far apart where they should coincide.",
+    "LARGE_RESIDUAL": "The surfaces are too far apart where they should coincide (preset paper).",
     "FREE_SPACE_VIOLATED": "The object would occupy space that the scene shows as empty.",
     "SURFACE_UNEXPLAINED": "Next to the object the scene has surface that does not belong to it: the object is a"
     " similar one, or something is attached to it.",
@@ -17,3 +17,9 @@ VERDICT_REASONS: dict[str, str] = {
     " pose.",
 }
 """By the stable UPPER_SNAKE word that results carry as ``verdict_reason``."""
+
+
+def verdict_in_words(reason: str, limit: str = "") -> str:
+    """The reason's sentence and, where a limit was not kept, both of its numbers."""
+    said = VERDICT_REASONS.get(reason, "")
+    return f"{said} {limit[:1].upper()}{limit[1:]}.".strip() if limit else said

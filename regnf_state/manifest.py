@@ -28,7 +28,7 @@ ARTIFACTS: dict[str, str] = {
     "residuals.npz": _BINARY,
     "considered.npz": _BINARY,
     "trace.json": "application/json",
-    "transform.npy": _BINARY,
+    "T_scene_object.npy": _BINARY,
     "aligned.glb": "model/gltf-binary",
     "recording.rrd": _BINARY,
     "preview.png": "image/png",

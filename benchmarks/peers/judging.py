@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.peers.interface import MissingPackageError, Peer, PeerCase, PeerResult
 from regnf_core import RegnfError
-from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.metrics import errors_against_truth, paper_errors
 
 SUCCESS = 0.05
 """Largest MSSD of a right pose, object diameters."""
@@ -35,6 +35,9 @@ def judge(result: PeerResult, case: PeerCase) -> dict[str, Any]:
     points = case.object_samples.points
     points = points[:: max(1, len(points) // _POINTS)]
     errors = errors_against_truth(result.T_object_scene, case.truth, points, case.symmetries)
+    errors |= paper_errors(result.T_object_scene, case.truth)
+    apart = float((result.T_object_scene.translation - case.truth.translation).norm())
+    errors["translation_error_share"] = apart / case.diameter
     share = errors["mssd"] / case.diameter
     return {
         "verdict": "pose",

@@ -19,7 +19,7 @@ DEFINITION = (
 )
 _POINTS = 2000
 """Surface points, about, that the errors are taken over."""
-_ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale_error_share", "add_s_share")
+_ERRORS = ("mssd_share", "rotation_error_rad", "center_error_share", "scale_error_share", "add_s_share")
 _METRICS = (
     "score",
     "inlier_share_object",
@@ -31,7 +31,7 @@ _METRICS = (
     "coarse_agreement",
     "unexplained_share_scene",
     "probability",
-    "probability_listed",
+    "probability_alone",
     "verdict_margin",
     "surface_offset",
     "field_evaluations",

@@ -27,9 +27,8 @@ from regnf_core.robust import pipeline
 from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.verdict.answer import choose
-from regnf_core.robust.verdict.evidence import gather_evidence
+from regnf_core.robust.verdict.evaluation import held_out_of
 from regnf_core.robust.verdict.lead import apart
-from regnf_core.robust.verdict.pose_features import pose_features
 from regnf_data.worlds.split import part_of_world
 
 Row = dict[str, Any]
@@ -129,9 +128,8 @@ def _described(
     A row's ``others`` are the candidates that are other answers, by how many rows they stand after it.
     ``found``: it is one of a registration's candidates.
     """
-    assert candidates.offsets is not None
-    features = pose_features(problem, candidates.T, candidates.offsets)
-    evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, _OPTIONS.robust)
+    held_out = held_out_of(problem, candidates, _OPTIONS)
+    features, evidence = held_out.features, held_out.evidence
     errors = _errors(problem, candidates.T, known)
     elsewhere = apart(candidates.T, problem.model.extremal_points, problem.model.symmetry)
     rivals = choose(problem, candidates, features, evidence.scores, _OPTIONS.robust.rival_margin).rivals

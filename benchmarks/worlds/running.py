@@ -21,7 +21,7 @@ from regnf_core.options import RobustOptions
 
 Run = dict[str, Any]
 _POINTS = 600
-_ERRORS = ("mssd_share", "rotation_error_rad", "translation_error_share", "scale_error_share")
+_ERRORS = ("mssd_share", "rotation_error_rad", "center_error_share", "scale_error_share")
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,16 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.result import RegistrationResult
-from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.verdicts import verdict_in_words
 from regnf_core.viewing.artifacts import write_artifacts
 from regnf_core.viewing.document import result_document
 from regnf_core.viewing.recording import write_recording
 from regnf_core.viewing.registration_picture import registration_picture
+from regnf_core.viewing.uncertainty import uncertainty
 from regnf_core.viewing.window import show
 
 if TYPE_CHECKING:
@@ -59,9 +57,13 @@ class Registered(RegistrationResult):
         return float(self.T_object_scene.scale)
 
     @property
-    def matrix(self) -> NDArray[np.float64]:
-        """(4, 4): scene coordinates to object coordinates."""
-        return np.asarray(self.T_object_scene, dtype=np.float64)
+    def uncertainty(self) -> dict[str, Any] | None:
+        """One standard deviation of where the object's center is (``center_scene``, along the scene's x, y, z, scene
+        units), of the rotation (``rotation_deg``, about the object's x, y, z) and of the scale (``scale_percent``).
+        None from the preset `paper`."""
+        if self.covariance is None:
+            return None
+        return uncertainty(self.covariance, self.T_object_scene, self.center_object)
 
     def to_dict(self) -> dict[str, Any]:
         """The result document: plain values, as result.json has them."""
@@ -122,13 +124,14 @@ class Registered(RegistrationResult):
 
     def _repr_html_(self) -> str:
         """For notebooks."""
-        reason = VERDICT_REASONS.get(self.verdict_reason, self.verdict_reason)
+        reason = verdict_in_words(self.verdict_reason, self.verdict_limit) or self.verdict_reason
         rows = "".join(
             "<tr>" + "".join(f"<td style='text-align:right'>{value:.4f}</td>" for value in row) + "</tr>"
-            for row in self.matrix
+            for row in self.T_scene_object.matrix().tolist()
         )
         png = self._repr_png_()
         data = "" if png is None else base64.b64encode(png).decode()
         picture = f"<img alt='registration' src='data:image/png;base64,{data}'>" if data else ""
         words = f"<b>{escape(self.verdict)}</b>: {escape(reason)} Scale {self.scale:.4g}."
-        return f"<div><p>{words}</p><table><caption>T_object_scene</caption>{rows}</table>{picture}</div>"
+        caption = "<caption>T_scene_object, the object's pose in the scene</caption>"
+        return f"<div><p>{words}</p><table>{caption}{rows}</table>{picture}</div>"

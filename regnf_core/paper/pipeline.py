@@ -131,6 +131,7 @@ def _result(
         residuals={},
         seed=seed,
         options=options.to_dict(),
+        center_object=surfaces.object.points.double().mean(0).cpu(),
     )
 
 

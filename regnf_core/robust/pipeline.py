@@ -259,8 +259,11 @@ def evaluate_with(
     earlier: Sequence[Evaluation], problem: RegistrationProblem, refined: PoseCandidates, options: RegistrationOptions
 ) -> Evaluation:
     """The evaluation of these candidates and of those of the last of the ``earlier`` attempts, which has all before."""
-    known = [one.candidates.to(refined.scores.device) for one in earlier[-1:]]
-    return evaluate_candidates(problem, PoseCandidates.cat([*known, refined]), options)
+    if not earlier:
+        return evaluate_candidates(problem, refined, options)
+    last = earlier[-1]
+    candidates = PoseCandidates.cat([last.candidates.to(refined.scores.device), refined])
+    return evaluate_candidates(problem, candidates, options, last.held_out)
 
 
 def _progress_of_steps(run: Run) -> Callable[[], None]:

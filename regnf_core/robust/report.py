@@ -24,6 +24,7 @@ def result_of(
     return RegistrationResult(
         verdict=evaluation.verdict,
         verdict_reason=evaluation.reason,
+        verdict_limit=evaluation.found.broken,
         T_object_scene=evaluation.T,
         T_object_scene_initial=problem.in_field_frames(history[0].T[winner]),
         scene_samples=_surface(view.foreground, view.frame),
@@ -35,6 +36,7 @@ def result_of(
         options=options.to_dict(),
         alternatives=evaluation.alternatives,
         considered=evaluation.considered,
+        center_object=model.frame.center.clone(),
         covariance=pose_covariance(problem, evaluation),
         symmetry=model.symmetry.to("cpu").group(),
     )

@@ -50,14 +50,14 @@ def write_result(
     symmetries: Symmetries | None = None,
     **said: Any,
 ) -> list[str]:
-    """What was found: trace.json, transform.npy (T_object_scene, 4x4), considered.npz (what the held-out samples say of
-    each pose that was judged, if the result has it), result.json. said: as ``result_document``.
+    """What was found: trace.json, T_scene_object.npy (4x4), considered.npz (what the held-out samples say of each pose
+    that was judged, if the result has it), result.json. said: as ``result_document``.
     """
     _write_json(directory / "trace.json", trace_document(result.trace))
-    np.save(directory / "transform.npy", result.T_object_scene.matrix().double().cpu().numpy())
+    np.save(directory / "T_scene_object.npy", result.T_scene_object.matrix().double().cpu().numpy())
     document = result_document(result, truth, symmetries, result.scene_samples.points.device, **said)
     _write_json(directory / "result.json", document)
-    names = ["trace.json", "transform.npy", "result.json"]
+    names = ["trace.json", "T_scene_object.npy", "result.json"]
     if result.considered is not None:
         _write_considered(directory / "considered.npz", result.considered)
         names.append("considered.npz")
@@ -71,7 +71,7 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
     source), context_points.ply (the scene around the detection, if the result has it), residuals.npz, preview.png.
     """
     scene, obj = result.scene_samples, result.object_samples
-    placed = obj.transformed(result.T_object_scene.inverse())
+    placed = obj.transformed(result.T_scene_object)
     _write_cloud(directory / "scene_points.ply", (scene, SCENE_COLOR))
     _write_cloud(directory / "object_points.ply", (obj, OBJECT_COLOR))
     _write_cloud(directory / "aligned.ply", (scene, SCENE_COLOR), (placed, OBJECT_COLOR))

@@ -8,15 +8,14 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from regnf_core.field_notes import FieldNotes
-from regnf_core.geometry.metrics import errors_against_truth
+from regnf_core.geometry.metrics import errors_against_truth, paper_errors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.hints import HINTS
 from regnf_core.result import Alternative, ConsideredPose, IterationRecord, RegistrationResult
-from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.verdicts import verdict_in_words
 from regnf_core.version import __version__
 from regnf_core.viewing.uncertainty import COVARIANCE_ORDERING, uncertainty
 
@@ -42,18 +41,25 @@ def result_document(
     """
     metrics = dict(result.metrics)
     if truth is not None:
-        metrics |= errors_against_truth(result.T_object_scene, truth, result.object_samples.points, symmetries)
+        metrics |= errors_against_truth(
+            result.T_object_scene, truth, result.object_samples.points, symmetries, result.center_object
+        )
+        if result.options.get("preset") == "paper":
+            metrics |= paper_errors(result.T_object_scene, truth)
     return {
         "verdict": result.verdict,
         "verdict_reason": result.verdict_reason,
-        "verdict_detail": VERDICT_REASONS.get(result.verdict_reason, ""),
+        "verdict_detail": verdict_in_words(result.verdict_reason, result.verdict_limit),
         "verdict_hint": HINTS.get(result.verdict_reason, ""),
+        "probability": None if result.probability is None else _json_number(result.probability),
+        "T_scene_object": result.T_scene_object.to_dict(),
         "T_object_scene": result.T_object_scene.to_dict(),
-        "T_scene_object": result.T_object_scene.inverse().to_dict(),
+        "center_scene": result.center_scene.tolist(),
+        "center_object": result.center_object.tolist(),
         "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
         "alternatives": [_alternative(other) for other in result.alternatives],
         "considered": None if result.considered is None else [_considered(one) for one in result.considered.poses],
-        **_covariance(result.covariance),
+        **_covariance(result),
         "symmetry": None if result.symmetry is None else asdict(result.symmetry),
         "metrics": {name: _json_number(value) for name, value in metrics.items()},
         "object": object_name,
@@ -79,12 +85,16 @@ def ranking_document(ranking: Sequence[Candidate], unusable: Mapping[str, str]) 
             "score": _json_number(one.score),
             "verdict": one.verdict,
             "verdict_reason": one.verdict_reason,
+            "probability": one.probability,
+            "T_scene_object": None if one.T_scene_object is None else one.T_scene_object.to_dict(),
             "T_object_scene": None if one.T_object_scene is None else one.T_object_scene.to_dict(),
         }
         for one in ranking
     ]
-    nothing = {"stage": "unusable", "score": None, "verdict": None, "T_object_scene": None}
-    return ranked + [{"object": name, **nothing, "verdict_reason": reason} for name, reason in unusable.items()]
+    nothing = dict.fromkeys(("score", "verdict", "probability", "T_scene_object", "T_object_scene"))
+    return ranked + [
+        {"object": name, "stage": "unusable", **nothing, "verdict_reason": reason} for name, reason in unusable.items()
+    ]
 
 
 def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
@@ -106,28 +116,33 @@ def trace_document(trace: list[IterationRecord]) -> list[dict[str, Any]]:
     ]
 
 
-def _covariance(covariance: Tensor | None) -> dict[str, Any]:
+def _covariance(result: RegistrationResult) -> dict[str, Any]:
+    covariance = result.covariance
     if covariance is None:
         return {"covariance": None, "covariance_ordering": None, "uncertainty": None}
     rows = [[_json_number(value) for value in row] for row in covariance.tolist()]
     return {
         "covariance": rows,
         "covariance_ordering": list(COVARIANCE_ORDERING),
-        "uncertainty": uncertainty(covariance),
+        "uncertainty": uncertainty(covariance, result.T_object_scene, result.center_object),
     }
 
 
 def _considered(one: ConsideredPose) -> dict[str, Any]:
     return {
-        "T_object_scene": one.T_object_scene.to_dict(),
+        **_both_ways(one),
         "reason": one.reason,
-        "detail": VERDICT_REASONS.get(one.reason, ""),
+        "detail": verdict_in_words(one.reason, one.limit),
         "metrics": {name: _json_number(value) for name, value in one.metrics.items()},
     }
 
 
 def _alternative(other: Alternative) -> dict[str, Any]:
-    return {"T_object_scene": other.T_object_scene.to_dict(), "score": other.score, "relation": other.relation}
+    return {**_both_ways(other), "score": other.score, "relation": other.relation}
+
+
+def _both_ways(pose: Alternative | ConsideredPose) -> dict[str, Any]:
+    return {"T_scene_object": pose.T_scene_object.to_dict(), "T_object_scene": pose.T_object_scene.to_dict()}
 
 
 def _json_number(value: float) -> float | None:

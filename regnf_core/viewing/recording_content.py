@@ -90,7 +90,7 @@ def _log_considered(stream: rr.RecordingStream, considered: Considered | None) -
         return
     for number, one in enumerate(considered.poses):
         entity = f"scene/considered/{number}"
-        stream.log(entity, _transform(one.T_object_scene.inverse()), static=True)
+        stream.log(entity, _transform(one.T_scene_object), static=True)
         signs = considered.object_signs[number].cpu().numpy()
         points, colors = _array(considered.object_points), _bytes(_SIGN_COLORS[signs])
         samples = rr.Points3D(points, colors=colors, labels=[label_of(one)], show_labels=True)

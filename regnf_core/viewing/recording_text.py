@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from regnf_core.hints import HINTS
 from regnf_core.result import ConsideredPose, RegistrationResult
-from regnf_core.verdicts import VERDICT_REASONS
+from regnf_core.verdicts import verdict_in_words
 
 
 def label_of(one: ConsideredPose) -> str:
@@ -15,22 +15,22 @@ def label_of(one: ConsideredPose) -> str:
 def verdict_text(result: RegistrationResult, object_name: str | None = None) -> str:
     """Verdict, reason, probability, hint, the transform and the poses that were judged, as Markdown."""
     reason = result.verdict_reason
-    lines = [f"# {result.verdict}", "", f"**{reason}**: {VERDICT_REASONS.get(reason, '')}", ""]
+    lines = [f"# {result.verdict}", "", f"**{reason}**: {verdict_in_words(reason, result.verdict_limit)}", ""]
     if (hint := HINTS.get(reason)) is not None:
         lines += [hint, ""]
     if object_name is not None:
         lines += [f"Object: `{object_name}`", ""]
     if result.probability is not None:
-        lines += [f"Probability that the pose is right: {_percent(result.probability)}", ""]
-    lines += ["T_scene_object (object coordinates to scene coordinates):", "", "```"]
-    lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_object_scene.inverse().matrix().tolist()]
+        lines += [f"Probability that the answer is right: {_percent(result.probability)}", ""]
+    lines += ["T_scene_object, the object's pose in the scene (object coordinates to scene coordinates):", "", "```"]
+    lines += [" ".join(f"{value: .6f}" for value in row) for row in result.T_scene_object.matrix().tolist()]
     lines += ["```", ""]
     if result.considered is not None:
         lines += ["Poses that were judged (`scene/considered`):", "", "| | probability | reason | |"]
         lines += ["|---|---|---|---|"]
         lines += [
             f"| {number} | {_percent(one.metrics.get('probability'))} | {one.reason} | "
-            f"{VERDICT_REASONS.get(one.reason, '')} |"
+            f"{verdict_in_words(one.reason, one.limit)} |"
             for number, one in enumerate(result.considered.poses)
         ]
     return "\n".join(lines)

@@ -88,7 +88,8 @@ def test_results_are_beside_the_pairs_failures_apart(run: Run, folder: Path) -> 
     reasons = {line: one["error"]["reason"] for line, one in found.items() if one["status"] == "failed"}
     assert reasons == {2: "DETECTION_OUTSIDE_SCENE", 3: "MALFORMED_JSON", 4: "FILE_NOT_FOUND"}
     assert found[1]["verdict"] in ("registered", "ambiguous", "rejected")
-    assert len(found[1]["T_object_scene"]["matrix"]) == 4
+    assert len(found[1]["T_object_scene"]["matrix"]) == len(found[1]["T_scene_object"]["matrix"]) == 4
+    assert found[1]["probability"] == found[1]["metrics"]["probability"]
     assert found[1]["metrics"]["seconds"] > 0
     assert Path(found[5]["object"]).name == "armchair.safetensors"
     assert "3 failed" in outcome.stdout
@@ -182,7 +183,9 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
                 assert one.more["pictures"] is (one.seed == 3)  # as the file says, else none
                 told = {"status": "successful", "verdict": "registered", "job": f"job {one.seed}"}
                 matrix = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
-                yield PairResult.model_validate({"index": index, "T_object_scene": matrix, **told})
+                back = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
+                poses = {"T_scene_object": back, "T_object_scene": matrix, "probability": 0.9}
+                yield PairResult.model_validate({"index": index, **poses, **told})
 
     monkeypatch.setattr(regnf_client, "Client", Pretended)
     path = write(folder, [pair(seed=1, key="a"), "no pair", pair(seed=3, key="c", pictures=True)])
@@ -190,6 +193,8 @@ def test_results_of_a_batch_at_a_service(run: Run, folder: Path, monkeypatch: py
     found = {one["line"]: one for one in results(path)}
     assert (found[1]["job"], found[3]["job"], found[2]["status"]) == ("job 1", "job 3", "failed")
     assert found[3]["T_object_scene"]["scale"] == pytest.approx(2.0)
+    assert found[3]["T_scene_object"]["scale"] == pytest.approx(0.5)
+    assert found[3]["probability"] == 0.9
     assert found[3]["key"] == "c"
 
 

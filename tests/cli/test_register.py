@@ -56,7 +56,7 @@ def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[o
     assert document["verdict"] == "registered"
     assert document["metrics"]["rotation_error_rad"] < 0.03
     folder = tmp_path / "new" / "out"
-    np.testing.assert_allclose(np.load(folder / "transform.npy"), document["T_object_scene"]["matrix"])
+    np.testing.assert_allclose(np.load(folder / "T_scene_object.npy"), document["T_scene_object"]["matrix"])
     assert {"result.json", "aligned.ply", "preview.png"} <= {path.name for path in folder.iterdir()}
     assert all(path.is_file() for path in folder.iterdir())  # nothing half done is left
     assert f"wrote {folder}: result.json, preview.png" in outcome.stderr
@@ -64,7 +64,7 @@ def test_a_registration_ends_with_0_and_leaves_its_files(run: Run, exact: list[o
 
 def test_a_rejected_registration_ends_with_1(run: Run, exact: list[object], tmp_path: Path) -> None:
     (tmp_path / "options.json").write_text('{"optimization": {"iterations": 1}}')
-    far = {"T_object_scene": {"matrix": np.eye(4).tolist()}}
+    far = {"T_scene_object": {"matrix": np.eye(4).tolist()}}
     (tmp_path / "truth.json").write_text(json.dumps(far))  # as results spell it
     outcome = run(*exact, "--preset", "paper", "--options", tmp_path / "options.json")
     assert outcome.code == 1, outcome.stderr
@@ -78,11 +78,13 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     said = outcome.stdout
     assert said.startswith("verdict      ambiguous  (SEVERAL_POSES_AGREE)")
     assert VERDICT_REASONS["SEVERAL_POSES_AGREE"] in said
-    assert re.search(r"^ +\d+\.\d % that one of the poses listed is right$", said, flags=re.M)
+    assert re.search(r"^probability +\d+\.\d % that one of the poses listed is right$", said, flags=re.M)
     assert re.search(r"^ *1 +0\.\d{4} +180 degrees about z", said, flags=re.M)
-    assert re.search(r"^1 sigma +rotation( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
-    assert re.search(r"^ +translation( [\d.e-]+){3} object units$", said, flags=re.M)
-    assert re.search(r"^ +scale [\d.e-]+ %$", said, flags=re.M)
+    assert said.index("T_scene_object") < said.index("center")
+    assert "T_object_scene" not in said
+    assert re.search(r"^center( +-?[\d.]+){3} in the scene, ±( [\d.e-]+){3} scene units$", said, flags=re.M)
+    assert re.search(r"^scale +[\d.]+ object units for each scene unit, ± [\d.e-]+ %$", said, flags=re.M)
+    assert re.search(r"^rotation +±( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
     assert re.search(
         r"^symmetry +2 rotations about \(0\.00, 0\.00, 1\.00\) of the object look the same", said, flags=re.M
     )

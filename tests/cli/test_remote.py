@@ -19,6 +19,7 @@ def service(verdict: str, artifact: str = "result.json") -> Answers:
     result = {
         "verdict": verdict,
         "verdict_reason": "BECAUSE",
+        "T_scene_object": transform,
         "T_object_scene": transform,
         "metrics": {"residual_rms": 0.5},
         "artifacts": [{"name": artifact}],

@@ -67,7 +67,7 @@ def test_what_a_box_may_be(client: Client) -> None:
 def test_files_of_a_result(client: Client, found: Result, tmp_path: Path) -> None:
     paths = client.save(found, tmp_path / "out")
     assert {path.name for path in paths} == {one.name for one in found.artifacts}
-    assert np.allclose(np.load(tmp_path / "out" / "transform.npy"), found.T_object_scene)
+    assert np.allclose(np.load(tmp_path / "out" / "T_scene_object.npy"), found.T_scene_object)
     assert client.artifact(found, "preview.png").startswith(b"\x89PNG")
     assert not list((tmp_path / "out").glob("*.part"))
     with pytest.raises(ServiceError) as caught:
@@ -163,8 +163,8 @@ def test_the_same_to_be_awaited(live_stack: Live, found: Result, tmp_path: Path)
             assert (again.job, other.seed) == (found.job, 4715)
             events = [event async for event in client.watch(other)]
             assert events[-1].data["status"] == "successful"
-            path = await client.download(again, "transform.npy", tmp_path / "T.npy")
-            assert np.allclose(np.load(path), found.T_object_scene)
+            path = await client.download(again, "T_scene_object.npy", tmp_path / "T.npy")
+            assert np.allclose(np.load(path), found.T_scene_object)
             with pytest.raises(ServiceError, match="job"):
                 await client.job("nothing")
 

@@ -90,8 +90,8 @@ def test_the_usual_preset_over_the_wire_and_a_second_look_from_its_result(
     files = {entry["name"]: entry["url"] for entry in result["artifacts"]}
     assert {"scene_points.ply", "object_points.ply", "residuals.npz", "trace.json"} <= set(files)
     assert arrived(live_client, files["preview.png"]).content.startswith(b"\x89PNG\r\n\x1a\n")
-    matrix = np.load(BytesIO(live_client.get(files["transform.npy"]).content), allow_pickle=False)
-    np.testing.assert_array_equal(matrix, result["T_object_scene"]["matrix"])
+    matrix = np.load(BytesIO(live_client.get(files["T_scene_object.npy"]).content), allow_pickle=False)
+    np.testing.assert_array_equal(matrix, result["T_scene_object"]["matrix"])
     start = {"options": {}, "initial_transform": result["T_object_scene"]}
     second = finished(live_client, submit(live_client, demo_fields, **start).json()["id"])
     again = live_client.get(second["links"]["result"]).json()
@@ -115,7 +115,8 @@ def test_a_search_over_the_wire_finds_the_object_and_keeps_what_it_learned(
     assert (result["verdict"], result["object"]) == ("registered", demo_fields["object"])
     assert sorted(one["object"] for one in result["candidates"]) == sorted(names)
     first = result["candidates"][0]
-    assert (first["stage"], first["T_object_scene"]) == ("refined", result["T_object_scene"])
+    names = ("T_scene_object", "T_object_scene", "probability")
+    assert (first["stage"], *(first[name] for name in names)) == ("refined", *(result[name] for name in names))
     for name in names:
         field = live_client.get(f"/fields/{name}").json()
         validator("FieldDocument").validate(field)

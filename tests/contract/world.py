@@ -48,8 +48,11 @@ def transform(scale: float = 1.0) -> dict[str, Any]:
 RESULT = {
     "verdict": "registered",
     "verdict_reason": "SURFACES_AGREE",
-    "T_object_scene": transform(2.0),
+    "probability": 0.95,
     "T_scene_object": transform(0.5),
+    "T_object_scene": transform(2.0),
+    "center_scene": [0.0, 0.0, 0.0],
+    "center_object": [0.0, 0.0, 0.0],
     "alternatives": [],
     "metrics": {"residual_rms": 0.001},
     "seed": 0,

@@ -99,3 +99,22 @@ def test_blocks_are_of_known_languages_and_what_is_not_run_cannot_be() -> None:
 
 def test_there_are_blocks() -> None:
     assert {"tutorial.md", "batch.md", "verdicts.md", "units.md", "page.md"} <= {page.name for page in RUN}
+
+
+def test_the_tutorial_prints_what_is_printed(tmp_path: Path) -> None:
+    """The words as they are, the numbers rounded: they differ between machines in the last digits."""
+    page = (DOCS / "start" / "tutorial.md").read_text(encoding="utf-8")
+    (told,) = re.findall(r"```text\n(verdict .*?)```", page, flags=re.S)
+    data = ROOT / "examples" / "data"
+    fields = [str(data / name) for name in ("mix-room.safetensors", "armchair.safetensors")]
+    command = [sys.executable, "-m", "regnf_cli.main", "register", *fields, "--detection", str(data / "detection.json")]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, timeout=280, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    number = re.compile(r"-?\d+\.\d+")
+    printed = "\n".join(done.stdout.splitlines()[: len(told.splitlines())])
+    words_told, words_printed = (re.sub(r"\s+", " ", number.sub("#", text)).strip() for text in (told, printed))
+    assert words_printed == words_told
+    for shown, found in zip(number.findall(told), number.findall(printed), strict=True):
+        assert float(found) == pytest.approx(float(shown), rel=0.05, abs=2e-4)

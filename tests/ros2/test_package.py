@@ -39,7 +39,7 @@ def result(verdict: str = "registered", alternatives: tuple[Sim3, ...] = ()) -> 
         "T_object_scene": T_OBJECT_FIELD.to_dict(),
         "alternatives": [{"T_object_scene": one.to_dict()} for one in alternatives],
         "covariance": (1e-4 * np.eye(7)).tolist(),
-        "metrics": {"probability": 0.97},
+        "probability": 0.97,
     }
 
 

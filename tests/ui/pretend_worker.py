@@ -77,6 +77,7 @@ class PretendWorker:
             "object": job.inputs.get("object"),
             "T_object_scene": _transform(np.linalg.inv(scene_object)),
             "T_scene_object": _transform(scene_object),
+            "probability": 0.97,
             "metrics": {"probability": 0.97, "residual_rms": 0.002, "seconds": {"sampling": 0.5, "optimizing": 1.5}},
             "options": {"preset": "robust", "up_axis": "z", "robust": {"rotations": 600}},
             "seed": 0,

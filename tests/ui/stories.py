@@ -149,7 +149,7 @@ class Stage:
         if story == "bare":
             return {k: self.data.result[k] for k in ("verdict", "verdict_reason", "T_object_scene", "metrics")}
         if story == "numbers":
-            return self.data.result | {"artifacts": [{"name": "trace.json"}, {"name": "transform.npy"}]}
+            return self.data.result | {"artifacts": [{"name": "trace.json"}, {"name": "T_scene_object.npy"}]}
         if story == "roomy":
             return self.data.result | {"artifacts": [*self.data.result["artifacts"], {"name": "context_points.ply"}]}
         if story == "searched":

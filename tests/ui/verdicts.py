@@ -32,8 +32,8 @@ def ambiguous_result(data: Synthetic) -> dict[str, Any]:
         "covariance": covariance.tolist(),
         "covariance_ordering": ORDERING,
         "uncertainty": {
+            "center_scene": SIGMAS[3:6],
             "rotation_deg": [0.4, 0.8, 0.2],
-            "translation": SIGMAS[3:6],
             "scale_percent": 100 * SIGMAS[6],
         },
         "fields": {

@@ -45,10 +45,8 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class VerdictConstants:
-    """Of the verdict (verdict/criteria.py, verdict/evaluation.py). What is enough by itself is an option."""
+    """Of the verdict (verdict/criteria.py, verdict/evaluation.py). What is enough is an option."""
 
-    min_probability: float = 0.7
-    """Probability that a pose needs even where it keeps the limits of the shares. [random worlds]"""
     unexplained: float = 0.05
     """Share of unexplained surface near the object without noise, where it is known what was seen: what was measured is
     there. [early fits]"""

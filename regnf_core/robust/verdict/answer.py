@@ -21,9 +21,10 @@ class Answer:
     """The best of H candidates by the held-out samples, and its rivals, which explain these as well, best first.
 
     scores: (H,), 0..1, smaller is better · demerits: (H,), what candidates are compared by, smaller is better, see
-    :func:`regnf_core.robust.verdict.lead.merits` · probability: (H,), that the candidate is right, where all others
-    that place the object elsewhere compete with it · probability_listed: (H,), the same where the best one and those of
-    its rivals that place nearly the same surface do not compete with each other: of those, that one of them is right.
+    :func:`regnf_core.robust.verdict.lead.merits` · probability: (H,), that the candidate is right, where those that
+    place the object elsewhere compete with it, but the best one and those of its rivals that place nearly the same
+    surface do not compete with each other: of those, that one of them is right · probability_alone: (H,), the same
+    where these compete too: that this very pose is right.
     """
 
     winner: int
@@ -31,7 +32,7 @@ class Answer:
     scores: Tensor
     demerits: Tensor
     probability: Tensor
-    probability_listed: Tensor
+    probability_alone: Tensor
 
 
 def choose(
@@ -52,10 +53,10 @@ def choose(
     ranked = distinct(candidates.T, demerits, points, VERDICT.rivals_min_distance, len(candidates))
     rivals = [number for number in ranked.tolist() if number != winner and close[number]]
     elsewhere = apart(candidates.T, points, problem.model.symmetry)
-    likely = odds.log_odds(features, scores, elsewhere).sigmoid()
+    likely_alone = odds.log_odds(features, scores, elsewhere).sigmoid()
     alike = [number for number in rivals if _places_the_same(problem.model, candidates.T, number, winner)]
-    listed = odds.log_odds(features, scores, apart_from_answer(elsewhere, [winner, *alike])).sigmoid()
-    return Answer(winner, rivals, scores, demerits, likely, listed)
+    likely = odds.log_odds(features, scores, apart_from_answer(elsewhere, [winner, *alike])).sigmoid()
+    return Answer(winner, rivals, scores, demerits, likely, likely_alone)
 
 
 def _places_the_same(model: ObjectModel, T: Sim3, one: int, other: int) -> bool:

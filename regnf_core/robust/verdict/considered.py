@@ -6,7 +6,6 @@ Nothing is evaluated for it: the held-out samples tell it that the verdict rests
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from regnf_core.geometry.pose_distance import distinct
 from regnf_core.options import RobustOptions
@@ -16,7 +15,7 @@ from regnf_core.robust.problem import RegistrationProblem
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.verdict.answer import Answer
 from regnf_core.robust.verdict.criteria import evaluate_pose
-from regnf_core.robust.verdict.evidence import Evidence
+from regnf_core.robust.verdict.evidence import HeldOut
 
 _MOST = 6
 
@@ -24,27 +23,21 @@ _MOST = 6
 def considered_poses(
     problem: RegistrationProblem,
     candidates: PoseCandidates,
-    evidence: Evidence,
+    held_out: HeldOut,
     answer: Answer,
-    features: dict[str, Tensor],
     options: RobustOptions,
 ) -> Considered:
-    """The best of the candidates that differ, the likeliest first. features: (H,) of each."""
-    points = problem.model.extremal_points
+    """The best of the candidates that differ, the likeliest first."""
+    points, evidence = problem.model.extremal_points, held_out.evidence
     ranked = distinct(candidates.T, answer.demerits, points, VERDICT.rivals_min_distance, len(candidates))
     numbers = ranked[:_MOST].tolist()
     poses = []
     for number in numbers:
-        likely = float(answer.probability_listed[number])
-        of_pose = {name: float(one[number]) for name, one in features.items()}
-        found = evaluate_pose(evidence, number, 0, options, of_pose, likely)
-        if not bool(problem.bound.admits(candidates.T[torch.tensor([number])])[0]):
-            reason = "OUTSIDE_DETECTION"
-        else:
-            reason = found.reason
-        metrics = {**evidence.of(number), "probability": likely}
-        metrics["unexplained_share_scene"] = of_pose["unexplained"]
-        poses.append(ConsideredPose(problem.in_field_frames(candidates.T[number]), reason, metrics))
+        likely = float(answer.probability[number])
+        found = evaluate_pose(held_out, number, 0, options, likely)
+        metrics = {**held_out.of(number), "probability": likely}
+        T = problem.in_field_frames(candidates.T[number])
+        poses.append(ConsideredPose(T, found.reason, metrics, found.broken))
     chosen = torch.tensor(numbers)
     scene, obj = problem.held_out.scene_samples, problem.held_out.object_samples
     return Considered(

@@ -1,9 +1,11 @@
 """The verdict on a pose: whether it is probable enough, and where it is not, what is wrong with it in words.
 
-The probability (:mod:`.probability`) holds all the evidence together. It decides where it is high or low. Between, a
-pose has to keep the limits of three shares too, which are options: another object of the same kind, a chair in another
-chair's place, may be as probable, but little of its surface agrees, or much of it stands in free space. In addition
+The probability (:mod:`.probability`) holds all the evidence together. Below the option ``min_probability`` nothing is
+accepted. Below ``share_limits_below`` a pose has to keep the limits of three shares too, which are options: another
+object of the same kind, a chair in another chair's place, may be as probable, but little of its surface agrees, or much
+of it stands in free space. In addition
 
+- the object must stand within the detection, give or take;
 - little of the object may be left that was seen: of such poses the probability knows nothing;
 - the scene may have surface within the object's hull that belongs to another, similar object. It fits as well, so this
   is asked for by itself where it is known what was seen. Elsewhere a field may have invented that surface.
@@ -12,79 +14,96 @@ chair's place, may be as probable, but little of its surface agrees, or much of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from regnf_core.options import RobustOptions
 from regnf_core.result import Verdict
 from regnf_core.robust.constants import VERDICT
-from regnf_core.robust.verdict.evidence import Evidence
+from regnf_core.robust.verdict.evidence import Evidence, HeldOut
 
 
 @dataclass(frozen=True)
 class PoseVerdict:
-    """A verdict, its reason (a stable UPPER_SNAKE word), and by what share 0..1 the narrowest of its limits was kept;
-    negative where it was not, that is, where the pose is rejected."""
+    """A verdict and its reason (a stable UPPER_SNAKE word).
+
+    margin: by what share 0..1 the narrowest of its limits was kept; negative where it was not, that is, where the pose
+    is rejected · broken: the limit that was not kept, in words with both numbers; "" where the reason says it all.
+    """
 
     verdict: Verdict
     reason: str
     margin: float
+    broken: str = ""
 
 
 @dataclass(frozen=True)
 class _Limit:
-    """slack: by how much it is kept, negative where it is not."""
+    """A number of a pose and what it may be. name: in words · upper: whether the limit is the most that is allowed."""
 
     reason: str
-    slack: float
+    name: str
+    value: float
+    limit: float
+    upper: bool = False
 
     @property
-    def kept(self) -> bool:
-        """False for a slack that is not a number."""
-        return self.slack >= 0.0
+    def slack(self) -> float:
+        """By how much it is kept, negative where it is not; -1 for a number that is none."""
+        slack = self.limit - self.value if self.upper else self.value - self.limit
+        return -1.0 if math.isnan(slack) else slack
+
+    def __str__(self) -> str:
+        # As few digits as tell the two apart: 0.6996 is not "0.7, at least 0.7".
+        texts = ((f"{self.value:.{digits}g}", f"{self.limit:.{digits}g}") for digits in (3, 5, 17))
+        value, limit = next((pair for pair in texts if pair[0] != pair[1]), (str(self.value), str(self.limit)))
+        return f"{self.name} {value}, " + (
+            f"at most {limit} is allowed" if self.upper else f"at least {limit} is needed"
+        )
 
 
 def evaluate_pose(
-    evidence: Evidence,
-    index: int,
-    rivals: int,
-    options: RobustOptions,
-    features: Mapping[str, float],
-    probability: float,
+    held_out: HeldOut, index: int, rivals: int, options: RobustOptions, probability: float
 ) -> PoseVerdict:
-    """The verdict on pose number ``index`` of the evidence, which ``rivals`` other poses equal.
+    """The verdict on pose number ``index``, which ``rivals`` other poses equal.
 
-    features: of this pose, see :mod:`.pose_features` · probability: that the pose or one of its rivals is right, 0..1.
+    probability: that the pose or one of its rivals is right, 0..1.
     Written so that a number that is not finite can only lead to a rejection.
     """
+    evidence, features = held_out.evidence, {name: float(one[index]) for name, one in held_out.features.items()}
+    occluded = float(evidence.occluded[index])
     limits = [
-        _Limit("TOO_LITTLE_SURFACE", options.max_occluded_share - float(evidence.occluded[index])),
-        _Limit("TOO_LITTLE_SURFACE", VERDICT.max_hidden - features["hidden"]),
+        _Limit("TOO_LITTLE_SURFACE", "occluded share", occluded, options.max_occluded_share, upper=True),
+        _Limit("TOO_LITTLE_SURFACE", "hidden share", features["hidden"], VERDICT.max_hidden, upper=True),
         *_of_a_similar_object(evidence, index, features),
         *_of_the_shares(evidence, index, options, probability),
-        _Limit("LOW_PROBABILITY", probability - min(VERDICT.min_probability, options.min_probability)),
+        _Limit("LOW_PROBABILITY", "probability", probability, options.min_probability),
     ]
-    margin = min(-1.0 if math.isnan(one.slack) else one.slack for one in limits)
-    broken = next((one for one in limits if not one.kept), None)
+    margin = min(one.slack for one in limits)
+    if not bool(held_out.admitted[index]):
+        return PoseVerdict("rejected", "OUTSIDE_DETECTION", -1.0)
+    broken = next((one for one in limits if not one.slack >= 0.0), None)
     if broken is not None:
-        return PoseVerdict("rejected", broken.reason, margin)
+        return PoseVerdict("rejected", broken.reason, margin, str(broken))
     if rivals:
         return PoseVerdict("ambiguous", "SEVERAL_POSES_AGREE", margin)
     return PoseVerdict("registered", "SURFACES_AGREE", margin)
 
 
-def _of_a_similar_object(evidence: Evidence, index: int, features: Mapping[str, float]) -> Iterable[_Limit]:
+def _of_a_similar_object(evidence: Evidence, index: int, features: dict[str, float]) -> Iterable[_Limit]:
     if not (evidence.partial or features["hidden"] > VERDICT.mostly_hidden):
         return
     allowed = VERDICT.unexplained + VERDICT.unexplained_per_noise * float(evidence.residual_rms[index])
-    yield _Limit("SURFACE_UNEXPLAINED", allowed - features["unexplained"])
+    yield _Limit("SURFACE_UNEXPLAINED", "unexplained share", features["unexplained"], allowed, upper=True)
 
 
 def _of_the_shares(evidence: Evidence, index: int, options: RobustOptions, probability: float) -> Iterable[_Limit]:
     """None where the pose is probable enough without."""
-    if probability >= options.min_probability:
+    if options.share_limits_below < 1.0 and probability >= options.share_limits_below:
         return
-    yield _Limit("FREE_SPACE_VIOLATED", options.max_free_space_violations - float(evidence.violations[index]))
-    yield _Limit("LOW_OVERLAP", float(evidence.share_object[index]) - options.min_inlier_share)
-    yield _Limit("LOW_OVERLAP", float(evidence.share_scene[index]) - options.min_inlier_share)
-    yield _Limit("SCENE_UNEXPLAINED", float(evidence.share_explained[index]) - options.min_explained_share)
+    free, enough = float(evidence.violations[index]), options.min_inlier_share
+    yield _Limit("FREE_SPACE_VIOLATED", "share in free space", free, options.max_free_space_violations, upper=True)
+    yield _Limit("LOW_OVERLAP", "object inliers", float(evidence.share_object[index]), enough)
+    yield _Limit("LOW_OVERLAP", "scene inliers", float(evidence.share_scene[index]), enough)
+    explained = float(evidence.share_explained[index])
+    yield _Limit("SCENE_UNEXPLAINED", "explained share", explained, options.min_explained_share)

@@ -19,7 +19,7 @@ from regnf_core.robust.verdict.answer import Answer, choose
 from regnf_core.robust.verdict.considered import considered_poses
 from regnf_core.robust.verdict.covariance import covariance, in_object_units, with_common_errors, with_known_scale
 from regnf_core.robust.verdict.criteria import PoseVerdict, evaluate_pose
-from regnf_core.robust.verdict.evidence import gather_evidence
+from regnf_core.robust.verdict.evidence import HeldOut, gather_evidence
 from regnf_core.robust.verdict.pose_features import pose_features
 from regnf_core.robust.verdict.relation import relation
 
@@ -29,9 +29,10 @@ class Evaluation:
     """The best candidate by the held-out samples and what is known of it, on the CPU. winner: its number among the
     candidates."""
 
-    verdict: Verdict
-    reason: str
+    found: PoseVerdict
     candidates: PoseCandidates
+    held_out: HeldOut
+    """Of all candidates."""
     winner: int
     T: Sim3
     """T_object_scene, in the fields' own frames."""
@@ -43,9 +44,17 @@ class Evaluation:
     """What the best candidates of several objects are compared by, as those of one object are."""
 
     @property
+    def verdict(self) -> Verdict:
+        return self.found.verdict
+
+    @property
+    def reason(self) -> str:
+        return self.found.reason
+
+    @property
     def doubtful(self) -> bool:
         """Whether a further attempt is worth its time: it may find a better pose, or one that speaks against this."""
-        return self.verdict == "rejected" or self.metrics["probability_listed"] < VERDICT.doubtful
+        return self.verdict == "rejected" or self.metrics["probability"] < VERDICT.doubtful
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -54,39 +63,57 @@ class Evaluation:
 
 
 def evaluate_candidates(
-    problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions
+    problem: RegistrationProblem,
+    candidates: PoseCandidates,
+    options: RegistrationOptions,
+    known: HeldOut | None = None,
 ) -> Evaluation:
     """Choose the likeliest candidate by the held-out samples, and decide on its verdict. Needs surface offsets.
 
-    The residuals are taken on the problem's device; what follows from them is decided on the CPU.
+    known: what they told before of the first of the candidates. The fields are evaluated on the problem's device; what
+    follows is decided on the CPU.
     """
-    assert candidates.offsets is not None, "candidates refined on the fields have offsets"
-    evidence = gather_evidence(problem.held_out, candidates.T, candidates.offsets, options.robust).to("cpu")
-    features = {name: one.cpu() for name, one in pose_features(problem, candidates.T, candidates.offsets).items()}
-    problem.held_out.require_finite()
+    first = 0 if known is None else len(known.admitted)
+    asked = held_out_of(problem, candidates[first:], options)
+    held_out = asked if known is None else HeldOut.cat([known, asked])
     problem, candidates = problem.to("cpu"), candidates.to("cpu")
-    answer = choose(problem, candidates, features, evidence.scores, options.robust.rival_margin)
-    winner, listed = answer.winner, answer.probability_listed
-    of_winner, likely = {name: float(one[winner]) for name, one in features.items()}, float(listed[winner])
-    found = evaluate_pose(evidence, winner, len(answer.rivals), options.robust, of_winner, likely)
-    if not bool(problem.bound.admits(candidates.T[torch.tensor([winner])])[0]):
-        found = PoseVerdict("rejected", "OUTSIDE_DETECTION", min(found.margin, -1.0))
+    answer = choose(problem, candidates, held_out.features, held_out.evidence.scores, options.robust.rival_margin)
+    winner, likely = answer.winner, float(answer.probability[answer.winner])
+    found = evaluate_pose(held_out, winner, len(answer.rivals), options.robust, likely)
     T = problem.in_field_frames(candidates.T[winner])
-    alternatives = [] if found.verdict == "rejected" else _alternatives(problem, candidates, answer, T)
     metrics = {
-        **evidence.of(winner),
-        "probability": float(answer.probability[winner]),
-        "probability_listed": likely,
-        "unexplained_share_scene": of_winner["unexplained"],
+        **held_out.of(winner),
+        "probability": likely,
+        "probability_alone": float(answer.probability_alone[winner]),
         "verdict_margin": found.margin,
         "object_diameter": problem.model.frame.length,
         "occlusion_boundary_share_scene": problem.view.occlusion_boundary_share,
         "iterations": float(len(candidates.history)),
         "pose_candidates": float(len(candidates)),
     }
-    considered = considered_poses(problem, candidates, evidence, answer, features, options.robust)
-    demerit = float(answer.demerits[winner])
-    return Evaluation(found.verdict, found.reason, candidates, winner, T, metrics, alternatives, considered, demerit)
+    return Evaluation(
+        found,
+        candidates,
+        held_out,
+        winner,
+        T,
+        metrics,
+        alternatives=[] if found.verdict == "rejected" else _alternatives(problem, candidates, answer, T),
+        considered=considered_poses(problem, candidates, held_out, answer, options.robust),
+        demerit=float(answer.demerits[winner]),
+    )
+
+
+def held_out_of(problem: RegistrationProblem, candidates: PoseCandidates, options: RegistrationOptions) -> HeldOut:
+    """What the held-out samples tell of the candidates: the fields are evaluated once for all of it, where the problem
+    is. Raises InvalidInputError (FIELD_NOT_FINITE)."""
+    assert candidates.offsets is not None, "candidates refined on the fields have offsets"
+    T, offsets = candidates.T, candidates.offsets
+    r = residuals(problem.held_out, T, offsets)
+    evidence = gather_evidence(r, offsets, options.robust).to("cpu")
+    features = {name: one.cpu() for name, one in pose_features(problem, T, r, offsets).items()}
+    problem.held_out.require_finite()
+    return HeldOut(evidence, features, problem.bound.to("cpu").admits(T.on("cpu")))
 
 
 def _alternatives(

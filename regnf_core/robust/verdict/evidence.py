@@ -7,17 +7,17 @@ matter instead, the part may be occluded (fields are solid behind what was obser
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RobustOptions
 from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.refine.loss import disagreement
-from regnf_core.robust.residuals import Residuals, SurfacePair, residuals
+from regnf_core.robust.residuals import Residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,17 @@ class Evidence:
 
     def to(self, device: torch.device | str) -> Evidence:
         """The same on another device."""
-        values: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
-        values |= {name: one.to(device) for name, one in values.items() if isinstance(one, Tensor)}
-        return Evidence(**values)
+        return Evidence(**{name: one.to(device) for name, one in self._tensors().items()}, partial=self.partial)
+
+    @classmethod
+    def cat(cls, parts: Sequence[Evidence]) -> Evidence:
+        """The evidence on the poses of several batches, all on the same samples."""
+        rows = [one._tensors() for one in parts]
+        joined = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
+        return cls(**joined, partial=parts[0].partial)
+
+    def _tensors(self) -> dict[str, Any]:
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name != "partial"}
 
     def of(self, index: int) -> dict[str, float]:
         """The numbers of one pose, by the names that results carry."""
@@ -70,9 +78,34 @@ class Evidence:
         }
 
 
-def gather_evidence(held_out: SurfacePair, T: Sim3, offsets: Tensor, options: RobustOptions) -> Evidence:
-    """The evidence of held-out samples on all poses T (H,) between the working frames. offsets: (H,)."""
-    r = residuals(held_out, T, offsets)
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """What the held-out samples tell of H poses, on the CPU: all that a verdict is made of, asked of the fields once.
+
+    features: each (H,), by its name, see :mod:`.pose_features` · admitted: (H,) bool, which of the poses the detection
+    allows.
+    """
+
+    evidence: Evidence
+    features: dict[str, Tensor]
+    admitted: Tensor
+
+    @classmethod
+    def cat(cls, parts: Sequence[HeldOut]) -> HeldOut:
+        """Of several batches of poses, all on the same samples, one after the other."""
+        return cls(
+            Evidence.cat([one.evidence for one in parts]),
+            {name: torch.cat([one.features[name] for one in parts]) for name in parts[0].features},
+            torch.cat([one.admitted for one in parts]),
+        )
+
+    def of(self, index: int) -> dict[str, float]:
+        """The numbers of one pose, by the names that results carry."""
+        return {**self.evidence.of(index), "unexplained_share_scene": float(self.features["unexplained"][index])}
+
+
+def gather_evidence(r: Residuals, offsets: Tensor, options: RobustOptions) -> Evidence:
+    """The evidence of the residuals of held-out samples under H poses. offsets: (H,), as the residuals have them."""
     n, limit = r.scene_count, options.inlier_distance
     to_scene = r.object_to_scene
     inlier = (r.values.abs() <= limit) & (r.cosines >= EVIDENCE.min_inlier_cosine)

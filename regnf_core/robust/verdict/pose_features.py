@@ -14,7 +14,7 @@ from torch import Tensor
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import EVIDENCE
 from regnf_core.robust.problem import RegistrationProblem
-from regnf_core.robust.residuals import Residuals, residuals
+from regnf_core.robust.residuals import Residuals
 from regnf_core.robust.verdict.coverage import coverage
 from regnf_core.robust.verdict.unexplained_surface import unexplained_samples
 
@@ -56,12 +56,11 @@ class _Groups:
     confirmed: Tensor
 
 
-def pose_features(problem: RegistrationProblem, T: Sim3, offsets: Tensor) -> dict[str, Tensor]:
+def pose_features(problem: RegistrationProblem, T: Sim3, r: Residuals, offsets: Tensor) -> dict[str, Tensor]:
     """Each feature (H,) float64 of the poses T (H,) between the working frames, by name, where the problem is.
 
-    offsets: (H,) of the surfaces.
+    r: of the held-out samples under these poses · offsets: (H,) of the surfaces, as the residuals have them.
     """
-    r = residuals(problem.held_out, T, offsets)
     groups = _groups(r)
     found = _agreement(r, groups) | _conflict(problem, T, r, groups) | _normals(r, groups) | _spread(r, groups)
     found |= _coverage(problem, T, groups) | {"offset": offsets.abs()}

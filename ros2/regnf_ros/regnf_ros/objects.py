@@ -15,7 +15,7 @@ from regnf_ros.service import Request, Service
 class Found:
     """What is published of one box. poses: the best first, then those that agree as well.
 
-    box: that of the detection, in the map frame · probability: that the best pose is right.
+    box: that of the detection, in the map frame · probability: that one of the poses is right.
     """
 
     class_id: str
@@ -74,10 +74,7 @@ class Registrar:
         covariance = None if given is None else np.asarray(given, dtype=np.float64)
         best = self._pose(result, covariance)
         others = [self._pose(one, None) for one in result.get("alternatives", [])]
-        probability = result["metrics"].get("probability")
-        return Found(
-            class_id, [best, *others], box_in_map, 1.0 if probability is None else probability, result["verdict"]
-        )
+        return Found(class_id, [best, *others], box_in_map, result["probability"], result["verdict"])
 
     def _pose(self, said: dict[str, Any], covariance: Matrix | None) -> ObjectPose:
         matrix = np.asarray(said["T_object_scene"]["matrix"], dtype=np.float64)

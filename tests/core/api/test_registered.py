@@ -27,9 +27,13 @@ def test_a_result_says_what_it_is(found: regnf.Registered) -> None:
     assert isinstance(found, regnf.RegistrationResult)
     assert isinstance(found.scale, float)
     assert found.scale == pytest.approx(1.25, rel=0.01)
-    assert found.matrix.shape == (4, 4)
-    assert found.matrix.dtype == np.float64
-    assert np.array_equal(found.matrix, np.asarray(found.T_object_scene))
+    pose, back = np.asarray(found.T_scene_object), np.asarray(found.T_object_scene)
+    np.testing.assert_allclose(pose @ back, np.eye(4), atol=1e-12)
+    center = pose[:3, :3] @ found.center_object.numpy() + pose[:3, 3]
+    np.testing.assert_allclose(found.center_scene.numpy(), center, atol=1e-12)
+    assert found.uncertainty is not None
+    assert found.uncertainty == found.to_dict()["uncertainty"]
+    assert max(found.uncertainty["center_scene"]) < 0.005
     assert repr(found).startswith("<registered: SURFACES_AGREE, scale 1.2")
     assert len(repr(found)) < 100
 
@@ -38,7 +42,7 @@ def test_paths_and_open_fields_are_the_same(found: regnf.Registered) -> None:
     box = regnf.OrientedBox.from_dict(BOX)
     options = regnf.RegistrationOptions(up_axis="z")
     again = regnf.register(regnf.open_field(ROOM), regnf.open_field(CHAIR), box, options, seed=3)
-    assert np.array_equal(again.matrix, found.matrix)
+    assert np.array_equal(again.T_scene_object, found.T_scene_object)
     assert (found.object_name, again.object_name) == (str(CHAIR), None)
 
 
@@ -46,7 +50,7 @@ def test_save_writes_what_the_command_writes(found: regnf.Registered, tmp_path: 
     paths = found.save(tmp_path / "out")
     names = {path.name for path in paths}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
-    assert {"result.json", "preview.png", "aligned.ply", "transform.npy", "trace.json"} <= names
+    assert {"result.json", "preview.png", "aligned.ply", "T_scene_object.npy", "trace.json"} <= names
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert document["object"] == str(CHAIR)
     assert set(document["fields"]) == {"scene", "object"}

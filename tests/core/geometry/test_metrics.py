@@ -14,6 +14,7 @@ from regnf_core.geometry.metrics import (
     errors_against_truth,
     euler_rmse,
     mssd,
+    paper_errors,
     rotation_error,
     scale_error,
     translation_rmse,
@@ -106,15 +107,40 @@ def test_add_s_forgives_what_mssd_does_not() -> None:
 def test_all_errors_vanish_for_the_truth_and_have_the_promised_names() -> None:
     T = turn_z(0.3, 1.25, (0.1, 0.2, 0.3))
     errors = errors_against_truth(T, T, SQUARE)
-    assert {"rotation_error_rad", "translation_error_share", "scale_error_share", "mssd_share"} <= set(errors)
+    assert {"rotation_error_rad", "center_error_share", "scale_error_share", "mssd_share"} <= set(errors)
     assert all(value == pytest.approx(0.0, abs=1e-7) for value in errors.values())
 
 
 def test_shares_are_of_the_diameter() -> None:
     shifted = Sim3.from_translation(torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64))
     errors = errors_against_truth(shifted, Sim3.identity(), SQUARE)
-    assert errors["translation_error_share"] == pytest.approx(0.1 / math.sqrt(8))
+    assert errors["center_error_share"] == pytest.approx(0.1 / math.sqrt(8))
     assert errors["mssd_share"] == pytest.approx(0.1 / math.sqrt(8))
+
+
+@pytest.mark.parametrize("far", [0.0, 7.0, 60.0, 1000.0])
+def test_no_error_depends_on_where_the_scenes_origin_is(far: float) -> None:
+    """A pose that is off by a little, told by a scene whose origin lies elsewhere. The paper's translation error is
+    the counter-example."""
+    truth, step = turn_z(0.3, 1.25, (0.1, 0.2, 0.3)), torch.tensor([0.01, 0.0, 0.02, 0.01, 0.0, 0.0, 0.003]).double()
+    estimate = truth.perturb(step)
+    move = Sim3.from_translation(torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64) * far)
+    here, there = (
+        errors_against_truth(estimate, truth, SQUARE),
+        errors_against_truth(estimate @ move, truth @ move, SQUARE),
+    )
+    assert there == pytest.approx(here, rel=1e-6, abs=1e-7)
+    assert (paper_errors(estimate @ move, truth @ move)["translation_rmse"] > 0.06) == (far > 1.0)
+
+
+def test_the_centers_error_is_in_scene_units_and_over_the_symmetries() -> None:
+    truth = turn_z(0.0, 2.0, (0.4, 0.0, 0.0))
+    center = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)  # not on the axis
+    turned = turn_z(math.pi) @ truth
+    assert errors_against_truth(turned, truth, SQUARE, HALF_TURN, center)["center_error"] == pytest.approx(
+        0.0, abs=1e-9
+    )
+    assert errors_against_truth(turned, truth, SQUARE, None, center)["center_error"] == pytest.approx(2.0 / 2.0)
 
 
 @pytest.mark.parametrize(

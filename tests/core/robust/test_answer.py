@@ -41,21 +41,21 @@ def test_poses_that_place_nearly_the_same_do_not_compete_in_their_answer() -> No
     found = answer([0.0, 0.12, 0.6], [0.2, 0.21, 0.5])
     single = answer([0.0, 0.6], [0.2, 0.5])
     assert (found.winner, found.rivals) == (0, [1])
-    assert float(found.probability[0].logit()) < float(found.probability_listed[0].logit()) - 2.0
-    assert float(found.probability_listed[0]) == pytest.approx(float(single.probability[0])), "as if it were alone"
-    assert float(found.probability_listed[2]) == pytest.approx(float(found.probability[2])), "it is not listed"
+    assert float(found.probability_alone[0].logit()) < float(found.probability[0].logit()) - 2.0
+    assert float(found.probability[0]) == pytest.approx(float(single.probability_alone[0])), "as if it were alone"
+    assert float(found.probability[2]) == pytest.approx(float(found.probability_alone[2])), "it is not listed"
 
 
 def test_poses_that_place_other_surface_compete_though_both_are_listed() -> None:
     found = answer([0.0, 0.6], [0.2, 0.21])
     assert (found.winner, found.rivals) == (0, [1])
-    assert torch.equal(found.probability, found.probability_listed)
+    assert torch.equal(found.probability, found.probability_alone)
 
 
 def test_without_rivals_both_probabilities_are_the_same() -> None:
     found = answer([0.0, 0.03, 0.6], [0.2, 0.21, 0.5])
     assert found.rivals == []
-    assert torch.equal(found.probability, found.probability_listed)
+    assert torch.equal(found.probability, found.probability_alone)
 
 
 def test_what_fits_by_its_score_and_is_much_less_likely_is_no_rival() -> None:

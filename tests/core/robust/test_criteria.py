@@ -13,10 +13,10 @@ from torch import Tensor
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions, RobustOptions
-from regnf_core.robust.residuals import SurfacePair
+from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.samples import Samples
 from regnf_core.robust.verdict.criteria import PoseVerdict, evaluate_pose
-from regnf_core.robust.verdict.evidence import Evidence, gather_evidence
+from regnf_core.robust.verdict.evidence import Evidence, HeldOut, gather_evidence
 
 D = torch.float64
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -44,11 +44,15 @@ def evidence_of(scene_to_object: list[float], object_to_scene: list[float]) -> E
     scene, obj = Flat(torch.tensor(object_to_scene)), Flat(torch.tensor(scene_to_object))
     offset = torch.zeros(1, dtype=D)
     surfaces = SurfacePair(scene, obj, samples(len(scene_to_object)), samples(len(object_to_scene)))
-    return gather_evidence(surfaces, identity, offset, RobustOptions())
+    return gather_evidence(residuals(surfaces, identity, offset), offset, RobustOptions())
 
 
 ALIKE = evidence_of([0.0] * 10, [0.0] * 10)
-NOTHING_WRONG = {"hidden": 0.0, "unexplained": 0.0}
+
+
+def told(evidence: Evidence, hidden: float = 0.0, unexplained: float = 0.0, admitted: bool = True) -> HeldOut:
+    features = {"hidden": torch.tensor([hidden]).double(), "unexplained": torch.tensor([unexplained]).double()}
+    return HeldOut(evidence, features, torch.tensor([admitted]))
 
 
 def verdict_on(
@@ -59,8 +63,7 @@ def verdict_on(
     rivals: int = 0,
     **options: Any,
 ) -> PoseVerdict:
-    features = {"hidden": hidden, "unexplained": unexplained}
-    return evaluate_pose(evidence, 0, rivals, RobustOptions(**options), features, probability)
+    return evaluate_pose(told(evidence, hidden, unexplained), 0, rivals, RobustOptions(**options), probability)
 
 
 def test_coarse_agreement_by_hand() -> None:
@@ -78,22 +81,72 @@ FREE = evidence_of([0.0] * 10, [0.0] * 7 + [0.1] * 3)
 """Three tenths of the object are where the scene is free."""
 
 
-@pytest.mark.parametrize("enough", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("enough", [0.5, 0.9, 0.95])
 def test_from_the_probability_of_the_options_on_shares_do_not_count(enough: float) -> None:
-    found = verdict_on(FREE, probability=enough, min_probability=enough)
+    found = verdict_on(FREE, probability=enough, share_limits_below=enough, min_probability=0.5)
     assert (found.verdict, found.reason) == ("registered", "SURFACES_AGREE")
-    several = verdict_on(FREE, probability=enough, min_probability=enough, rivals=1)
+    several = verdict_on(FREE, probability=enough, share_limits_below=enough, min_probability=0.5, rivals=1)
     assert (several.verdict, several.reason) == ("ambiguous", "SEVERAL_POSES_AGREE")
-    assert verdict_on(FREE, probability=enough - 0.01, min_probability=enough).verdict == "rejected"
+    less = verdict_on(FREE, probability=enough - 0.01, share_limits_below=enough, min_probability=0.2)
+    assert (less.verdict, less.reason) == ("rejected", "FREE_SPACE_VIOLATED")
 
 
-def test_below_it_a_pose_has_to_keep_the_limits_and_be_likely_enough() -> None:
+def test_the_share_limits_may_count_always_or_never() -> None:
+    assert verdict_on(FREE, probability=1.0, share_limits_below=1.0).reason == "FREE_SPACE_VIOLATED"
+    assert verdict_on(FREE, probability=0.7, share_limits_below=0.0).reason == "SURFACES_AGREE"
+
+
+@given(
+    probability=st.floats(0.0, 1.0),
+    least=st.floats(0.0, 1.0),
+    below=st.floats(0.0, 1.0),
+    shares=st.floats(0.01, 1.0),
+    rivals=st.integers(0, 3),
+)
+def test_no_answer_below_the_minimum_is_accepted(
+    probability: float, least: float, below: float, shares: float, rivals: int
+) -> None:
+    """Whatever the other options say. And where nothing else is wrong, every answer from it on is."""
+    options: dict[str, Any] = {
+        "min_probability": least,
+        "share_limits_below": below,
+        "min_inlier_share": shares,
+        "max_free_space_violations": shares,
+    }
+    found = verdict_on(FREE, probability, rivals=rivals, **options)
+    assert found.verdict == "rejected" or probability >= least
+    sound = verdict_on(ALIKE, probability, rivals=rivals, **options)
+    assert (sound.verdict == "rejected") == (probability < least)
+    if probability < least:
+        assert sound.reason == "LOW_PROBABILITY"
+
+
+@pytest.mark.parametrize(
+    ("probability", "least", "said"),
+    [
+        (0.6411, 0.7, "probability 0.641, at least 0.7 is needed"),
+        (0.69996, 0.7, "probability 0.69996, at least 0.7 is needed"),  # and not "0.7, at least 0.7"
+    ],
+)
+def test_a_rejection_says_the_number_and_its_limit(probability: float, least: float, said: str) -> None:
+    assert verdict_on(probability=probability, min_probability=least).broken == said
+    assert verdict_on().broken == ""
+
+
+def test_a_pose_outside_of_the_detection_is_rejected_first() -> None:
+    found = evaluate_pose(told(FREE, admitted=False), 0, 0, RobustOptions(), 0.2)
+    assert (found.verdict, found.reason, found.margin) == ("rejected", "OUTSIDE_DETECTION", -1.0)
+
+
+def test_by_default_a_pose_below_nine_tenths_has_to_keep_the_share_limits() -> None:
     assert verdict_on(probability=0.7).verdict == "registered"
     assert verdict_on(probability=0.7).margin == 0.0
     less = verdict_on(probability=0.69)
     assert (less.verdict, less.reason) == ("rejected", "LOW_PROBABILITY")
     assert less.margin == pytest.approx(-0.01)
     assert verdict_on(FREE, probability=0.69).reason == "FREE_SPACE_VIOLATED"
+    assert verdict_on(FREE, probability=0.89).reason == "FREE_SPACE_VIOLATED"
+    assert verdict_on(FREE, probability=0.9).verdict == "registered"
 
 
 @pytest.mark.parametrize(("hidden", "verdict"), [(0.94, "registered"), (0.96, "rejected"), (float("nan"), "rejected")])
@@ -145,8 +198,8 @@ def test_the_limits_are_options(
     option: str, limit: float, kept: float, margin: float, reason: str, evidence: Evidence
 ) -> None:
     within, beyond = (RegistrationOptions.from_dict({"robust": {option: value}}).robust for value in (kept, limit))
-    assert evaluate_pose(evidence, 0, 0, within, NOTHING_WRONG, 0.8).verdict == "registered"
-    outcome = evaluate_pose(evidence, 0, 0, beyond, NOTHING_WRONG, 0.8)
+    assert evaluate_pose(told(evidence), 0, 0, within, 0.8).verdict == "registered"
+    outcome = evaluate_pose(told(evidence), 0, 0, beyond, 0.8)
     assert (outcome.verdict, outcome.reason) == ("rejected", reason)
     assert outcome.margin == pytest.approx(margin, abs=1e-6)
 

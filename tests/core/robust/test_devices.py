@@ -162,10 +162,11 @@ def test_evidence_and_features_stay_on_the_device(neural: RegistrationProblem, m
     problem = replace(neural, held_out=held_out, view=replace(neural.view, observation=scene))
     monkeypatch.setattr(features_module, "unexplained_samples", lambda pair, T, beyond: beyond)
     T = poses(5)
-    pose_features(problem, T, T.scale)
+    pose_features(problem, T, residuals(problem.held_out, T, T.scale), T.scale)
     with Border() as border:
-        evidence = gather_evidence(problem.held_out, T, T.scale, OPTIONS)
-        found = pose_features(problem, T, T.scale)
+        r = residuals(problem.held_out, T, T.scale)
+        evidence = gather_evidence(r, T.scale, OPTIONS)
+        found = pose_features(problem, T, r, T.scale)
     assert list(found) == list(SPEAKS_FOR)
     assert {one.device for one in found.values()} == {evidence.scores.device} == {ELSEWHERE}
     assert set(border.copies) <= {"torch.Tensor.new_tensor"}  # two quantiles, by their numbers

@@ -30,7 +30,7 @@ def problem() -> RegistrationProblem:
 
 
 def features_at(problem: RegistrationProblem, T: Sim3) -> dict[str, float]:
-    found = pose_features(problem, T[None], NO_OFFSET)
+    found = pose_features(problem, T[None], residuals(problem.held_out, T[None], NO_OFFSET), NO_OFFSET)
     assert list(found) == list(SPEAKS_FOR)
     return {name: float(values[0]) for name, values in found.items()}
 
@@ -74,7 +74,8 @@ def test_shares_by_a_slow_count(problem: RegistrationProblem) -> None:
 def test_an_offset_counts_either_way(problem: RegistrationProblem) -> None:
     T = truth(problem)[None]
     for offset in (-0.02, 0.02):
-        assert float(pose_features(problem, T, torch.tensor([offset], dtype=torch.float64))["offset"][0]) == 0.02
+        off = torch.tensor([offset], dtype=torch.float64)
+        assert float(pose_features(problem, T, residuals(problem.held_out, T, off), off)["offset"][0]) == 0.02
 
 
 def test_stiffness_by_finite_differences(problem: RegistrationProblem) -> None:

@@ -31,7 +31,7 @@ NAMES = [
     "context_points.ply",
     "preview.png",
     "trace.json",
-    "transform.npy",
+    "T_scene_object.npy",
     "result.json",
 ]
 
@@ -58,6 +58,9 @@ def test_the_document_is_json_and_says_everything(chair_run: ChairRun) -> None:
         "T_object_scene",
         "T_scene_object",
         "T_object_scene_initial",
+        "center_scene",
+        "center_object",
+        "probability",
         "alternatives",
         "covariance",
         "covariance_ordering",
@@ -88,6 +91,7 @@ def test_numbers_that_json_lacks_become_null(chair_run: ChairRun) -> None:
     document = result_document(odd)
     assert document["metrics"] == {"residual_rms": None}
     assert document["alternatives"][0]["relation"] == "180 degrees about z"
+    assert document["alternatives"][0]["T_scene_object"]["matrix"] == np.eye(4).tolist()
     assert len(document["covariance"]) == 7
     json.dumps(document, allow_nan=False)
 
@@ -98,7 +102,6 @@ def test_uncertainty_is_the_covariance_in_units_of_people(chair_run: ChairRun) -
     document = result_document(replace(chair_run.result, covariance=torch.tensor(variances).double().diag()))
     assert document["covariance_ordering"] == ["omega_x", "omega_y", "omega_z", "t_x", "t_y", "t_z", "log_s"]
     assert document["uncertainty"]["rotation_deg"] == pytest.approx([1.0, 2.0, 3.0])
-    assert document["uncertainty"]["translation"] == pytest.approx([0.25, 0.5, 0.0])
     assert document["uncertainty"]["scale_percent"] == pytest.approx(1.0)
 
 
@@ -106,22 +109,23 @@ def test_what_is_no_variance_has_no_deviation(chair_run: ChairRun) -> None:
     odd = torch.diag(torch.tensor([-1.0, math.nan, 1.0, math.inf, 1.0, 1.0, -1e-9]).double())
     document = json.loads(json.dumps(result_document(replace(chair_run.result, covariance=odd)), allow_nan=False))
     assert document["uncertainty"]["rotation_deg"][:2] == [None, None]
-    assert document["uncertainty"]["translation"] == [None, 1.0, 1.0]
+    assert document["uncertainty"]["center_scene"] == [None] * 3
     assert document["uncertainty"]["scale_percent"] is None
     assert document["covariance"][1][1] is None
 
 
 def test_a_ranking_is_told_with_what_is_unusable_last() -> None:
     ranking = [
-        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity()),
+        Candidate("chair", "refined", 0.02, "registered", "SURFACES_AGREE", Sim3.identity(), 0.9),
         Candidate("stool", "coarse", math.inf),
     ]
     chair, stool, air = json.loads(json.dumps(ranking_document(ranking, {"air": "NO_SURFACE_IN_OBJECT"})))
-    assert chair["T_object_scene"]["matrix"] == np.eye(4).tolist()
+    assert chair["T_object_scene"]["matrix"] == chair["T_scene_object"]["matrix"] == np.eye(4).tolist()
+    assert chair["probability"] == 0.9
     assert (chair["object"], chair["verdict"], chair["verdict_reason"]) == ("chair", "registered", "SURFACES_AGREE")
     assert stool == {
         "object": "stool", "stage": "coarse", "score": None, "verdict": None, "verdict_reason": None,
-        "T_object_scene": None,
+        "probability": None, "T_scene_object": None, "T_object_scene": None,
     }  # fmt: skip
     assert (air["object"], air["stage"], air["verdict_reason"]) == ("air", "unusable", "NO_SURFACE_IN_OBJECT")
     assert set(air) == set(stool)
@@ -154,7 +158,7 @@ def test_residuals_trace_and_transform_come_back(chair_run: ChairRun, folder: Pa
     with np.load(folder / "residuals.npz") as arrays:
         assert set(arrays) == {"scene_points", "scene_residuals", "object_points", "object_residuals"}
         assert arrays["scene_points"].shape == (len(arrays["scene_residuals"]), 3)
-    np.testing.assert_allclose(np.load(folder / "transform.npy"), result.T_object_scene.matrix().numpy())
+    np.testing.assert_allclose(np.load(folder / "T_scene_object.npy"), result.T_scene_object.matrix().numpy())
     trace = json.loads((folder / "trace.json").read_text())
     assert len(trace) == len(result.trace)
     assert np.array(trace[-1]["T_object_scene"]["matrix"]).shape == (4, 4)

@@ -83,7 +83,10 @@ class BatchResult(Outgoing):
     status: ResultStatus
     verdict: Verdict | None = None
     verdict_reason: str | None = None
+    probability: float | None = None
+    T_scene_object: TransformDocument | None = None
     T_object_scene: TransformDocument | None = None
+    center_scene: list[float] | None = None
     uncertainty: UncertaintyDocument | None = None
     alternatives: list[AlternativeDocument] = Field([])
     object: str | None = Field(None, description="Of a search, the likeliest object.")

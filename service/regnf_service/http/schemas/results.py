@@ -25,6 +25,7 @@ class TransformDocument(Outgoing):
 class AlternativeDocument(Outgoing):
     """Another pose that explains the data as well, such as a table's twin."""
 
+    T_scene_object: TransformDocument
     T_object_scene: TransformDocument
     score: float = Field(description="0..1, smaller is better; the result's own is the metric `score`.")
     relation: str = Field(description="How it differs from the result, such as `180 degrees about z`: object axes.")
@@ -33,6 +34,7 @@ class AlternativeDocument(Outgoing):
 class ConsideredDocument(Outgoing):
     """A pose that was refined and judged by itself. `considered.npz` has what each sample says of it."""
 
+    T_scene_object: TransformDocument
     T_object_scene: TransformDocument
     reason: str = Field(description="As of a verdict: SURFACES_AGREE, or what speaks against it.")
     detail: str = Field("", description="The same in words.")
@@ -40,10 +42,10 @@ class ConsideredDocument(Outgoing):
 
 
 class UncertaintyDocument(Outgoing):
-    """One standard deviation each, from the covariance's diagonal."""
+    """One standard deviation each, from the covariance. They do not depend on where the scene's origin is."""
 
+    center_scene: _Three = Field(description="Of `center_scene`, along the scene's x, y, z, scene units.")
     rotation_deg: _Three = Field(description="Degrees about the object frame's x, y, z.")
-    translation: _Three = Field(description="Of T_object_scene's translation, along x, y, z, object units.")
     scale_percent: float | None = Field(description="Of the scale.")
 
 
@@ -68,7 +70,9 @@ class CandidateDocument(Outgoing):
     score: float | None = Field(description="0..1, smaller is better; to be compared within one stage.")
     verdict: Verdict | None = Field(None, description="Of refined ones.")
     verdict_reason: str | None = Field(None, description="Of refined and unusable ones.")
-    T_object_scene: TransformDocument | None = Field(None, description="Of refined ones.")
+    probability: float | None = Field(None, description="Of refined ones, as the result's.")
+    T_scene_object: TransformDocument | None = Field(None, description="Of refined ones.")
+    T_object_scene: TransformDocument | None = Field(None, description="Its inverse.")
 
 
 class SettingsUsedDocument(Outgoing):
@@ -104,10 +108,24 @@ class ResultDocument(Outgoing):
 
     verdict: Verdict
     verdict_reason: str = Field(description="One stable word, e.g. SURFACES_AGREE.")
-    verdict_detail: str = Field("", description="The reason in words, for people.")
+    verdict_detail: str = Field(
+        "", description="The reason in words, for people, with the number and the limit that it does not keep."
+    )
     verdict_hint: str = Field("", description="What to do next, for people; empty for a registered result.")
-    T_object_scene: TransformDocument = Field(description="Scene coordinates to object coordinates.")
-    T_scene_object: TransformDocument = Field(description="Its inverse.")
+    probability: float | None = Field(
+        None,
+        description="0..1: that the pose, or one of the alternatives that place nearly the same surface, is right, "
+        "within 5 % of the object's diameter. No answer below `options.robust.min_probability` is accepted. "
+        "Null from the preset `paper`.",
+    )
+    T_scene_object: TransformDocument = Field(
+        description="The object's pose in the scene: object coordinates to scene coordinates."
+    )
+    T_object_scene: TransformDocument = Field(description="Its inverse: scene coordinates to object coordinates.")
+    center_scene: list[float] = Field(
+        [], description="Where the object's center is, scene frame: T_scene_object of `center_object`."
+    )
+    center_object: list[float] = Field([], description="The centroid of the object's surface, object frame.")
     T_object_scene_initial: TransformDocument | None = Field(None, description="Where the refinement began.")
     alternatives: list[AlternativeDocument] = Field(
         [], description="Every other pose that explains the data as well; empty unless `ambiguous`."
@@ -117,8 +135,11 @@ class ResultDocument(Outgoing):
     )
     covariance: Annotated[list[_Seven], Field(min_length=7, max_length=7)] | None = Field(
         None,
-        description="7x7 in the order of `covariance_ordering`: a left perturbation of T_object_scene, "
-        "s e^(log_s), exp(omega) R, t + dt; radians and object units. Null from the preset `paper`.",
+        description="7x7 in the order of `covariance_ordering`, in radians and object units. T_object_scene, "
+        "x -> s R x + t, becomes s exp(log_s), exp([omega]) R, t + dt, so turn and growth are about t, where the "
+        "scene's origin lies; it is not exp(xi) T_object_scene. The object's point c lies in the scene at "
+        "p = R^T (c - t) / s and moves by J (omega, dt, log_s) with J = R^T [[c - t]x, -I, -(c - t)] / s: its "
+        "covariance is J C J^T. docs/api.md has an example in numbers. Null from the preset `paper`.",
     )
     covariance_ordering: list[str] | None = Field(None, description="omega_x, omega_y, omega_z, t_x, t_y, t_z, log_s.")
     uncertainty: UncertaintyDocument | None = None

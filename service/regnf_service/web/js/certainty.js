@@ -10,9 +10,10 @@ const [FULL_DEGREES, FULL_SHARE, FULL_PERCENT] = [1, 0.01, 1]; // the share is o
 export function showCertainty(result) {
   const { uncertainty, covariance, covariance_ordering: ordering, symmetry } = result;
   if (uncertainty) {
+    const diameter = (result.metrics?.object_diameter ?? NaN) * (result.T_scene_object?.scale ?? NaN);
     byId('sigmas').replaceChildren(
+      ...group('The object’s center, along the scene’s axes', 'scene units', AXES, uncertainty.center_scene, FULL_SHARE * diameter),
       ...group('Rotation about the object’s axes', 'degrees', AXES, uncertainty.rotation_deg, FULL_DEGREES),
-      ...group('Translation', 'object units', AXES, uncertainty.translation, FULL_SHARE * (result.metrics?.object_diameter ?? NaN)),
       ...group('Scale', '%', [''], [uncertainty.scale_percent], FULL_PERCENT),
     );
   }

@@ -37,10 +37,11 @@ function row(name, cells) {
 function apart(results) {
   const [first, second] = results.map(({ T_scene_object: pose }) => readSim3(pose));
   if (!first || !second) return [];
+  const [from, to] = results.map(({ center_scene: center }) => center ?? []);
   const { quaternion, scale } = partsOf(second.clone().multiply(inverse(first)));
-  const origin = partsOf(second).position.distanceTo(partsOf(first).position);
+  const between = Math.hypot(...[0, 1, 2].map((i) => to[i] - from[i]));
   const turn = 2 * Math.acos(Math.min(Math.abs(quaternion.w), 1));
-  const text = `turned by ${fixed((turn * 180) / Math.PI, 2)}°, origins ${number(origin, 3)} apart, scale × ${number(scale, 4)}`;
+  const text = `turned by ${fixed((turn * 180) / Math.PI, 2)}°, centers ${number(between, 3)} apart, scale × ${number(scale, 4)}`;
   return [el('tr', {}, el('th', { scope: 'row' }, 'Second pose from the first'), el('td', { colSpan: 2 }, text))];
 }
 

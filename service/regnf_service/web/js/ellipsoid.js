@@ -9,13 +9,15 @@ const VISIBLE = 0.1; // of the object's diameter: the least length of the longes
 const [MERIDIANS, PARALLELS, STEPS] = [8, 7, 64];
 
 /**
- * The covariance of the place of a point, 3x3 in the object's frame and units. covariance: 7x7 of a left perturbation of
- * T_object_scene in the order (rotation, translation, log scale); point: in the object's frame. Seen in the scene, the point
- * moves by -(rotation x point + translation + log scale * point), to first order and in the object's frame. null where a
- * number is missing, as that of a rotation nothing tells.
+ * The covariance of the place of a point, 3x3 in the object's frame and units. covariance: 7x7 of T_object_scene, x -> s R x + t,
+ * in the order (rotation, translation, log scale): s exp(log scale), exp(rotation) R, t + translation. point: in the object's
+ * frame; shift: t. Seen in the scene, the point moves by -(rotation x arm + translation + log scale * arm) with
+ * arm = point - t, to first order and in the object's frame. null where a number is missing, as that of a rotation nothing
+ * tells.
  */
-export function covarianceOfPlace(covariance, [x, y, z]) {
+export function covarianceOfPlace(covariance, point, shift) {
   if (!covariance?.flat().every(Number.isFinite) || covariance.length !== 7) return null;
+  const [x, y, z] = point.map((value, i) => value - shift[i]);
   const jacobian = [[0, z, -y, 1, 0, 0, x], [-z, 0, x, 0, 1, 0, y], [y, -x, 0, 0, 0, 1, z]];
   const half = product(jacobian, covariance);
   return half.map((row) => jacobian.map((column) => dot(row, column)));
@@ -23,10 +25,10 @@ export function covarianceOfPlace(covariance, [x, y, z]) {
 
 /**
  * { object, factor }: the ellipsoid as lines in the object's frame, enlarged by factor, a power of ten, so that it can be
- * seen; or null where nothing is known. diameter: the object's.
+ * seen; or null where nothing is known. shift: of T_object_scene; diameter: the object's.
  */
-export function ellipsoidOf(covariance, center, diameter) {
-  const spread = covarianceOfPlace(covariance, center);
+export function ellipsoidOf(covariance, center, shift, diameter) {
+  const spread = covarianceOfPlace(covariance, center, shift);
   if (!spread || !(diameter > 0)) return null;
   const longest = Math.sqrt(QUANTILE * largestEigenvalue(spread));
   if (!(longest > 0)) return null;

@@ -6,8 +6,8 @@ import { bytes, fixed, moment, number, percent, seconds, words } from './format.
 import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
 
 const DIRECTIONS = {
+  T_scene_object: 'T_scene_object, the object’s pose in the scene: carries object coordinates to scene coordinates',
   T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
-  T_scene_object: 'T_scene_object: carries object coordinates to scene coordinates',
 };
 
 export function showVerdict(job, result) {
@@ -22,9 +22,10 @@ export function showVerdict(job, result) {
   const scale = readSim3(result.T_object_scene);
   const deviation = result.uncertainty?.scale_percent;
   const { waited, worked } = timesOf(job, metrics);
-  const { probability } = metrics;
+  const { probability } = result;
+  const meant = verdict === 'ambiguous' ? 'that one of the poses listed is right' : 'that the pose is right';
   fillFacts(byId('figures'), [
-    ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), 'that the pose is right')]] : []),
+    ...(Number.isFinite(probability) ? [['Probability', figure(percent(probability, 1), meant)]] : []),
     ['Residual RMS', figure(percent(metrics.residual_rms, 2), 'of the diameter')],
     ['Scale, object ← scene', figure(scale ? fixed(partsOf(scale).scale, 4) : '–',
       Number.isFinite(deviation) ? `± ${number(deviation, 2)} %` : '')],

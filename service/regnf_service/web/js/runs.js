@@ -64,7 +64,7 @@ export class Runs {
 
   showResult(row, id, job, result, object, took) {
     const tone = TONES[result.verdict] ?? 'wait';
-    const { probability } = result.metrics ?? {};
+    const { probability } = result;
     const facts = [
       Number.isFinite(probability) && `probability ${percent(probability, 1)}`,
       `scale ${result.T_object_scene.scale.toPrecision(4)}`,

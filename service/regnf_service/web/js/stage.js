@@ -141,12 +141,11 @@ export class Stage {
   }
 
   /** At the pose of the result, wherever the object is shown; hidden until it is asked for. */
-  addUncertainty({ covariance }) {
+  addUncertainty({ covariance, center_object: center, T_object_scene: pose }) {
     const { geometry } = this.plain.after;
     geometry.computeBoundingBox();
     const { min, max } = geometry.boundingBox;
-    const center = min.clone().lerp(max, 0.5).toArray();
-    const found = ellipsoidOf(covariance, center, min.distanceTo(max));
+    const found = center && ellipsoidOf(covariance, center, pose.translation, min.distanceTo(max));
     show(byId('uncertainty-chip'), Boolean(found));
     if (!found) return;
     const { object, factor } = found;

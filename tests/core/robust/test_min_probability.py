@@ -1,0 +1,87 @@
+"""The option ``min_probability`` on every way to an answer: none below it is accepted, and those from it on are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+import regnf
+from regnf_core import RegistrationOptions, RegistrationResult, WarmStart, register, register_batch
+from regnf_core.geometry.sim3 import Sim3
+from regnf_core.library import LibraryObject, model_object, search_library
+from regnf_core.viewing import result_document
+from tests.core.analytic import chair, chair_box, chair_pose, room, table
+from tests.core.robust.shapes import slab_table, table_room
+from tests.golden.cases import SLAB_BOX
+
+NEAR = Sim3.from_quaternion(1.02, [0.02, -0.03, 0.04, 1.0], [0.02, -0.01, 0.02]) @ chair_pose()
+Way = Callable[[RegistrationOptions], RegistrationResult]
+
+
+def registered(options: RegistrationOptions) -> RegistrationResult:
+    return register(room(chair_pose()), chair(), chair_box(chair_pose()), options, clouds=False)
+
+
+def started(options: RegistrationOptions) -> RegistrationResult:
+    start = WarmStart(NEAR)
+    return register(room(chair_pose()), chair(), chair_box(chair_pose()), options, warm_start=start, clouds=False)
+
+
+def ambiguous(options: RegistrationOptions) -> RegistrationResult:
+    return register(table_room(chair_pose(1.4)), slab_table(), SLAB_BOX, options, clouds=False)
+
+
+def in_batch(options: RegistrationOptions, memory: int | None) -> RegistrationResult:
+    """One pair after the other, or in lock step where the memory is given."""
+    values = options.to_dict()
+    values["robust"]["batch_memory"] = memory
+    box = chair_box(chair_pose())
+    found = register_batch(room(chair_pose()), [box], [chair()], options=RegistrationOptions.from_dict(values))
+    assert found[0].result is not None
+    return found[0].result
+
+
+def searched(options: RegistrationOptions) -> RegistrationResult:
+    shapes = {"table": table(), "chair": chair()}
+    library = [LibraryObject(name, partial(shapes.__getitem__, name), model_object(shapes[name])) for name in shapes]
+    found = search_library(room(chair_pose()), chair_box(chair_pose()), library, options)
+    first = found.ranking[0]
+    assert (first.name, first.verdict, first.probability) == ("chair", found.result.verdict, found.result.probability)
+    assert all(one.verdict == "rejected" for one in found.ranking[1:] if one.verdict)
+    return found.result
+
+
+WAYS: dict[str, Way] = {
+    "register": registered,
+    "from a start": started,
+    "ambiguous": ambiguous,
+    "batch": partial(in_batch, memory=None),
+    "fused batch": partial(in_batch, memory=2**26),
+    "search": searched,
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_above_its_probability_no_answer_is_accepted(way: str) -> None:
+    find = WAYS[way]
+    usual = find(RegistrationOptions())
+    assert usual.verdict == ("ambiguous" if way == "ambiguous" else "registered")
+    assert usual.probability is not None
+    assert 0.9 <= usual.probability < 1.0
+    least = (1.0 + usual.probability) / 2
+    found = find(RegistrationOptions.from_dict({"robust": {"min_probability": least}}))
+    assert found.probability is not None
+    assert found.probability < least
+    assert (found.verdict, found.verdict_reason) == ("rejected", "LOW_PROBABILITY")
+    document = result_document(found)
+    assert document["probability"] == document["metrics"]["probability"] == found.probability
+    assert "at least" in document["verdict_detail"]
+    assert document["considered"][0]["metrics"]["probability"] == found.probability
+
+
+def test_the_public_call_takes_it_too() -> None:
+    room_, box = room(chair_pose()), chair_box(chair_pose())
+    found = regnf.register(room_, chair(), box, {"robust": {"min_probability": 1.0}}, clouds=False)
+    assert found.verdict == "rejected"
