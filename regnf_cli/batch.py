@@ -11,7 +11,7 @@ import typer
 
 from regnf_cli.batch_file import FilePair, ResultsFile, read_pairs
 from regnf_cli.batch_here import failure, register_here
-from regnf_cli.console import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, out, phase_progress
+from regnf_cli.console import EXIT_NOT_REGISTERED, EXIT_REGISTERED, err, fail, out, phase_progress
 from regnf_cli.extras import require
 from regnf_cli.options import Server, Token, WorkerTimeout
 
@@ -33,6 +33,7 @@ Results = Annotated[
 Processes = Annotated[
     int | None, typer.Option("--jobs", min=1, help="Processes, of one thread each. By default one a core.")
 ]
+_REASONS_SHOWN, _LINES_SHOWN = 8, 5
 
 
 def batch(
@@ -67,9 +68,22 @@ def batch(
         ended = _at_service(sound, server, token, worker_timeout)
     if sound:
         _write(ended, results, len(sound))
+    _show_failures(results.failures(listed))
     counts = results.counts(listed)
     out.print(", ".join(f"{count} {name}" for name, count in sorted(counts.items())) or "no pairs", markup=False)
     raise typer.Exit(EXIT_NOT_REGISTERED if counts["failed"] else EXIT_REGISTERED)
+
+
+def _show_failures(failures: dict[str, list[dict[str, Any]]]) -> None:
+    """Each reason once, with the lines that have it: the first of them in full."""
+    for reason, told in list(failures.items())[:_REASONS_SHOWN]:
+        first = told[0]["error"]
+        lines = ", ".join(str(one["line"]) for one in told[:_LINES_SHOWN])
+        more = f" and {len(told) - _LINES_SHOWN} more" if len(told) > _LINES_SHOWN else ""
+        place = f"line {lines}" if len(told) == 1 else f"{len(told)} pairs, lines {lines}{more}; the first"
+        fail(reason, f"{place}: {first['detail']}", hint=first.get("hint"))
+    if len(failures) > _REASONS_SHOWN:
+        err.print(f"and {len(failures) - _REASONS_SHOWN} other reasons, in the results", markup=False)
 
 
 def _write(ended: Iterator[tuple[FilePair, dict[str, Any]]], results: ResultsFile, count: int) -> None:

@@ -4,25 +4,36 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from regnf_cli.request_files import is_json
 from regnf_core.detections import parse_detection
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.hints import suggestion
-from regnf_core.json_faults import json_fault
 from regnf_core.options import RegistrationOptions
+from regnf_core.texts import TextError, decode_text, json_value
 
 MEMBERS = ("key", "scene", "object", "candidates", "detection", "detection_index", "options", "seed")
 _MORE = ("initial_transform", "ground_truth", "pictures")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+_KNOWN = frozenset((*MEMBERS, *_MORE))
 _HINT = 'Write {"scene": FILE, "object": FILE, "detection": BOX or FILE} on each line.'
+_HEADER_HINT = "Name the columns in the first line: scene,object,detection and more of " + ", ".join(MEMBERS) + "."
+_JSON_LINES = frozenset({".jsonl", ".ndjson", ".json"})
+_DELIMITERS = ",;\t|"
+_SEPARATOR_TOLD = re.compile(r"sep=([,;\t|])", re.IGNORECASE)
+_WHOLE = re.compile(r"(\d{1,10})(?:[.,]0*)?")
+"""Also as a spreadsheet writes the whole numbers of a column that has empty cells."""
+_TRUTH = {"true": True, "wahr": True, "false": False, "falsch": False}
+"""As spreadsheets write them, a German one too."""
 
 
 @dataclass(frozen=True)
@@ -43,35 +54,95 @@ class FilePair:
 
 
 def read_pairs(path: Path) -> Iterator[FilePair]:
-    """The pairs of a JSON Lines file, or of a CSV file with the members' names in its first line."""
-    lines = _csv_lines(path) if path.suffix.lower() == ".csv" else _json_lines(path)
-    for number, given in lines:
+    """The pairs of a JSON Lines file, or of a CSV file with the members' names in its first line.
+
+    Raises InvalidInputError (TEXT_UNREADABLE, INVALID_REQUEST) for a file of which no line can be read.
+    """
+    try:
+        text = decode_text(path.read_bytes())
+    except TextError as error:
+        hint = "Save it as UTF-8."
+        raise InvalidInputError(f"{path} is {error}", reason="TEXT_UNREADABLE", hint=hint) from error
+    is_table = not (is_json(text) or path.suffix.lower() in _JSON_LINES)
+    for number, given in _csv_lines(path, text) if is_table else _json_lines(path, text):
         yield _pair(path.resolve().parent, number, given)
 
 
-def _csv_lines(path: Path) -> Iterator[tuple[int, Any]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(file)
+def _csv_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
+    """Each row with its line's number. Rows and columns that are wholly empty are passed over."""
+    head, _, rest = text.partition("\n")
+    told = _SEPARATOR_TOLD.fullmatch(head.strip())  # Excel's own first line
+    delimiter = told[1] if told else _delimiter(head)
+    rows = csv.reader(io.StringIO(rest if told else text), delimiter=delimiter, skipinitialspace=True)
+    skipped = 1 if told else 0
+    try:
+        names = [name.strip() for name in next((row for row in rows if any(row)), [])]
+        while names and not names[-1]:
+            names.pop()
+        _check_header(path, names, rows.line_num + skipped)
         for row in rows:
-            given: dict[str, Any] = {name: value for name, value in row.items() if value not in (None, "")}
-            for name in ("seed", "detection_index", "pictures"):
-                if re.fullmatch(r"0|[1-9]\d*|true|false", str(given.get(name, ""))):
-                    given[name] = json.loads(given[name])
-            yield rows.line_num, given
+            if any(cell.strip() for cell in row):
+                yield rows.line_num + skipped, _row(names, row)
+    except csv.Error as error:
+        message = f"{path}, line {rows.line_num + skipped}: no table: {error}"
+        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HEADER_HINT) from error
 
 
-def _json_lines(path: Path) -> Iterator[tuple[int, Any]]:
-    with path.open(encoding="utf-8", errors="surrogateescape") as file:
-        for number, text in enumerate(file, 1):
-            if not text.strip():
-                continue
+def _row(names: list[str], row: list[str]) -> dict[str, Any] | RegnfError:
+    """The members that a row says, or why it is none."""
+    cells = [cell.strip() for cell in row]
+    if any(cells[len(names) :]):
+        message = f"the row has {len(cells)} cells, the header {len(names)}"
+        hint = "Put a cell that holds the separator into double quotes."
+        return InvalidInputError(message, reason="INVALID_REQUEST", hint=hint)
+    try:
+        return {name: _cell(name, cell) for name, cell in zip(names, cells, strict=False) if cell}
+    except InvalidInputError as error:
+        return error
+
+
+def _delimiter(head: str) -> str:
+    """The one that makes most known names of the header."""
+
+    def known(delimiter: str) -> int:
+        names = next(csv.reader([head], delimiter=delimiter, skipinitialspace=True), [])
+        return len({name.strip() for name in names} & _KNOWN)
+
+    return max(_DELIMITERS, key=known)
+
+
+def _check_header(path: Path, names: list[str], line: int) -> None:
+    """Raises InvalidInputError (INVALID_REQUEST), once for all rows."""
+    try:
+        _check_names(names)
+        if len(set(names)) < len(names):
+            raise InvalidInputError("a name stands there twice", reason="INVALID_REQUEST", hint=_HEADER_HINT)
+    except InvalidInputError as error:
+        hint = error.hint if error.hint and error.hint != _HINT else _HEADER_HINT
+        raise InvalidInputError(f"{path}, line {line}, the header: {error}", reason=error.reason, hint=hint) from error
+
+
+def _cell(name: str, text: str) -> Any:
+    """The value that a cell stands for: a number, a truth value or JSON where the member is one."""
+    if name in ("seed", "detection_index") and (number := _WHOLE.fullmatch(text)):
+        return int(number[1])
+    if name == "pictures":
+        return _TRUTH.get(text.lower(), text)
+    if name in ("candidates", "initial_transform", "ground_truth") and is_json(text):
+        return json_value(text, f"{name}: ")
+    return text
+
+
+def _json_lines(path: Path, text: str) -> Iterator[tuple[int, Any]]:
+    if text.lstrip()[:1] == "[":
+        message = f"{path}: one list, expected an object on each line"
+        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HINT)
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.strip():
             try:
-                yield number, json.loads(text)
-            except json.JSONDecodeError as error:
-                message, hint = json_fault(error)
-                yield number, InvalidInputError(f"the line is {message}", reason="MALFORMED_JSON", hint=hint)
-            except (ValueError, RecursionError):
-                yield number, InvalidInputError("the line is no JSON", reason="MALFORMED_JSON", hint=_HINT)
+                yield number, json_value(line, "the line is ")
+            except InvalidInputError as error:
+                yield number, error
 
 
 def _pair(folder: Path, line: int, given: Any) -> FilePair:
@@ -91,19 +162,26 @@ def _pair(folder: Path, line: int, given: Any) -> FilePair:
 def _members(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise InvalidInputError("the line is no object", reason="INVALID_REQUEST", hint=_HINT)
-    known = (*MEMBERS, *_MORE)
-    unknown = next((name for name in given if name not in known), None)
-    if unknown is not None:
-        hint = suggestion(str(unknown), known) or _HINT
-        raise InvalidInputError(f"no member `{unknown}` is known", reason="INVALID_REQUEST", hint=hint)
-    missing = [name for name in ("scene", "detection") if name not in given]
-    if missing or ("object" in given) == ("candidates" in given):
-        what = f"`{missing[0]}`" if missing else "either `object` or `candidates`"
-        raise InvalidInputError(f"the line lacks {what}", reason="INVALID_REQUEST", hint=_HINT)
+    _check_names(given)
     return given
 
 
+def _check_names(given: Collection[str]) -> None:
+    """Raises InvalidInputError (INVALID_REQUEST) for members that are unknown, or too few."""
+    unknown = next((name for name in given if name not in _KNOWN), None)
+    if unknown is not None:
+        hint = suggestion(unknown, _KNOWN) or _HINT
+        raise InvalidInputError(f"no member `{unknown}` is known", reason="INVALID_REQUEST", hint=hint)
+    missing = [name for name in ("scene", "detection") if name not in given]
+    if missing or not {"object", "candidates"} & set(given):
+        what = f"`{missing[0]}`" if missing else "`object` or `candidates`"
+        raise InvalidInputError(f"{what} is missing", reason="INVALID_REQUEST", hint=_HINT)
+
+
 def _fields(folder: Path, given: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
+    if "candidates" in given and "object" in given:
+        message = "`object` and `candidates` are both given: one of them is taken"
+        raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HINT)
     several = given["candidates"] if "candidates" in given else [given["object"]]
     if not (isinstance(several, list) and several):
         raise InvalidInputError("`candidates` is no list of files", reason="INVALID_REQUEST", hint=_HINT)
@@ -135,15 +213,15 @@ def _request(folder: Path, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _value(folder: Path, given: Any) -> Any:
-    """A value, or that of the JSON file that it names."""
+    """A value, or that of the JSON or the JSON file that a text is."""
     if not isinstance(given, str):
         return given
+    if is_json(given):
+        return json_value(given)
     try:
-        return json.loads((folder / given).read_text(encoding="utf-8"))
+        return json_value((folder / given).read_bytes(), f"{given}: ")
     except OSError as error:
         raise InvalidInputError(f"{given}: {error.strerror}", reason="FILE_NOT_FOUND", hint=_HINT) from error
-    except ValueError as error:
-        raise InvalidInputError(f"{given}: no JSON", reason="MALFORMED_JSON", hint=_HINT) from error
 
 
 class ResultsFile:
@@ -164,6 +242,15 @@ class ResultsFile:
         self._last[pair.id] = line
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
+
+    def failures(self, pairs: list[FilePair]) -> dict[str, list[dict[str, Any]]]:
+        """The lines of those that failed in this run, by reason, the most frequent one first."""
+        found: dict[str, list[dict[str, Any]]] = {}
+        for pair in pairs:
+            told = self._last.get(pair.id, {})
+            if "error" in told:
+                found.setdefault(told["error"]["reason"], []).append({**told, "line": pair.line})
+        return dict(sorted(found.items(), key=lambda one: -len(one[1])))
 
     def counts(self, pairs: list[FilePair]) -> Counter[str]:
         """How these pairs have ended: by verdict, or failed."""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from regnf_cli.console import err
 from regnf_cli.paths import file
-from regnf_cli.request_files import read_object
-from regnf_core.errors import FieldFormatError, InvalidInputError
+from regnf_cli.request_files import is_json, read_object
+from regnf_core.errors import FieldFormatError
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
-from regnf_core.json_faults import json_fault
+from regnf_core.texts import json_value
 
 
 def description(text: str) -> dict[str, Any]:
@@ -22,25 +21,13 @@ def description(text: str) -> dict[str, Any]:
     """
     from regnf_core.importing.upload_description import UploadDescription
 
-    values = _inline(text) if text.lstrip().startswith("{") else read_object(file(text), "description")
+    values = json_value(text, "description: ") if is_json(text) else read_object(file(text), "description")
     try:
         UploadDescription.from_dict(values)
     except FieldFormatError as error:
         hint = "docs/import-gate.md lists every entry of a description."
         raise FieldFormatError(str(error), reason=error.reason, hint=error.hint or hint) from error
     return values
-
-
-def _inline(text: str) -> dict[str, Any]:
-    try:
-        values: dict[str, Any] = json.loads(text)
-    except json.JSONDecodeError as error:
-        message, hint = json_fault(error)
-    except (ValueError, RecursionError):
-        message, hint = "no JSON object", 'Write for example \'{"up_axis": "z"}\'.'
-    else:
-        return values
-    raise InvalidInputError(f"description: {message}", reason="MALFORMED_JSON", hint=hint)
 
 
 def choice_of(config: Path | None, no_config: bool) -> SettingsChoice:

@@ -17,9 +17,9 @@ from regnf_cli.paths import file, output_folder
 from regnf_cli.shelves import Shown, files_of, open_shelf
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_source import FieldSource
-from regnf_core.json_faults import json_fault
 from regnf_core.library_archive import open_archive, write_archive
 from regnf_core.library_entries import EntryNotes
+from regnf_core.texts import json_value
 
 app = typer.Typer(
     help="Keep objects by name, with tags: add, list, show, edit, remove, export, import.",
@@ -219,11 +219,7 @@ def _symmetry(text: str | None) -> Any:
     """What is said of it; None leaves the detected one."""
     if text in (None, _DETECTED):
         return None
-    try:
-        said = {"order": 1} if text == _NONE else json.loads(text)
-    except json.JSONDecodeError as error:
-        message, hint = json_fault(error)
-        raise InvalidInputError(f"symmetry: {message}", reason="MALFORMED_JSON", hint=hint) from error
+    said = {"order": 1} if text == _NONE else json_value(text, "symmetry: ")
     return {"axis": None, "continuous": False} | said if isinstance(said, dict) else said
 
 

@@ -63,4 +63,13 @@ WorkerTimeout = Annotated[
 CancelOnInterrupt = Annotated[
     bool, typer.Option("--cancel-on-interrupt", help="With --server: Ctrl+C cancels the job; it goes on otherwise.")
 ]
-Token = Annotated[str | None, typer.Option(envvar="REGNF_API_TOKEN", help="The service's bearer token.")]
+Token = Annotated[
+    str | None,
+    typer.Option(
+        envvar="REGNF_API_TOKEN",
+        help="The service's bearer token.",
+        # `$(cat FILE)` keeps the mark and the carriage return of a file that Windows wrote
+        parser=lambda text: text.strip("\ufeff \t\r\n"),
+        metavar="TOKEN",
+    ),
+]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import numpy as np
 from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
 from regnf_core.geometry.similarity_check import similarity_fault
-from regnf_core.json_faults import json_fault
 from regnf_core.options import Preset, RegistrationOptions
+from regnf_core.texts import json_value
 
 Rows = list[list[float]]
 _TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates;'
@@ -22,7 +21,7 @@ _TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordina
 def read_detection(path: Path, index: int | None = None) -> Detection:
     """The detection in a file, in any form. Raises InvalidInputError (MALFORMED_JSON) and InvalidDetectionError."""
     try:
-        return parse_detection(_read_json(path, "detection"), index)
+        return parse_detection(read_json(path, "detection"), index)
     except InvalidDetectionError as error:
         message = f"{path}: {error}"
         raise InvalidDetectionError(message, reason=error.reason, hint=error.hint, place=error.place) from error
@@ -30,7 +29,7 @@ def read_detection(path: Path, index: int | None = None) -> Detection:
 
 def read_object(path: Path, what: str) -> dict[str, Any]:
     """A JSON object from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
-    value = _read_json(path, what)
+    value = read_json(path, what)
     if not isinstance(value, dict):
         hint = "Write an object: {...}."
         raise InvalidInputError(f"{what} {path}: expected a JSON object", reason="MALFORMED_JSON", hint=hint)
@@ -39,7 +38,7 @@ def read_object(path: Path, what: str) -> dict[str, Any]:
 
 def read_list(path: Path, what: str) -> list[Any]:
     """A JSON list from a file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold."""
-    value = _read_json(path, what)
+    value = read_json(path, what)
     if not isinstance(value, list):
         raise InvalidInputError(f"{what} {path}: expected a JSON list", reason="MALFORMED_JSON", hint="Write [...].")
     return value
@@ -70,7 +69,7 @@ def read_transform(path: Path, what: str) -> Rows:
 
     Raises InvalidInputError (INVALID_TRANSFORM) when there is none, or it is no similarity.
     """
-    value = _read_json(path, what)
+    value = read_json(path, what)
     inverse = isinstance(value, dict) and "T_object_scene" not in value and "T_scene_object" in value
     if isinstance(value, dict):
         value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
@@ -82,15 +81,11 @@ def read_transform(path: Path, what: str) -> Rows:
     return np.linalg.inv(plain).tolist() if inverse else plain
 
 
-def _read_json(path: Path, what: str) -> Any:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        message, hint = json_fault(error)
-    except UnicodeDecodeError:
-        message, hint = "no text in UTF-8", "Is it a field or a picture? A JSON file is expected here."
-    except RecursionError:
-        message, hint = "its lists nest too deeply", "A box has two levels of lists at most."
-    except ValueError:
-        message, hint = "a number of too many digits", "Write fewer digits."
-    raise InvalidInputError(f"{what} {path}: {message}", reason="MALFORMED_JSON", hint=hint)
+def is_json(text: str) -> bool:
+    """Whether a text that stands where a file may be named is the JSON itself."""
+    return text.lstrip().lstrip("\ufeff")[:1] in ("{", "[")
+
+
+def read_json(path: Path, what: str) -> Any:
+    """The value in a JSON file. Raises InvalidInputError (MALFORMED_JSON) naming what the file was to hold, OSError."""
+    return json_value(path.read_bytes(), f"{what} {path}: ")

@@ -15,6 +15,8 @@ from regnf_client.worker_watch import WorkerWatch
 
 ADDRESS = "http://127.0.0.1:8080"
 WORKER_TIMEOUT_S = 60.0
+_AROUND = "\ufeff \t\r\n"
+"""What a shell keeps of a file that Windows wrote."""
 _TIMEOUT = httpx.Timeout(60.0, connect=5.0)
 
 
@@ -31,7 +33,7 @@ class Connection:
         """Of httpx's clients. Raises InvalidInputError (INVALID_ADDRESS, INVALID_TOKEN)."""
         checked_address(self.address)
         token = self.token if self.token is not None else os.environ.get("REGNF_API_TOKEN")
-        headers = {"Authorization": f"Bearer {checked_token(token)}"} if token else {}
+        headers = {"Authorization": f"Bearer {checked_token(token.strip(_AROUND))}"} if token else {}
         return {"base_url": self.address.rstrip("/"), "headers": headers, "timeout": _TIMEOUT}
 
     def asking(self, report: Report | None = None, timeout_s: float | None = None) -> Asking:

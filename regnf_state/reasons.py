@@ -26,7 +26,7 @@ REASONS: dict[str, Reason] = {
         503, "Too many connections", "The service, or your address, has the maximum number of connections. Close some."
     ),
     "MALFORMED_JSON": Reason(
-        400, "Malformed JSON", "The body is not one JSON value in UTF-8, names a member twice, or nests too deeply."
+        400, "Malformed JSON", "The body is not one JSON value, names a member twice, or nests too deeply."
     ),
     "INVALID_QUERY": Reason(
         400,

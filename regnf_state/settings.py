@@ -7,9 +7,9 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 MIB = 1024 * 1024
@@ -182,6 +182,14 @@ class Settings(BaseSettings):
     metrics_port: int | None = Field(default=None, ge=0, le=65535)
     """Where Prometheus finds `/metrics`, a port of its own without tokens; unset: nowhere."""
     log_format: Literal["text", "json"] = "text"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bare(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """Without what a file of variables adds that Windows wrote: carriage returns and byte order marks."""
+        return {
+            name: value.strip("\ufeff \t\r\n") if isinstance(value, str) else value for name, value in given.items()
+        }
 
     @property
     def needs_token(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from urllib.parse import quote, urlsplit, urlunsplit
 
+from regnf_core.texts import TextError, decode_text
 from regnf_state.settings import Settings
 
 
@@ -31,9 +32,11 @@ def redis_address(settings: Settings) -> str:
 
 def _password(file: Path) -> str:
     try:
-        password = file.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RedisPasswordError(f"the file {file} cannot be read: {type(error).__name__}") from error
+        password = decode_text(file.read_bytes()).strip()
+    except OSError as error:
+        raise RedisPasswordError(f"the file {file} cannot be read: {error.strerror}") from error
+    except TextError as error:
+        raise RedisPasswordError(f"the file {file} is {error}") from error
     if not password:
         raise RedisPasswordError(f"the file {file} is empty")
     return password

@@ -7,6 +7,7 @@ import hmac
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from regnf_core.texts import TextError, decode_text
 from regnf_state.ownership import ANONYMOUS, CALLER_NAME
 
 Callers = Mapping[bytes, str]
@@ -34,9 +35,11 @@ def read_callers(entries: Iterable[str], file: Path | None) -> Callers:
 def read_lines(file: Path) -> list[str]:
     """The entries of a file: one a line; empty lines and those that begin with # are left out. Raises TokensError."""
     try:
-        lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise TokensError(f"the file {file} cannot be read: {type(error).__name__}") from error
+        lines = [line.strip() for line in decode_text(file.read_bytes()).splitlines()]
+    except OSError as error:
+        raise TokensError(f"the file {file} cannot be read: {error.strerror}") from error
+    except TextError as error:
+        raise TokensError(f"the file {file} is {error}") from error
     return [line for line in lines if line and not line.startswith("#")]
 
 

@@ -100,7 +100,11 @@ def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pyt
 
     def pretend(one: FilePair) -> dict[str, Any]:
         done.append(one.line)
-        return {"status": "failed", "error": {"reason": "X"}} if one.key == "bad" else {"status": "successful"}
+        return (
+            {"status": "failed", "error": {"reason": "X", "detail": "x"}}
+            if one.key == "bad"
+            else {"status": "successful"}
+        )
 
     monkeypatch.setattr(batch_here, "register_pair", pretend)
     path = write(folder, [pair(seed=1), pair(seed=2, key="bad")])

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from redis import Redis
 
 from regnf_service.jobs.identity import job_id_of
@@ -323,3 +324,12 @@ def test_a_one_shot_dry_run_keeps_nothing(world: World) -> None:
     files = one_shot(field_bytes("one"), field_bytes("two"), {"detection": BOX})
     assert world.client.post("/register?dry_run=true", files=files).json()["valid"] is True
     assert world.blobs.blobs == {}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32", "cp1252"])
+def test_a_request_as_another_editor_saves_it(world: World, encoding: str) -> None:
+    request = world.valid_request()
+    plain = world.client.post("/register", json=request)
+    text = json.dumps(request, indent=1).replace("\n", "\r\n")
+    answer = world.client.post("/register", content=text.encode(encoding), headers={"Content-Type": "application/json"})
+    assert (plain.status_code, answer.json()["id"]) == (202, plain.json()["id"])

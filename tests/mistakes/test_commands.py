@@ -27,7 +27,7 @@ CASES = [
     Case("JSON for a file", "FILE_NOT_FOUND", 2, r'\{"min"', "no such file", "write the JSON into a file", [*REGISTER[:4], '{"min": [0, 0, 0]}']),
     Case("detection missing", "FILE_NOT_FOUND", 2, "bx.json", "no such file", "Did you mean box.json", [*REGISTER[:4], "bx.json"]),
     Case("detection a folder", "FILE_IS_FOLDER", 2, "nothing", "expected a file", "Give a file", [*REGISTER[:4], "nothing"]),
-    Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON file is expected", [*REGISTER[:4], "chair.safetensors"]),
+    Case("detection a field", "MALFORMED_JSON", 2, "chair.safetensors", "text in UTF-8", "JSON is expected", [*REGISTER[:4], "chair.safetensors"]),
     Case("output a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json"]),
     Case("output below a file", "FILE_IS_NO_FOLDER", 2, "box.json", "expected a folder", "another folder", [*REGISTER, "--output", "box.json/out"]),
     Case("truth without a transform", "INVALID_TRANSFORM", 2, "box.json", "T_object_scene", "Write", [*REGISTER, "--truth", "box.json"]),

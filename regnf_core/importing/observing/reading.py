@@ -21,6 +21,7 @@ from regnf_core.importing.observing.trajectory_json import is_trajectory, read_t
 from regnf_core.importing.observing.trajectory_text import read_matrices, read_tum
 from regnf_core.importing.settings.json_reader import read_json
 from regnf_core.importing.settings.keys import Keys
+from regnf_core.importing.settings.plain import looks_like_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -62,7 +63,7 @@ def _read(files: Sequence[SettingsFile], said: CamerasDescription) -> Trajectory
         name = PurePosixPath(file.name).name
         if name.lower().endswith(".npz"):
             return _of_arrays(name, ArraySource(file.data, _ARRAY_BYTES), said)
-        if bytes(file.data[:64]).lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"{":
+        if looks_like_json(file.data):
             keys = Keys(name, read_json(name, file.data))
             if is_trajectory(keys):
                 return read_trajectory_json(keys, _said(said), said.axes)

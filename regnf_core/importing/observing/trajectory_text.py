@@ -9,12 +9,13 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from regnf_core.importing.observing.trajectory import MOST_CAMERAS, Array, malformed
-from regnf_core.importing.settings.plain import MAX_NUMBER_CHARACTERS
+from regnf_core.importing.settings.plain import MAX_NUMBER_CHARACTERS, decoded
 
 MOST_BYTES = 8 << 20
 _TUM = 8
 _NUMBERS = re.compile(r"[0-9]+")
 _SEPARATORS = re.compile(r"[\s,;]+")
+_CELLS = re.compile(r"[;\t]")
 
 
 def read_tum(name: str, data: bytes | memoryview) -> Array | None:
@@ -59,14 +60,17 @@ def read_matrices(files: Sequence[tuple[str, bytes | memoryview]]) -> tuple[Arra
 
 def _rows(name: str, data: bytes | memoryview) -> list[list[float]]:
     """The lines' numbers; NaN and infinity are such, as trackers write them for a camera that they have lost."""
-    if len(data) > MOST_BYTES:
-        raise malformed(f"{name} has more than {MOST_BYTES} bytes")
-    try:
-        lines = bytes(data).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise malformed(f"{name} is not UTF-8") from error
-    words = (_SEPARATORS.split(line.strip()) for line in lines if line.strip() and not line.lstrip().startswith("#"))
+    lines = (line.strip() for line in decoded(name, data, MOST_BYTES).splitlines())
+    words = (_words(line) for line in lines if line and not line.startswith("#"))
     return [[_number(name, word) for word in line] for line in words]
+
+
+def _words(line: str) -> list[str]:
+    """A line's numbers. A spreadsheet that writes decimal commas parts them by semicolons or tabs."""
+    cells = _CELLS.split(line)
+    if len(cells) > 1 and "." not in line and all(cell.count(",") <= 1 for cell in cells):
+        line = line.replace(",", ".")
+    return [word for word in _SEPARATORS.split(line) if word]
 
 
 def _number(name: str, word: str) -> float:

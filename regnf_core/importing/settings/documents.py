@@ -13,6 +13,7 @@ from regnf_core.importing.run.opened import SettingsFile
 from regnf_core.importing.settings.hocon_reader import read_hocon
 from regnf_core.importing.settings.json_reader import read_json
 from regnf_core.importing.settings.keys import Keys
+from regnf_core.importing.settings.plain import looks_like_json
 from regnf_core.importing.settings.yaml_reader import read_yaml
 
 _YAML, _HOCON, _JSON, _ARRAYS, _TENSORS = (".yml", ".yaml"), (".conf", ".hocon"), (".json",), (".npz",), (".pth", ".pt")
@@ -53,7 +54,7 @@ def _tree(name: str, end: str, data: memoryview) -> Any:
     """By the name's end; of a name without a known one, by the first bytes."""
     if end in _HOCON:
         return read_hocon(name, data)
-    if end in _JSON or (end not in _YAML and bytes(data[:64]).lstrip()[:1] == b"{"):
+    if end in _JSON or (end not in _YAML and looks_like_json(data)):
         return read_json(name, data)
     return read_yaml(name, data)
 

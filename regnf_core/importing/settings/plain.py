@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.texts import TextError, decode_text
 
 MAX_DEPTH = 48
 MAX_NODES = 60_000
@@ -41,9 +42,14 @@ def decoded(name: str, data: bytes | memoryview, most: int) -> str:
     if len(data) > most:
         raise too_large(f"{name} has {len(data)} bytes; at most {most} are read")
     try:
-        return bytes(data).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise malformed(f"{name} is not UTF-8") from error
+        return decode_text(data)
+    except TextError as error:
+        raise malformed(f"{name} is {error}") from error
+
+
+def looks_like_json(data: bytes | memoryview) -> bool:
+    """Whether a text begins with a brace, in whatever encoding."""
+    return bytes(data[:64]).strip(b"\xef\xbb\xbf\xfe\xff\0 \t\r\n")[:1] == b"{"
 
 
 def plain(value: Any) -> Any:

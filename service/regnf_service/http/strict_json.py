@@ -1,12 +1,14 @@
-"""JSON as RFC 8259 has it and no laxer: UTF-8, each member once, no wild nesting."""
+"""JSON of a request: each member once, no wild nesting. Its encoding is told as that of files is: a person may have
+written the body with any editor.
+"""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
-from regnf_core.json_faults import json_fault
+from regnf_core.errors import InvalidInputError
+from regnf_core.texts import json_value
 from regnf_service.http.json_size import MOST_MEMBERS, MOST_VALUES, count_values
 from regnf_service.problem import Problem
 
@@ -24,14 +26,9 @@ def parse_json(body: bytes, most_values: int = MOST_VALUES) -> Any:
     if count_values(body) > most_values:
         raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {most_values} members and values is taken.")
     try:
-        value = json.loads(body.decode("utf-8"), object_pairs_hook=_object, parse_float=_number)
-    except UnicodeDecodeError as error:
-        raise Problem("MALFORMED_JSON", "The body is not UTF-8.") from error
-    except json.JSONDecodeError as error:
-        message, hint = json_fault(error)
-        raise Problem("MALFORMED_JSON", f"The body is {message}.", hint=hint) from error
-    except (RecursionError, ValueError) as error:
-        raise Problem("MALFORMED_JSON", "Too deep, or a number of too many digits.") from error
+        value = json_value(body, "The body is ", object_pairs_hook=_object, parse_float=_number)
+    except InvalidInputError as error:
+        raise Problem("MALFORMED_JSON", f"{error}.", hint=error.hint) from error
     _check_depth(value)
     return value
 

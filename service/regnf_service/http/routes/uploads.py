@@ -225,7 +225,7 @@ async def _receive_parts(
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
         return await upload.finish(), Beside(description, settings, cameras)
-    named = parts["upload"].decode("latin-1")
+    named = parts["upload"].decode("utf-8-sig", "replace").strip()
     if not is_sha256(named):
         raise Problem("INVALID_DIGEST")
     return named, Beside(description, settings, cameras)
