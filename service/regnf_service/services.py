@@ -6,7 +6,6 @@ import asyncio
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from anyio import CapacityLimiter
 from redis import Redis
 
 from regnf_service.bytes_under_way import UnderWay
@@ -26,9 +25,6 @@ from regnf_state.redis.batch_index import BatchIndex
 from regnf_state.room import Room
 from regnf_state.settings import Settings
 
-_UPLOAD_THREADS = 4
-_LOOK_THREADS = 2
-
 
 @dataclass(frozen=True)
 class Services:
@@ -46,10 +42,6 @@ class Services:
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     batch_posted: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
-    # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
-    upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
-    parse_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
-    look_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_LOOK_THREADS))
 
     @cached_property
     def quota(self) -> Quota:

@@ -7,14 +7,13 @@ from collections.abc import AsyncIterator, Iterator
 from itertools import islice
 from typing import Annotated
 
-from anyio import to_thread
 from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from regnf_service.batches.cancelling import cancel, go_on
 from regnf_service.batches.lookup import Found, find_batch
-from regnf_service.concurrency import blocking, in_thread
+from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Intake
 from regnf_service.http.batch_lines import lines_of
@@ -97,7 +96,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
     async for lines in lines_of(chunks):
         left = iter(lines)
         while few := list(islice(left, _LINES_AT_ONCE)):
-            await to_thread.run_sync(intake.take, few, limiter=services.parse_limiter)
+            await PARSING.run(intake.take, few)
     return intake.finish(await in_thread(services.records.now))
 
 
