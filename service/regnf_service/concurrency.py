@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -17,24 +18,95 @@ from anyio.lowlevel import RunVar
 from regnf_service.problem import CLOSE, RETRY_LATER, Problem
 
 _LOOK_EVERY_S = 0.02
-_STORE_THREADS = 40
-_threads: RunVar[CapacityLimiter] = RunVar("store_threads")
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
+whose: ContextVar[str] = ContextVar("whose", default="")
+"""Whom the work at hand is done for: a caller, without tokens an address; "" for the service itself."""
 
 
-def _store_threads() -> CapacityLimiter:
-    """The threads for calls of stores. When all of them wait, what needs no store is still answered."""
-    try:
-        return _threads.get()
-    except LookupError:
-        _threads.set(CapacityLimiter(_STORE_THREADS))
-        return _threads.get()
+class _Lines:
+    """Who waits for one of ``most`` places: a line for each caller, which has ``of_caller`` places at most."""
+
+    def __init__(self, most: int, of_caller: int) -> None:
+        self._free = most
+        self._of_caller = of_caller
+        self._taken: Counter[str] = Counter()
+        self._waiting: OrderedDict[str, deque[asyncio.Future[None]]] = OrderedDict()
+        self.limiter = CapacityLimiter(most)
+
+    async def take(self, who: str) -> None:
+        """Return when a place is this caller's; give it back with ``give_back``."""
+        if self._may_begin(who):
+            self._begin(who)
+            return
+        turn = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(who, deque()).append(turn)
+        try:
+            await turn
+        except asyncio.CancelledError:
+            if turn.done() and not turn.cancelled():
+                self.give_back(who)
+            raise
+
+    def give_back(self, who: str) -> None:
+        """Whose turn it is begins."""
+        self._free += 1
+        self._taken[who] -= 1
+        if not self._taken[who]:
+            del self._taken[who]
+        while (whose_turn := next(filter(self._may_begin, self._waiting), None)) is not None:
+            line = self._waiting.pop(whose_turn)
+            turn = line.popleft()
+            if line:
+                self._waiting[whose_turn] = line  # behind all others
+            if not turn.done():
+                self._begin(whose_turn)
+                turn.set_result(None)
+
+    def _may_begin(self, who: str) -> bool:
+        return self._free > 0 and self._taken[who] < self._of_caller
+
+    def _begin(self, who: str) -> None:
+        self._free -= 1
+        self._taken[who] += 1
 
 
-async def in_thread(work: Callable[..., _Result], *arguments: Any) -> _Result:
-    """Run blocking work, a call of a store, in a thread."""
-    return await to_thread.run_sync(work, *arguments, limiter=_store_threads())
+class Threads:
+    """Threads for one kind of blocking work, ``most`` of them. Callers take turns, and none has all of them.
+
+    All threads share one interpreter: a caller with many of them would slow those of others down, and the event loop.
+    """
+
+    def __init__(self, kind: str, most: int, of_caller: int) -> None:
+        self._most = most
+        self._of_caller = of_caller
+        self._of_loop: RunVar[_Lines] = RunVar(f"{kind}_threads")
+
+    async def run(self, work: Callable[..., _Result], *arguments: Any) -> _Result:
+        """Run blocking work in one of them, when it is the turn of ``whose`` work it is."""
+        lines = self._of_loop.get(None)
+        if lines is None:
+            lines = _Lines(self._most, self._of_caller)
+            self._of_loop.set(lines)
+        who = whose.get()
+        await lines.take(who)
+        try:
+            return await to_thread.run_sync(work, *arguments, limiter=lines.limiter)
+        finally:
+            lines.give_back(who)
+
+
+STORES = Threads("store", 40, 4)
+"""Calls of stores. When all of them wait, what needs no store is still answered."""
+PARSING = Threads("parsing", 2, 1)
+"""Reading bodies, in portions: the interpreter's own work, of which two at once go no faster than one."""
+UPLOADS = Threads("upload", 8, 2)
+"""Hashing and writing uploads: a slow disk must not keep a poll waiting."""
+LOOKS = Threads("look", 4, 1)
+"""Looks for held answers: hundreds of them must not either."""
+PROBES = Threads("probe", 4, 2)
+"""Whether the service is ready: whoever asks does not wait behind its own requests."""
+in_thread = STORES.run
 
 
 def blocking(route: Callable[_Given, _Result]) -> Callable[_Given, Awaitable[_Result]]:
@@ -98,7 +170,8 @@ class Slots:
 
 
 class Waiters:
-    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many.
+    """Answers that are held back. All of them together look for news ``looks_per_s`` times a second, however many;
+    those of each caller as often as those of any other.
 
     Each keeps a connection in use: beyond ``most``, or half as many of one caller, no further one is held back.
     """
@@ -123,9 +196,10 @@ class Waiters:
             if not self._held[caller]:
                 del self._held[caller]
 
-    def pause_s(self, wanted_s: float) -> float:
-        """Seconds until one of them looks again: what it would like, or more where others look too.
+    def pause_s(self, caller: str, wanted_s: float) -> float:
+        """Seconds until one of this caller's looks again: what it would like, or more where the caller has many.
 
         Up to a quarter more or less, so that those that began together do not look together ever after.
         """
-        return max(wanted_s, self._held.total() / self._looks_per_s) * random.uniform(0.75, 1.25)  # noqa: S311
+        share = self._looks_per_s / max(1, len(self._held))
+        return max(wanted_s, self._held[caller] / share) * random.uniform(0.75, 1.25)  # noqa: S311

@@ -6,7 +6,6 @@ import asyncio
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from anyio import CapacityLimiter
 from redis import Redis
 
 from regnf_service.bytes_under_way import UnderWay
@@ -25,8 +24,6 @@ from regnf_state.records import Quota
 from regnf_state.room import Room
 from regnf_state.settings import Settings
 
-_UPLOAD_THREADS = 4
-_LOOK_THREADS = 2
 _ASSEMBLIES = 4
 """Each holds a copy of a whole upload for a moment."""
 
@@ -43,10 +40,6 @@ class Services:
     webhooks: Webhooks
     stopping: asyncio.Event = field(default_factory=asyncio.Event)
     waiters: Waiters = field(default_factory=Waiters)
-    # threads of their own: neither uploads to a slow disk nor hundreds of looks must keep a poll waiting for one
-    upload_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_UPLOAD_THREADS))
-    parse_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(1))
-    look_limiter: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(_LOOK_THREADS))
 
     @cached_property
     def quota(self) -> Quota:

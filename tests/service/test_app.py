@@ -89,17 +89,20 @@ def test_a_caller_has_half_of_the_answers_that_are_held() -> None:
     assert waiters.has_room("alice")
 
 
-def test_the_more_answers_are_held_the_more_seldom_each_looks() -> None:
-    waiters = Waiters(looks_per_s=10.0)
+def test_the_more_answers_a_caller_holds_the_more_seldom_each_looks() -> None:
+    waiters = Waiters(looks_per_s=20.0)
     with ExitStack() as stack:
+        stack.enter_context(waiters.held("bob"))
         stack.enter_context(waiters.held("alice"))
-        assert 0.1875 <= waiters.pause_s(0.25) <= 0.3125
+        assert 0.1875 <= waiters.pause_s("alice", 0.25) <= 0.3125
         for _ in range(9):
             stack.enter_context(waiters.held("alice"))
-        assert 0.75 <= waiters.pause_s(0.25) <= 1.25
-        assert 1.5 <= waiters.pause_s(2.0) <= 2.5
-        assert len({waiters.pause_s(2.0) for _ in range(5)}) > 1, "those that began together do not stay together"
-    assert waiters.pause_s(0.02) <= 0.025
+        assert 0.75 <= waiters.pause_s("alice", 0.25) <= 1.25
+        assert 1.5 <= waiters.pause_s("alice", 2.0) <= 2.5
+        several = {waiters.pause_s("alice", 2.0) for _ in range(5)}
+        assert len(several) > 1, "those that began together do not stay together"
+        assert waiters.pause_s("bob", 0.02) <= 0.125, "others' answers slow his down no further than to his half"
+    assert waiters.pause_s("alice", 0.02) <= 0.025
 
 
 def test_a_fault_in_a_round_of_the_reaper_is_logged_and_the_next_one_comes(

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+from collections import Counter
+from collections.abc import Callable
 
+from regnf_service.concurrency import Threads, whose
 from regnf_service.http.turns import AT_ONCE, Turns, fair_key
 
 
@@ -76,3 +80,46 @@ def test_an_address_is_no_callers_name() -> None:
     assert fair_key({"client": ("10.1.2.3", 5)}, "anonymous") == "anonymous 10.1.2.3"
     assert fair_key({"client": ("10.1.2.3", 5)}, "alice") == "alice"
     assert fair_key({"client": None}, "anonymous") == "anonymous "
+
+
+async def eventually(look: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not look():
+            await asyncio.sleep(0.01)
+
+
+def test_threads_go_round_between_callers_and_none_has_all() -> None:
+    begun: list[str] = []
+    together: Counter[str] = Counter()
+    most: Counter[str] = Counter()
+    lock, go = threading.Lock(), threading.Event()
+
+    def work(who: str) -> None:
+        with lock:
+            begun.append(who)
+            together[who] += 1
+            most[who] = max(most[who], together[who])
+        go.wait(20)
+        with lock:
+            together[who] -= 1
+
+    async def ask(threads: Threads, who: str) -> None:
+        whose.set(who)
+        await threads.run(work, who)
+
+    async def all_at_once() -> None:
+        threads = Threads("of the test", 4, 3)
+        asking = [asyncio.create_task(ask(threads, "greedy")) for _ in range(30)]
+        await eventually(lambda: len(begun) == 3)
+        asking += [asyncio.create_task(ask(threads, who)) for who in ("honest", "other", "honest")]
+        await eventually(lambda: len(begun) == 4)
+        assert sorted(begun) == ["greedy", "greedy", "greedy", "honest"]
+        asking[10].cancel()
+        go.set()
+        await asyncio.gather(*asking, return_exceptions=True)
+        await ask(threads, "last")
+
+    asyncio.run(all_at_once())
+    assert set(begun[4:8]) >= {"honest", "other"}
+    assert most["greedy"] <= 3
+    assert Counter(begun) == {"greedy": 29, "honest": 2, "other": 1, "last": 1}

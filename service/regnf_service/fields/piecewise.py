@@ -35,7 +35,7 @@ class PieceUpload(Upload):
     """One piece. Only the file's beginning shows whether it can be a field."""
 
     def __init__(self, services: Services, claim: Claim, piece: PieceRange) -> None:
-        super().__init__(services.blobs, piece.length, services.upload_limiter, claim)
+        super().__init__(services.blobs, piece.length, claim)
         self._recognized = piece.first != 0 or piece.length < HEAD_BYTES
 
 

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
-from typing import TypeVar
 
 import anyio
-from anyio import CapacityLimiter, to_thread
 
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_service.bytes_under_way import Claim
+from regnf_service.concurrency import UPLOADS
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.blobs.base import BlobStore, BlobWriter
@@ -27,7 +25,6 @@ _BLOCK_BYTES = 1 << 20
 SETTINGS_BYTES = 64 << 20
 """The latent codes of a thousand shapes are the largest of settings."""
 _NAME_LENGTH = 100
-_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True)
@@ -44,13 +41,12 @@ class Upload:
     format: str | None = None
     """What the bytes seem to be, once enough of them have come."""
 
-    def __init__(self, blobs: BlobStore, limit: int, limiter: CapacityLimiter, claim: Claim) -> None:
+    def __init__(self, blobs: BlobStore, limit: int, claim: Claim) -> None:
         self._blobs = blobs
         self._opened = ExitStack()
         self._writer: BlobWriter | None = None
         """From the first block on: an upload that never sends as much costs the store nothing."""
         self._limit = limit
-        self._limiter = limiter
         self._claim = claim
         self._hash = hashlib.sha256()
         self._bytes = 0
@@ -86,13 +82,13 @@ class Upload:
     async def commit(self, key: str) -> None:
         """Name the bytes, whole and at once."""
         assert self._writer is not None, "commit comes after finish"
-        await self._in_thread(partial(self._writer.commit, key))
+        await UPLOADS.run(self._writer.commit, key)
         self._claim.end()
 
     async def close(self) -> None:
         """What has no name goes."""
         if self._writer is not None:
-            await self._in_thread(self._opened.close)
+            await UPLOADS.run(self._opened.close)
 
     def _recognize(self) -> None:
         head = bytes(self._pending[:HEAD_BYTES])
@@ -104,7 +100,7 @@ class Upload:
 
     async def _flush(self) -> None:
         block, self._pending = self._pending, bytearray()
-        await self._in_thread(lambda: self._take(block))
+        await UPLOADS.run(self._take, block)
 
     def _take(self, block: bytearray) -> None:
         if self._writer is None:
@@ -112,9 +108,6 @@ class Upload:
         self._hash.update(block)
         self._writer.write(bytes(block))
         self._bytes += len(block)
-
-    async def _in_thread(self, work: Callable[[], _Result]) -> _Result:
-        return await to_thread.run_sync(work, limiter=self._limiter)
 
 
 class SettingsUpload(Upload):
@@ -154,7 +147,7 @@ def plain_name(filename: str) -> str:
 @asynccontextmanager
 async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]:
     """A new upload into the blob store, within the settings' limits."""
-    upload = Upload(services.blobs, services.settings.max_upload_bytes, services.upload_limiter, claim)
+    upload = Upload(services.blobs, services.settings.max_upload_bytes, claim)
     async with closing(upload):
         yield upload
 
@@ -162,7 +155,7 @@ async def open_upload(services: Services, claim: Claim) -> AsyncIterator[Upload]
 @asynccontextmanager
 async def open_settings(services: Services, claim: Claim) -> AsyncIterator[SettingsUpload]:
     """The settings that may come with an upload, which counts as one with them."""
-    upload = SettingsUpload(services.blobs, settings_limit(services), services.upload_limiter, claim)
+    upload = SettingsUpload(services.blobs, settings_limit(services), claim)
     async with closing(upload):
         yield upload
 

@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator, Mapping
 from email.message import Message
 from typing import Protocol
 
-from anyio import CapacityLimiter, to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser
 from starlette.requests import Request
 
+from regnf_service.concurrency import PARSING
 from regnf_service.problem import CLOSE, Problem
 
 _MAX_HEADER_BYTES = 4096
@@ -120,12 +120,11 @@ async def read_parts(
     boundary: str,
     files: Mapping[str, Sink],
     texts: Mapping[str, int],
-    limiter: CapacityLimiter,
 ) -> dict[str, bytes]:
     """Feed the parts named in ``files`` to their sinks; return the text parts, capped as ``texts`` says, by name.
 
     A file part that came appears in the answer too, empty. Looking for boundaries takes long where there is nearly one
-    in every line, so it is done in a thread, in as many at once as ``limiter`` says.
+    in every line, so it is done in a thread, a piece at a time.
 
     Raises Problem: MALFORMED_MULTIPART, UNKNOWN_PART, DUPLICATE_PART, REQUEST_TOO_LARGE, and what the sinks raise.
     """
@@ -133,7 +132,7 @@ async def read_parts(
     parts: dict[str, _Part] = {}
     async for data in body:
         try:
-            events = await to_thread.run_sync(collector.feed, data, limiter=limiter)
+            events = await PARSING.run(collector.feed, data)
         except FormParserError as error:
             raise Problem("MALFORMED_MULTIPART", headers=CLOSE) from error
         for part, content in events:

@@ -14,6 +14,7 @@ from itertools import count
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
+from regnf_service.concurrency import whose
 from regnf_service.http.connections import site_of
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.ownership import ANONYMOUS
@@ -81,5 +82,7 @@ class TurnGate:
             state["owner"] = owner
             connection = state.get("connection")  # the server's own; another server tells nothing
             quiet_since = asyncio.get_running_loop().time() if connection is None else connection.quiet_since
-            await self._turns.come(fair_key(scope, owner or ANONYMOUS), quiet_since)
+            who = fair_key(scope, owner or ANONYMOUS)
+            whose.set(who)
+            await self._turns.come(who, quiet_since)
         await self._app(scope, receive, send)

@@ -6,9 +6,7 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
-from anyio import to_thread
-
-from regnf_service.concurrency import in_thread, pause
+from regnf_service.concurrency import LOOKS, in_thread, pause
 from regnf_service.services import Services
 
 _FIRST_PAUSE_S = 0.02
@@ -29,7 +27,9 @@ async def wait_for(
         value = await in_thread(fetch)
         while True:
             left = deadline - time.monotonic()
-            if enough(value) or left <= 0 or await pause(min(services.waiters.pause_s(step), left), services.stopping):
+            if enough(value) or left <= 0:
                 return value
-            value = await to_thread.run_sync(fetch, limiter=services.look_limiter)
+            if await pause(min(services.waiters.pause_s(caller, step), left), services.stopping):
+                return value
+            value = await LOOKS.run(fetch)
             step = min(step * 1.5, _MAX_PAUSE_S)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from anyio import to_thread
 from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 
 from regnf_service.batches import Posting, cancel, find_batch, is_waiting, results_page, state_of
-from regnf_service.concurrency import blocking, in_thread
+from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Intake, portions
 from regnf_service.http.batch_lines import lines_of
@@ -100,7 +99,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
     chunks = body.chunks(request, services.settings.max_batch_bytes, pace, "REQUEST_TOO_LARGE")
     async for lines in lines_of(chunks):
         for few in portions(lines):
-            read = await to_thread.run_sync(intake.read, few, limiter=services.parse_limiter)
+            read = await PARSING.run(intake.read, few)
             await in_thread(intake.take, read)
     return intake.finish()
 

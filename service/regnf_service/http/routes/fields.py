@@ -243,7 +243,7 @@ async def patch_field(
     """
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
-    change = await read_body(services, FieldChange, await body.read_small(request, services.settings))
+    change = await read_body(FieldChange, await body.read_small(request, services.settings))
     record, imported = await in_thread(_changed, services, caller, sha256, change)
     headers = {"ETag": field_etag(record)} | ({"Retry-After": "1"} if imported else {})
     return JSONResponse(field_document(record, prefix), status_code=202 if imported else 200, headers=headers)

@@ -98,7 +98,7 @@ async def post_library(request: Request, services: ServicesDep, caller: CallerDe
     """
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
-    asked = await read_body(services, NewEntry, await body.read_small(request, services.settings))
+    asked = await read_body(NewEntry, await body.read_small(request, services.settings))
     notes = EntryNotes.checked(asked.name, asked.tags, asked.unit, asked.note, _plain(asked.symmetry))
     entry, created = await in_thread(add_entry, services, caller, asked.field, notes)
     document = entry_document(entry, prefix)
@@ -132,7 +132,7 @@ async def patch_library_entry(
     (RFC 7396)."""
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
-    change = await read_body(services, EntryChange, await body.read_small(request, services.settings))
+    change = await read_body(EntryChange, await body.read_small(request, services.settings))
     entry = await in_thread(_changed, services, caller, name, change)
     return JSONResponse(entry_document(entry, prefix))
 

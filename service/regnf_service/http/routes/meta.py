@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 
 from regnf_core import __version__
-from regnf_service.concurrency import blocking, in_thread
+from regnf_service.concurrency import PROBES, blocking, in_thread
 from regnf_service.http.contract import contract_json, contract_yaml
 from regnf_service.http.dependencies import PrefixDep, ServicesDep
 from regnf_service.http.page_requests import wants_page
@@ -44,13 +44,17 @@ async def healthz() -> dict[str, str]:
     response_model=ReadyDocument,
     responses=refusals("INVALID_QUERY", "NOT_READY"),
 )
-@blocking
-def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
+async def readyz(services: ServicesDep, worker: WorkerQuery = True) -> dict[str, object]:
     """Records and storage, both asked to take a write, and at least one live worker.
 
     A 503 has the same `checks`; its detail names what is missing, and its `reasons` say why. With `worker=false` no
     worker is asked for: whether uploads and requests would be taken, to wait for one.
     """
+    return await PROBES.run(_readiness, services, worker)
+
+
+def _readiness(services: Services, worker: bool) -> dict[str, object]:
+    """The answer. Raises Problem NOT_READY."""
     faults = {
         "records": _fault(lambda: _records_write(services)),
         "storage": _fault(services.blobs.probe),

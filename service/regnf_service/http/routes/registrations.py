@@ -135,7 +135,7 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     settings = services.settings
     text = await body.read_small(request, settings)
-    spec = await read_body(services, RegisterRequest, text)
+    spec = await read_body(RegisterRequest, text)
     asked, named = await in_thread(asked_by_reference, CallersLibrary(services, caller), spec)
     await in_thread(check_fields, services, caller, asked, named)
     return asked
@@ -158,11 +158,11 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         sinks = files | {f"{name}_settings": config for name, config in configs.items()}
         texts = {"request": settings.max_request_bytes} | {f"{name}_description": DESCRIPTION_BYTES for name in _ROLES}
         data = body.chunks(request, limit, pace)
-        parts = await read_parts(data, boundary_of(request), sinks, texts, services.parse_limiter)
+        parts = await read_parts(data, boundary_of(request), sinks, texts)
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
-        spec = await read_body(services, RegistrationSpec, parts["request"])
+        spec = await read_body(RegistrationSpec, parts["request"])
         said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}
         beside = {name: Beside(said[name], await configs[name].received(), role=name) for name in _ROLES}

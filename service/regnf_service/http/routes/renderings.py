@@ -95,7 +95,7 @@ async def render(
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
     text = await body.read_small(request, services.settings)
-    said = await read_body(services, RenderBody, text, most_values=MOST_VALUES_WITH_CAMERAS)
+    said = await read_body(RenderBody, text, most_values=MOST_VALUES_WITH_CAMERAS)
     asked = await in_thread(_checked, services, caller, said)
     return await answer(services, caller, prefix, asked, Asking(dry_run, prefer, idempotency_key))
 

@@ -218,7 +218,7 @@ async def _receive_parts(
         data = _compared(data, digest)
     texts = {"description": DESCRIPTION_BYTES, "upload": _SHA256_DIGITS}
     files = {"file": upload, **beside}
-    parts = await read_parts(data, boundary_of(request), files, texts, services.parse_limiter)
+    parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
         raise Problem("MISSING_PART", "Send the part `file`, or `upload` in its place.")
     description = read_description(parts.get("description"))
