@@ -72,21 +72,26 @@ class RemoteService:
         known = self._http.get(f"/fields/{sha256}")
         with source.packed_settings() as settings:
             if known.status_code != 200 or checked(known).get("state") == "rejected":
-                self._send(sha256, source, settings, report)
-            elif source.said or settings is not None:
+                self._send(source, settings, report)
+                return sha256
+            if source.said or settings is not None:
                 _require_same(checked(known), source, settings)
+        self._name(checked(known), source)
         return sha256
 
-    def _send(self, sha256: str, source: FieldSource, settings: Path | None, report: Report) -> None:
-        """The bytes alone, or multipart where something goes with them."""
+    def _name(self, held: dict[str, Any], source: FieldSource) -> None:
+        """Call a field that the service holds as the user now does, or by the file's name where it has none."""
+        label = held.get("label")
+        if source.label and label != source.label and (label is None or "label" in source.said):
+            checked(self._http.patch(f"/fields/{held['sha256']}", json={"label": source.label}))
+
+    def _send(self, source: FieldSource, settings: Path | None, report: Report) -> None:
+        """The bytes, what is said of them, and their settings."""
         with _Told(source.file, report) as file:
-            if not source.description and settings is None:
-                length = {"Content-Length": str(file.size), "Content-Type": "application/octet-stream"}
-                checked(self._http.put(f"/fields/{sha256}", content=_Blocks(file), headers=length))
-                return
-            parts: dict[str, Any] = {"file": (source.file.name, file, "application/octet-stream")}
-            if source.description:
-                parts["description"] = (None, json.dumps(source.description), "application/json")
+            parts: dict[str, Any] = {
+                "description": (None, json.dumps(source.description_to_send), "application/json"),
+                "file": (source.file.name, file, "application/octet-stream"),
+            }
             if settings is not None:
                 parts["settings"] = (settings.name, settings.read_bytes(), "application/octet-stream")
             checked(self._http.post("/fields", files=parts))
@@ -162,18 +167,6 @@ class _Told(io.FileIO):
         block = super().read(-1 if size is None else size) or b""
         self._report("uploading", self.tell() / max(self.size, 1))
         return block
-
-
-class _Blocks:
-    """All of a file, from its beginning each time that it is sent."""
-
-    def __init__(self, file: io.FileIO) -> None:
-        self._file = file
-
-    def __iter__(self) -> Iterator[bytes]:
-        self._file.seek(0)
-        while block := self._file.read(_BLOCK):
-            yield block
 
 
 def _require_same(held: dict[str, Any], source: FieldSource, settings: Path | None) -> None:

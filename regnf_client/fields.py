@@ -123,9 +123,17 @@ def send(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Fie
         known = parsed(Field, checked(answer))
         if known.state != "rejected":
             _require_same(known, source)
-            return known
+            return (yield from _named(asking, known, source))
     with source.packed_settings() as settings:
         return (yield from _Sending(asking, source, sha256, settings).all())
+
+
+def _named(asking: Asking, known: Field, source: FieldSource) -> Flow[Field]:
+    """The field that the service holds, by the name that it is now given, or by the file's where it has none."""
+    if not source.label or known.label == source.label or (known.label is not None and "label" not in source.said):
+        return known
+    answer = yield from call(asking.patience, "PATCH", f"/fields/{known.sha256}", json={"label": source.label})
+    return parsed(Field, checked(answer))
 
 
 def find(asking: Asking, field: FieldLike) -> Flow[Field]:
@@ -175,31 +183,22 @@ class _Sending:
 
     def _beside(self) -> dict[str, Any]:
         """The parts of a form that go with the file."""
-        parts: dict[str, Any] = {}
-        if self.source.description:
-            parts["description"] = (None, json.dumps(self.source.description), "application/json")
+        parts: dict[str, Any] = {"description": (None, json.dumps(self.source.description_to_send), "application/json")}
         if self.settings is not None:
             parts["settings"] = (self.settings.name, self.settings.read_bytes(), "application/octet-stream")
         return parts
 
     def _at_once(self, data: bytes) -> Flow[Field]:
         self.asking.tell("uploading", 0.0)
-        parts = self._beside()
-        if parts:
-            form = {"file": (self.source.file.name, data, "application/octet-stream"), **parts}
-            answer = yield from call(self.asking.patience, "POST", "/fields", files=form)
-        else:
-            how = {"content": data, "headers": {"Content-Type": "application/octet-stream"}}
-            answer = yield from call(self.asking.patience, "PUT", f"/fields/{self.sha256}", **how)
+        form = {"file": (self.source.file.name, data, "application/octet-stream"), **self._beside()}
+        answer = yield from call(self.asking.patience, "POST", "/fields", files=form)
         self.asking.tell("uploading", 1.0)
         return parsed(Field, checked(answer))
 
     def _in_pieces(self, size: int) -> Flow[Field]:
         """From where an earlier try stopped."""
         piece = max(PIECE_BYTES, -(-size // _MOST_PIECES))
-        parts = self._beside()
-        complete = {"Upload-Complete": "?0"} if parts else {}
-        answer = yield from self._put(b"", f"bytes */{size}", complete)
+        answer = yield from self._put(b"", f"bytes */{size}")
         while True:
             document = checked(answer)
             offset = document.get("offset")
@@ -210,15 +209,15 @@ class _Sending:
                 break
             data = yield from work(partial(_read, self.source.file, offset, piece))
             span = f"bytes {offset}-{offset + len(data) - 1}/{size}"
-            answer = yield from self._put(data, span, complete)
+            answer = yield from self._put(data, span)
             if answer.status_code == 409 and refusal(answer).offset not in (None, offset):
-                answer = yield from self._put(b"", f"bytes */{size}", complete)  # the answer to a piece was lost
-        form = {"upload": (None, self.sha256), **parts}
+                answer = yield from self._put(b"", f"bytes */{size}")  # the answer to a piece was lost
+        form = {"upload": (None, self.sha256), **self._beside()}
         answer = yield from call(self.asking.patience, "POST", "/fields", files=form)
         return parsed(Field, checked(answer))
 
-    def _put(self, data: bytes, span: str, complete: Mapping[str, str]) -> Flow[Any]:
-        headers = {"Content-Range": span, "Content-Type": "application/octet-stream", **complete}
+    def _put(self, data: bytes, span: str) -> Flow[Any]:
+        headers = {"Content-Range": span, "Content-Type": "application/octet-stream", "Upload-Complete": "?0"}
         return call(self.asking.patience, "PUT", f"/fields/{self.sha256}", content=data, headers=headers)
 
 

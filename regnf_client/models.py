@@ -69,6 +69,7 @@ class Entry(Document):
     symmetry: dict[str, Any] | None = None
     symmetry_source: Literal["said", "detected"] | None = None
     bounds: Any = None
+    surface_bounds: Any = None
 
     def __repr__(self) -> str:
         tags = f", {', '.join(self.tags)}" if self.tags else ""
@@ -85,6 +86,7 @@ class Job(Document):
     progress: float = 0.0
     queue_position: int | None = None
     verdict: Verdict | None = None
+    object_found: str | None = None
     error: dict[str, Any] | None = None
     warnings: dict[str, list[str]] = {}
     links: dict[str, str] = {}

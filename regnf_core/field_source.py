@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from regnf_core.importing.containers.sniff import HEAD_BYTES, RUN_ARCHIVES, snif
 from regnf_core.importing.containers.sniff_mesh import MESH_FORMATS
 from regnf_core.importing.run.folder import Run, find_run, pack_settings, settings_beside
 from regnf_core.importing.run.settings_names import DATA_FILES
+from regnf_core.labels import MOST_OF_LABEL, UNSHOWN
 
 Role = Literal["scene", "object"]
 SettingsChoice = str | Path | bool | None
@@ -49,6 +51,17 @@ class FieldSource:
     def description(self) -> dict[str, Any]:
         """What the gate is told."""
         return dict(self.said) if self.role is None else {**self.said, "as": self.role}
+
+    @property
+    def label(self) -> str:
+        """What people call it: as they said, or the name of the file or the folder that they gave."""
+        name = os.path.basename(os.path.abspath(self.named))
+        return str(self.said.get("label") or re.sub(f"[{UNSHOWN}\\ud800-\\udfff]", "", name)[:MOST_OF_LABEL])
+
+    @property
+    def description_to_send(self) -> dict[str, Any]:
+        """What a service is told: the same, and what to call it."""
+        return {**self.description, **({"label": self.label} if self.label else {})}
 
     @property
     def settings(self) -> tuple[Path, ...]:

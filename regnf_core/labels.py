@@ -4,3 +4,5 @@ UNSHOWN = r"\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff
 """Characters of control, of line breaks and of the direction of writing, as ranges of a regular expression."""
 LABEL_PATTERN = rf"^[^{UNSHOWN}]*$"
 """Labels are shown as they are: nothing in them breaks a line or turns the text around them."""
+MOST_OF_LABEL = 200
+"""Characters."""

@@ -92,7 +92,7 @@ class JobQueue(Protocol):
         """Queue what waited for this field: its import has ended."""
         ...
 
-    def position(self, job_id: str, attempt: int) -> int | None:
+    def position(self, work: Work) -> int | None:
         """1 for the work that is expected to be next; None for what does not wait in line."""
         ...
 

@@ -101,6 +101,8 @@ class JobRecord:
     phase_since: float | None = None
     verdict: str | None = None
     """Of a successful job: what its result says."""
+    object_found: str | None = None
+    """Of a successful search: the SHA-256 of the object that its result is about."""
     more_webhooks: list[str] = field(default_factory=list)
     """Addresses named by later requests for this job, which are told of its end as well."""
     unknown_members: dict[str, Any] = field(default_factory=dict)

@@ -26,7 +26,8 @@ _MOVES: dict[str, frozenset[str]] = {
     "accepted": frozenset({"running", "failed", "dismissed"}),
     "running": frozenset({"successful", "failed", "dismissed"}),
 }
-_CHANGEABLE_IN_JOB = frozenset({"status", "phase", "progress", "engine", "error", "inputs", "worker", "verdict"})
+_TOLD_BY_RESULT = frozenset({"verdict", "object_found"})
+_CHANGEABLE_IN_JOB = _TOLD_BY_RESULT | {"status", "phase", "progress", "engine", "error", "inputs", "worker"}
 _IN_REPORT = frozenset({VIEWS, DRAWINGS})
 """What is changed by itself and stands in a field's report: the release before knows no such members of a record."""
 _CHANGEABLE_IN_FIELD = _IN_REPORT | {"state", "label", "description", "report", "error", "bytes", "symmetry"}

@@ -10,7 +10,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen
 from pydantic import AfterValidator, Field, FiniteFloat, StringConstraints, TypeAdapter, ValidationError
 
 from regnf_core.errors import FieldFormatError
-from regnf_core.labels import LABEL_PATTERN
+from regnf_core.labels import LABEL_PATTERN, MOST_OF_LABEL
 from regnf_core.schema.similarity import require_similarity
 
 _FORBID_UNKNOWN: dict[str, Any] = {"extra": "forbid", "strict": True}
@@ -175,7 +175,7 @@ class UploadDescription:
     """scene: a surface seen from within, as a room's. object: a thing seen from around it."""
     accept_implausible: bool | None = None
     """True: import the field although it does not behave like a signed distance."""
-    label: Annotated[str, StringConstraints(max_length=200, pattern=LABEL_PATTERN)] | None = None
+    label: Annotated[str, StringConstraints(max_length=MOST_OF_LABEL, pattern=LABEL_PATTERN)] | None = None
     grid_box: _Box | None = None
     """Lowest and highest corner of what the hash grid covers, in the checkpoint's coordinates, if that is no cube."""
     use_grid: bool | None = None

@@ -67,8 +67,8 @@ class RqJobQueue:
     def release(self, reference: str) -> None:
         self.fair.release(reference)
 
-    def position(self, job_id: str, attempt: int) -> int | None:
-        return self.fair.position(Work("registration", job_id, attempt))
+    def position(self, work: Work) -> int | None:
+        return self.fair.position(work)
 
     def spent(self, owner: str) -> dict[int, float]:
         return self.fair.spent(owner)

@@ -51,7 +51,8 @@ class Gate:
         shutil.copy(DATA / f"{name}.safetensors", out_dir / "field.safetensors")
         used = None if settings is None else {"trainer": "neus", "files": ["config.yml"], "used": {}}
         told: dict[str, Any] = {"family": "deepsdf", "kind": "sdf", "why": (), "parameters": 1, "plausibility": {}}
-        told |= {"bounds": ((0, 0, 0), (1, 1, 1)), "warnings": (WARNING,), "label": None, "settings": used}
+        told |= {"bounds": ((0, 0, 0), (1, 1, 1)), "surface_bounds": ((0, 0, 0), (1, 1, 1))}
+        told |= {"warnings": (WARNING,), "label": None, "settings": used}
         told |= {"field_bytes": 1, "seconds": 0.1, "cpu_seconds": 0.1, "peak_memory_bytes": 1, "isolation": {}}
         return ImportReport(**told)
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from regnf_core.options import RobustOptions
 from tests.ui.fixture_server import WEB
 
 
@@ -48,14 +47,3 @@ def test_every_import_and_every_id_exists(page: str) -> None:
             open_.append(path.parent / target)
         assert set(re.findall(r"byId\('([^']+)'\)", source)) <= ids, path.name
     assert len(seen) > 2
-
-
-def test_the_form_of_options_starts_from_the_defaults_of_the_contract() -> None:
-    """What is left at its default is left out of the request, so the engine's own default is taken."""
-    source = (WEB / "js" / "options-form.js").read_text()
-    shown = re.findall(r"^  \['(\w+)', '[^']+', (null|[\d.e+-]+), ([\d.e+-]+), ([\d.e+-]+)\],$", source, re.MULTILINE)
-    assert len(shown) == source.split("];")[0].count("\n  [")
-    defaults = RobustOptions()
-    for name, usual, _, _ in shown:
-        expected = getattr(defaults, name)
-        assert expected == (None if usual == "null" else float(usual)), name

@@ -33,7 +33,7 @@ def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, file
         page.goto(f"{address}/library")
         page.wait_for_selector("html[data-page=ready]")
         expect(page.locator("#note")).to_have_text(re.compile("Nothing in the library yet"))
-        page.get_by_role("button", name="Add an object").click()
+        page.get_by_role("button", name="Add objects").click()
         page.set_input_files("#entry-file", files[1])
         expect(page.locator("#entry-name")).to_have_value("chair")
         page.fill("#entry-tags", "seat, oak")
@@ -67,9 +67,13 @@ def test_an_object_from_its_file_to_the_library_and_out_again(visit: Visit, file
         expect(page.locator("#objects input:checked")).to_have_count(1)
         page.goto(f"{address}/fields")
         page.get_by_role("button", name="Delete armchair").click()
-        expect(page.locator("#note")).to_contain_text("library")
+        page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+        expect(page.locator("dialog[open]")).to_contain_text("library")  # and stays to say so
+        page.get_by_role("button", name="Close").click()
         page.goto(f"{address}/library")
         page.get_by_role("button", name="Remove armchair").click()
+        assert in_both_themes(page) == NONE
+        page.locator("dialog[open]").get_by_role("button", name="Remove").click()
         expect(page.locator(".tile")).to_have_count(0)
         page.goto(f"{address}/fields")
         page.get_by_role("link", name="Add to library").click()

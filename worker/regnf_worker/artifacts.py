@@ -14,13 +14,17 @@ _CHUNK_BYTES = 1 << 20
 _VERDICTS = ("registered", "ambiguous", "rejected")
 
 
-def verdict_of(blobs: BlobStore, manifest: Manifest) -> str | None:
-    """The verdict in the result; None for a result without a known one."""
+def told_by_result(blobs: BlobStore, manifest: Manifest) -> dict[str, str | None]:
+    """What the job's record says of its result: the verdict if it is a known one, and of a search the object found."""
     try:
-        verdict = read_result(blobs, manifest).get("verdict")
+        result = read_result(blobs, manifest)
     except (FileNotFoundError, UnreadableRecordError):
-        return None
-    return verdict if verdict in _VERDICTS else None
+        return {}
+    verdict, found = result.get("verdict"), result.get("object")
+    return {
+        "verdict": verdict if verdict in _VERDICTS else None,
+        "object_found": found if isinstance(found, str) and result.get("candidates") else None,
+    }
 
 
 def store_artifacts(

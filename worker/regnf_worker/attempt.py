@@ -20,7 +20,7 @@ from regnf_state.manifest import Manifest, read_manifest
 from regnf_state.problems import problem_document
 from regnf_state.records import JobRecord, StaleAttemptError, UnreadableRecordError
 from regnf_state.rendering_request import RenderingRequest
-from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, verdict_of
+from regnf_worker.artifacts import discard, discard_others, publish, store_artifacts, told_by_result
 from regnf_worker.context import Context
 from regnf_worker.edited_fields import keep_edited_field
 from regnf_worker.engine import Engine, Made
@@ -100,7 +100,7 @@ def _published(
         _fail(context, job_id, attempt, fault(error, incident, _limits_held(context)))
     else:
         keep_edited_field(context, record.owner, done.manifest)
-        _end(context, job_id, attempt, status="successful", verdict=verdict_of(context.blobs, done.manifest))
+        _end(context, job_id, attempt, status="successful", **told_by_result(context.blobs, done.manifest))
         discard_others(context.blobs, done.manifest)
         return done
     return None

@@ -10,7 +10,7 @@ from typing import Any
 from regnf_state.manifest import read_manifest
 from regnf_state.problems import problem_document
 from regnf_state.records import ACTIVE, JobRecord, StaleAttemptError
-from regnf_worker.artifacts import discard, verdict_of
+from regnf_worker.artifacts import discard, told_by_result
 from regnf_worker.context import Context
 from regnf_worker.edited_fields import keep_edited_field
 from regnf_worker.imports import claim_import, reject
@@ -92,8 +92,7 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
     manifest = read_manifest(context.blobs, job_id)
     if manifest is not None:
         keep_edited_field(context, record.owner, manifest)
-        verdict = verdict_of(context.blobs, manifest)
-        context.records.update_job(job_id, attempt, status="successful", verdict=verdict)
+        context.records.update_job(job_id, attempt, status="successful", **told_by_result(context.blobs, manifest))
         give_up_rest(context, job_id)
         return
     discard(context.blobs, job_id, attempt)

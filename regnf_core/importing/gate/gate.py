@@ -187,11 +187,13 @@ def _report(
         size = _checked_size(field, limits.file_bytes)
         isolation = {str(key): bool(value) for key, value in values["isolation"].items()}
         lower, upper = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["bounds"])
+        lowest, highest = ((_finite(x), _finite(y), _finite(z)) for x, y, z in values["surface_bounds"])
         return ImportReport(
             family=str(values["family"]),
             kind=str(values["kind"]),
             why=tuple(map(str, values["why"])),
             bounds=(lower, upper),
+            surface_bounds=(lowest, highest),
             parameters=int(values["parameters"]),
             plausibility={str(key): _finite(value) for key, value in values["plausibility"].items()},
             warnings=(*map(str, values["warnings"]), *_isolation_warnings(isolation)),

@@ -35,8 +35,10 @@ def without_new_code() -> Iterator[None]:
 
 
 @without_new_code()
-def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -> tuple[dict[str, float], list[str]]:
-    """Measurements of the field, and warnings.
+def check_plausibility(
+    field: SdfField, samples: int = SAMPLES, seed: int = 0
+) -> tuple[dict[str, float], list[str], list[list[float]]]:
+    """Measurements of the field, warnings, and the lowest and the highest corner of the surface, as points on it show.
 
     Measured: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
     gradient_p10, gradient_median and gradient_p90 (the gradient's norm there), and what ``measured_enclosure`` does.
@@ -68,7 +70,7 @@ def check_plausibility(field: SdfField, samples: int = SAMPLES, seed: int = 0) -
         "gradient_p90": high,
         **measured_enclosure(points, distance, surface, median, Box(lower, upper)),
     }
-    return measured, _warnings(measured)
+    return measured, _warnings(measured), torch.stack([surface.amin(0), surface.amax(0)]).tolist()
 
 
 def _no_surface(distance: Tensor) -> FieldFormatError:

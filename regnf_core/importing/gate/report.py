@@ -90,6 +90,8 @@ class ImportReport:
     """The evidence for the family, one short sentence each."""
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
     """Lowest and highest corner of the region where the field has meaning."""
+    surface_bounds: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """The same of the surface: of some thousand points on it, so a thin end may reach a little further."""
     parameters: int
     plausibility: dict[str, float]
     """What was measured of the evaluated field; see ``plausibility``."""

@@ -39,6 +39,7 @@ from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
 from regnf_state.originals import candidate_key
 from regnf_state.ownership import reference_of
+from regnf_state.queue import Work
 from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
@@ -90,9 +91,12 @@ async def get_field(
 
     record = await wait_for(lambda: _require(services, caller, sha256), is_news, wait, services, caller)
     headers = {"ETag": field_etag(record), "Cache-Control": "no-cache"}
+    position = None
     if record.state == "validating":
         headers["Retry-After"] = "1"
-    return held.apply(JSONResponse(field_document(record, prefix), headers=headers))
+        work = Work("import", record.sha256, record.attempt)
+        position = await in_thread(services.queue.position, work)
+    return held.apply(JSONResponse(field_document(record, prefix, position), headers=headers))
 
 
 @get_and_head(

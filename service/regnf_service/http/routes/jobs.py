@@ -23,6 +23,7 @@ from regnf_service.jobs.identity import digest
 from regnf_service.jobs.lookup import find_job
 from regnf_service.problem import Problem
 from regnf_service.services import Services
+from regnf_state.queue import Work
 from regnf_state.records import ACTIVE, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 
@@ -55,7 +56,8 @@ class _Seen(NamedTuple):
 
 
 def _seen(services: Services, record: JobRecord) -> _Seen:
-    position = services.queue.position(record.id, record.attempt) if record.status == "accepted" else None
+    work = Work("registration", record.id, record.attempt)
+    position = services.queue.position(work) if record.status == "accepted" else None
     return _Seen(record, position, services.webhooks.deliveries(record))
 
 

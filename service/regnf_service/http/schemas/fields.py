@@ -51,11 +51,16 @@ class FieldDocument(Outgoing):
     description: dict[str, Any] = Field({}, description="What the uploader said that the file does not.")
     settings: SettingsDocument | None = Field(None, description="The file of settings that came with the upload.")
     cameras: SettingsDocument | None = Field(None, description="The file that says where its cameras stood.")
-    report: dict[str, Any] = Field({}, description="What the import found: family, bounds, parameters, plausibility.")
+    report: dict[str, Any] = Field(
+        {}, description="What the import found: family, bounds, those of the surface, parameters, plausibility."
+    )
     symmetry: SymmetryDocument | None = Field(
         None, description="The object's own, found by the first job that registers the field as an object."
     )
     library: EntryNamed | None = Field(None, description="Its entry in the library: `GET /library/{name}`.")
+    queue_position: int | None = Field(
+        None, description="1 is next; null for an import that runs or has ended, and in lists."
+    )
     views: Literal["pending", "ready", "none"] | None = Field(
         None,
         description="Of a ready field: whether its mesh and picture, which follow when workers have time, are still to "
@@ -110,7 +115,7 @@ class FieldPage(Outgoing):
     next_page_token: str | None = Field(None, description=NEXT_PAGE)
 
 
-def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
+def field_document(record: FieldRecord, prefix: str, queue_position: int | None = None) -> dict[str, Any]:
     """The field as it travels; ``prefix`` is what the API's paths begin with."""
     address = f"{prefix}/fields/{sha256_of(record.sha256)}"
     return {
@@ -124,6 +129,7 @@ def field_document(record: FieldRecord, prefix: str) -> dict[str, Any]:
         "report": _plain(record.report),
         "symmetry": record.symmetry,
         "library": None if record.library is None else {name: record.library[name] for name in ("name", "tags")},
+        "queue_position": queue_position,
         "views": record.views,
         "error": None if record.error is None else outgoing_problem(_error(record, address)),
         "kept_until": rfc3339(record.original_until),

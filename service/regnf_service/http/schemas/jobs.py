@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, WithJsonSchema
 
 from regnf_service.http.paging import NEXT_PAGE
-from regnf_service.http.schemas.common import Links, Moment, Outgoing, ProblemDocument, outgoing_problem
+from regnf_service.http.schemas.common import Links, Moment, Outgoing, ProblemDocument, Sha256, outgoing_problem
 from regnf_service.http.schemas.results import Verdict
 from regnf_service.times import rfc3339
 from regnf_state.records import ACTIVE, WARNINGS, JobRecord
@@ -69,6 +69,9 @@ class JobDocument(Outgoing):
         description="What the imports of `scene` and `object` were not sure of: words; the result has sentences.",
     )
     verdict: _Verdict | None = Field(None, description="Of a successful job: its result's verdict.")
+    object_found: Sha256 | None = Field(
+        None, description="Of a successful search: the object of its result. If that is rejected, it was none of them."
+    )
     error: ProblemDocument | None = Field(None, description="Why the job failed.")
     webhooks: list[WebhookDocument] = Field([], description="Told of the job's end, in the order of asking.")
     links: Links
@@ -103,6 +106,7 @@ def job_document(
         "engine": record.engine,
         "warnings": record.inputs.get(WARNINGS) or {},
         "verdict": record.verdict,
+        "object_found": record.object_found,
         "error": outgoing_problem(record.error),
         "webhooks": [_webhook(url, one) for url, one in zip_longest(record.webhooks, deliveries)],
         "links": _links(record, f"{prefix}/jobs/{record.id}"),

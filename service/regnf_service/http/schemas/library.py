@@ -114,6 +114,7 @@ class EntryDocument(Outgoing):
         description="Null: nothing is said, and none was detected yet. A worker looks for it.",
     )
     bounds: list[list[float]] | None = Field(None, description="Of the field: lowest and highest corner.")
+    surface_bounds: list[list[float]] | None = Field(None, description="Of its surface: the object's own size.")
     added_at: Moment
     updated_at: Moment
     links: Links
@@ -176,6 +177,7 @@ def entry_document(entry: LibraryEntry, prefix: str) -> dict[str, Any]:
         "symmetry": entry.symmetry,
         "symmetry_source": source,
         "bounds": field.report.get("bounds"),
+        "surface_bounds": field.report.get("surface_bounds"),
         "added_at": rfc3339(entry.added),
         "updated_at": rfc3339(field.updated),
         "links": {"self": address, "field": at_field} | (shown if field.state == "ready" else {}),

@@ -14,6 +14,20 @@ export class ApiProblem extends Error {
   }
 }
 
+/** All that an error says, in sentences: what is wrong, each member of its `errors` with its place, and what helps. */
+export const told = (error) => toldOf({ ...error.problem, detail: error.message });
+
+/** The same of a problem object, as a failed job and a refused field have it. */
+export function toldOf({ detail, title, errors, hint }) {
+  const faults = (errors ?? []).map(({ pointer = '', detail: fault = '' }) => {
+    const place = pointer.replace(/^\//, '').replaceAll('/', '.');
+    return place ? `${place}: ${fault}` : fault;
+  });
+  return [detail || title, ...faults, hint].filter(Boolean).map(asSentence).join(' ');
+}
+
+const asSentence = (text) => (/[.!?:]$/.test(text) ? text : `${text}.`);
+
 /** "/v1/jobs/ab12/view" is the page of the job at "/v1/jobs/ab12". */
 export function jobBase(pathname) {
   return pathname.replace(/\/view\/?$/, '');

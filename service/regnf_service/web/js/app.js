@@ -5,10 +5,12 @@ import { showCandidates } from './candidates.js';
 import { showCertainty } from './certainty.js';
 import { offerConsidered, unchooseConsidered } from './considered.js';
 import { artifactsOf, framesOf, isActive } from './documents.js';
-import { announce, byId, copyText, show } from './dom.js';
+import { askFirst, deletionOf } from './confirm.js';
+import { announce, byId, copyText, keepPrefix, show } from './dom.js';
 import { followJob } from './events.js';
 import { showFields } from './fields.js';
 import { offerInScene, showStrip } from './in-scene.js';
+import { Turns } from './latest.js';
 import { showAgreement } from './metric-list.js';
 import { prefersStillness } from './motion.js';
 import { Names } from './names.js';
@@ -19,6 +21,8 @@ import {
 import { Playback } from './playback.js';
 import { DistancePlot } from './plot.js';
 import { showRanking } from './ranking.js';
+import { runAgain } from './run-again.js';
+import { Service } from './service.js';
 import { inverse, readSim3 } from './sim3.js';
 import { Stage } from './stage.js';
 import {
@@ -28,23 +32,41 @@ import {
 
 const api = new JobApi(jobBase(location.pathname));
 const fieldNames = new Names(api);
+const turns = new Turns();
 
+/** May be called again, to try again or with another token: only the latest call shows what it finds. */
 async function main() {
+  const isLatest = turns.next();
+  const ifLatest = (act) => (...news) => { if (isLatest()) act(...news); };
   showLoading('Reading the job');
   try {
     let job = await api.job();
+    if (!isLatest()) return;
     showJob(fieldNames, job);
     showFields(api, fieldNames, job);
     if (isActive(job)) {
       showActive(job);
-      job = await followJob(api, job, showActive, showTrouble);
+      job = await followJob(api, job, ifLatest(showActive), ifLatest(showTrouble));
     }
+    if (!isLatest()) return;
     showJob(fieldNames, job);
+    offerActs(job);
     await showFinished(job);
   } catch (error) {
-    showError(error, main);
+    ifLatest(showError)(error, main);
   }
   document.documentElement.dataset.page = 'ready';
+}
+
+/** What can be done with a job that has ended. */
+function offerActs(job) {
+  const service = new Service(() => Promise.reject(new Error('The token is no longer taken. Reload the page.')));
+  show(byId('run-again'), job.kind === 'registration');
+  show(byId('delete-job'));
+  byId('run-again').onclick = () => runAgain(service, job);
+  byId('delete-job').onclick = async () => {
+    if (await askFirst(deletionOf(service, job, byId('job-title').textContent))) location.href = `${api.root}/jobs`;
+  };
 }
 
 async function showFinished(job) {
@@ -118,8 +140,8 @@ async function showStage(job, result, frames, names) {
     playback.pause();
     stage.placeAlternative(inverse(pose));
     stage.showMarks(marks);
-    playback.nameInstead('A pose that was judged');
-    showTransform(pose, 'A pose that was judged');
+    playback.nameInstead('A candidate pose');
+    showTransform(pose, 'A candidate pose');
   });
   announce('The surfaces are shown.');
   if (!prefersStillness() && frames.length > 1) playback.play();
@@ -144,6 +166,7 @@ async function readTrace() {
   }
 }
 
+keepPrefix(api.root);
 byId('job-id').textContent = api.id;
 byId('copy-id').addEventListener('click', () => copyText(api.id, byId('copy-id')));
 byId('cancel').addEventListener('click', async () => {

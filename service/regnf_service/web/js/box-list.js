@@ -4,6 +4,8 @@ import { announce, byId, el, show } from './dom.js';
 import { number } from './format.js';
 
 const ROWS = [['Center', 'center'], ['Size', 'size']];
+const FIRST = 'Click a thing in the scene: it gets a box. Click it again for a larger or smaller one.';
+const ONE_MORE = 'Click the thing again for a larger or smaller box. A click elsewhere moves the box there; Add a box keeps it.';
 
 export class BoxList {
   /** workspace() is where they are drawn; onChange() hears that there are others. */
@@ -36,7 +38,7 @@ export class BoxList {
   add() {
     this.adding = true;
     this.rest();
-    byId('boxes-note').textContent = 'Click the next thing.';
+    byId('boxes-note').textContent = 'Click the next thing: it gets a box of its own.';
   }
 
   /** Leaves the view to what was found: no box is edited. */
@@ -73,6 +75,7 @@ export class BoxList {
   }
 
   clear() {
+    this.adding = false;
     for (const { id } of [...this.boxes]) this.remove(id);
   }
 
@@ -81,6 +84,7 @@ export class BoxList {
     byId('boxes').replaceChildren(...this.boxes.map(({ id, box }) => el('li', {},
       el('button', { type: 'button', 'aria-pressed': String(id === this.edits), onclick: () => this.show(id) }, `Box ${id}: ${sizeOf(box)}`),
       el('button', { type: 'button', className: 'quiet', 'aria-label': `Remove box ${id}`, onclick: () => this.remove(id) }, 'Remove'))));
+    byId('boxes-note').textContent = this.boxes.length ? ONE_MORE : FIRST;
     show(byId('numbers'), Boolean(this.current()));
     this.fill();
   }

@@ -17,10 +17,24 @@ export function showCertainty(result) {
       ...group('Scale', '%', [''], [uncertainty.scale_percent], FULL_PERCENT),
     );
   }
+  byId('certainty-words').textContent = inWords(result);
   if (covariance && ordering) byId('covariance').replaceChildren(...matrixRows(covariance, ordering));
   show(byId('covariance-details'), Boolean(covariance && ordering));
   fillFacts(byId('symmetry'), [['Symmetry of the object', symmetry ? symmetryInWords(symmetry) : null]]);
   show(byId('certainty'), Boolean(uncertainty || symmetry));
+}
+
+/** How well the pose is known, in one sentence: of each kind the largest standard deviation. */
+function inWords({ uncertainty, metrics, T_scene_object: pose }) {
+  const most = (values) => Math.max(...(values ?? [NaN]));
+  const [center, turn, scale] = [most(uncertainty?.center_scene), most(uncertainty?.rotation_deg), uncertainty?.scale_percent];
+  const share = (100 * center) / ((metrics?.object_diameter ?? NaN) * (pose?.scale ?? NaN));
+  const parts = [
+    Number.isFinite(center) && `its center to ± ${number(center, 2)} scene units${Number.isFinite(share) ? `, ${number(share, 2)} % of its size` : ''}`,
+    Number.isFinite(turn) && `its rotation to ± ${number(turn, 2)}°`,
+    Number.isFinite(scale) && `its scale to ± ${number(scale, 2)} %`,
+  ].filter(Boolean);
+  return parts.length ? `The pose is known: ${parts.join('; ')}.` : '';
 }
 
 /** { order, axis, continuous } in words. */

@@ -1,32 +1,46 @@
 // Two results side by side, and how far their poses are apart.
 
+import { told } from './api.js';
+import { isShare, readSentences } from './documents.js';
 import { byId, el } from './dom.js';
-import { fixed, moment, number, words } from './format.js';
+import { fixed, moment, number, percent, words } from './format.js';
 import { inverse, partsOf, readSim3 } from './sim3.js';
 
 /** Opens the comparison of two jobs; names.nameOf(job) is what people call one. */
 export async function compareJobs(service, jobs, names) {
-  const results = await Promise.all(jobs.map(({ id }) => service.json(`/jobs/${id}/result`)));
+  byId('comparison').replaceChildren(el('caption', { className: 'note' }, 'Reading the results'));
+  byId('compare-dialog').showModal(); // at once: nothing else can be chosen while the answers are on their way
+  byId('compare-title').focus();
+  try {
+    const [about, ...results] = await Promise.all([readSentences(), ...jobs.map(({ id }) => service.json(`/jobs/${id}/result`))]);
+    draw(jobs, results, about, names);
+  } catch (error) {
+    byId('comparison').replaceChildren(el('caption', { className: 'bad' }, told(error)));
+  }
+}
+
+function draw(jobs, results, about, names) {
   const head = el('tr', {}, el('th', { scope: 'col' }, ''), ...jobs.map((job) => el('th', { scope: 'col' }, names.nameOf(job), el('br'), el('small', {}, moment(job.created_at)))));
+  const metrics = results.map(({ metrics: values }) => values ?? {});
+  const options = results.map(({ options: given }) => ({ preset: given?.preset, up_axis: given?.up_axis, ...given?.robust }));
   const rows = [
     ['Verdict', results.map(({ verdict }) => words(verdict))],
-    ['Why', results.map(({ verdict_reason: reason }) => words(reason))],
+    ['Why', results.map(({ verdict_reason: reason, verdict_detail: detail }) => detail || words(reason))],
     ['Seed', results.map(({ seed }) => String(seed))],
-    ...rowsOf(results.map(({ metrics }) => metrics ?? {})),
-    ...rowsOf(results.map(({ options }) => ({ preset: options?.preset, up_axis: options?.up_axis, ...options?.robust })), true),
+    ...rowsOf(metrics, (name) => about[name]?.title ?? words(name)),
+    ...rowsOf(options, (name) => `Option: ${words(name).toLowerCase()}`).filter(([, cells]) => cells[0] !== cells[1]),
   ];
   byId('comparison').replaceChildren(
     el('thead', {}, head),
     el('tbody', {}, ...apart(results), ...rows.map(([name, cells]) => row(name, cells))),
   );
-  byId('compare-dialog').showModal();
 }
 
-/** The rows of plain values; differing: of those alone that differ. */
-function rowsOf(values, differing = false) {
+/** The rows of plain values, under the words that the page of a job has for them. */
+function rowsOf(values, titleOf) {
   const names = [...new Set(values.flatMap(Object.keys))];
-  return names.map((name) => [words(name), values.map((value) => shown(value[name]))])
-    .filter(([, cells]) => cells.some((cell) => cell !== null) && !(differing && cells[0] === cells[1]));
+  return names.map((name) => [titleOf(name), values.map((value) => shown(name, value[name]))])
+    .filter(([, cells]) => cells.some((cell) => cell !== null));
 }
 
 function row(name, cells) {
@@ -45,7 +59,7 @@ function apart(results) {
   return [el('tr', {}, el('th', { scope: 'row' }, 'Second pose from the first'), el('td', { colSpan: 2 }, text))];
 }
 
-function shown(value) {
-  if (typeof value === 'number') return number(value, 4);
+function shown(name, value) {
+  if (typeof value === 'number') return isShare(name, value) ? percent(value) : number(value, 4);
   return typeof value === 'string' || typeof value === 'boolean' ? String(value) : null;
 }

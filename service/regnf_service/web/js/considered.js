@@ -25,10 +25,11 @@ export function offerConsidered(api, result, names, onChoose) {
     fillFacts(byId('considered-facts'), ROWS.map(([term, name, format]) => [term, Number.isFinite(metrics[name]) ? format(metrics[name]) : null]));
     arrays ??= names.includes('considered.npz') ? api.artifact('considered.npz').then(readNpz).catch(() => null) : null;
     const read = await arrays;
+    if (!byId('considered-list').querySelectorAll('input')[index]?.checked) return; // another pose was chosen meanwhile
     show(byId('considered-key'), Boolean(read));
     onChoose({ pose: readSim3(matrix), marks: read && marksOf(read, index, inverse(readSim3(matrix))) });
   };
-  byId('considered-list').replaceChildren(el('legend', { className: 'unseen' }, 'Pose that was judged'), ...poses.map((one, i) => {
+  byId('considered-list').replaceChildren(el('legend', { className: 'unseen' }, 'Candidate pose'), ...poses.map((one, i) => {
     const input = el('input', { type: 'radio', name: 'considered', value: String(i), onchange: () => choose(i) });
     const words = one.reason === AGREES ? 'The surfaces agree.' : one.detail || one.reason;
     const sure = el('span', { className: 'mono' }, percent(one.metrics?.probability));

@@ -13,6 +13,24 @@ export const phasesOf = (job) => (job.kind === 'render' ? RENDERING_PHASES : PHA
 
 export const isActive = (job) => job.status === 'accepted' || job.status === 'running';
 
+/** Whether a metric is shown as a bar, in per cent. */
+export const isShare = (name, value) => /share|overlap/.test(name) && value >= 0 && value <= 1;
+
+/** { title, meaning, good } of each metric; none where they cannot be had: names must do. */
+export async function readSentences() {
+  try {
+    return await (await fetch('/static/metrics.json')).json();
+  } catch {
+    return {};
+  }
+}
+
+/** Where work stands that no worker has yet: a job's or a field's document. */
+export function queueWords({ queue_position: position }) {
+  if (!Number.isFinite(position)) return 'Waiting for a worker: the next free one takes it';
+  return position <= 1 ? 'Waiting for a worker: it is next' : `Waiting for a worker: ${position - 1} before it`;
+}
+
 /** The detection box { center, size, quaternion } in the scene frame, or null. */
 export function detectionOf(job, result) {
   const sources = [job?.inputs, job?.request, result?.inputs, result, job];

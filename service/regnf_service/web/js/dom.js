@@ -32,6 +32,17 @@ export function fillFacts(list, pairs) {
   show(list, rows.length > 0);
 }
 
+/** Puts the focus on the title of the tile at a place of a list, of the last one if there are fewer, or on the list. */
+export function focusTile(list, place) {
+  const tile = list.children[Math.min(place, list.children.length - 1)];
+  (tile?.querySelector('h2') ?? list).focus();
+}
+
+/** Links between the pages stay below the prefix that this page was opened with. */
+export function keepPrefix(root) {
+  for (const link of document.querySelectorAll('[data-to]')) link.href = root + link.dataset.to;
+}
+
 /** Says something to screen readers without moving anything on the page. */
 export function announce(text) {
   byId('announce').textContent = text;

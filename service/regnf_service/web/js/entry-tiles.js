@@ -2,14 +2,15 @@
 
 import { el } from './dom.js';
 import { number, words } from './format.js';
-import { canvasOf } from './pictures.js';
+import { canvasOf, panelsOf } from './pictures.js';
+import { sizeOf } from './uploads.js';
 
 const TONES = { ready: 'good', rejected: 'bad', validating: 'warn' };
 
 /** acts: change(entry), remove(entry), choose(tag). */
 export function entryTile(service, entry, acts) {
-  const { bounds, unit } = entry;
-  const size = bounds && bounds[1].map((high, i) => number(high - bounds[0][i], 3)).join(' × ');
+  const { surface_bounds: surface, bounds, unit } = entry;
+  const size = sizeOf(surface ?? bounds);
   const facts = [size && `${size}${unit ? ` ${unit}` : ''}`, symmetryWords(entry)].filter(Boolean).join(', ');
   const tags = entry.tags.map((tag) => {
     const chip = el('button', { type: 'button', className: 'quiet', 'aria-label': `Show the tag ${tag}` }, tag);
@@ -17,7 +18,7 @@ export function entryTile(service, entry, acts) {
     return chip;
   });
   const node = el('article', { className: 'tile' },
-    el('h2', {}, entry.name),
+    el('h2', { tabIndex: -1 }, entry.name),
     ...(entry.state === 'ready' ? [] : [el('span', { className: 'word', 'data-tone': TONES[entry.state] }, words(entry.state))]),
     el('span', { className: 'note' }, facts),
     ...(entry.note ? [el('span', { className: 'note' }, entry.note)] : []),
@@ -50,7 +51,7 @@ function actions(service, entry, acts) {
 
 async function picture(service, entry, node) {
   try {
-    node.prepend(await canvasOf(await service.picture(entry.field), `${entry.name}: two views and a section`));
+    node.prepend(await canvasOf(await service.picture(entry.field), `${entry.name}: two views`, panelsOf('object')));
   } catch {
     // not every field has one
   }

@@ -1,41 +1,57 @@
 // One tile a field: its picture, what its import found, and what can be done with it.
 
-import { byId, el } from './dom.js';
-import { bytes, moment, number, words } from './format.js';
-import { canvasOf } from './pictures.js';
-import { nameOf } from './uploads.js';
+import { toldOf } from './api.js';
+import { askFirst } from './confirm.js';
+import { el } from './dom.js';
+import { bytes, moment, words } from './format.js';
+import { canvasOf, panelsOf } from './pictures.js';
+import { sayRole } from './roles.js';
+import { nameOf, sizeOf } from './uploads.js';
 
 const TONES = { ready: 'good', rejected: 'bad', validating: 'warn' };
 
 export class FieldTiles {
-  constructor(service, refresh) {
-    Object.assign(this, { service, refresh, entries: [], empty: 'No fields yet. Upload them on the page Register.' });
+  constructor(service, store, refresh) {
+    Object.assign(this, { service, store, refresh, empty: 'No fields yet. Upload them on the page Register.' });
   }
 
-  async load() {
-    const fields = await this.service.all('fields');
-    this.entries = fields.map((field) => ({ text: nameOf(field), states: [field.state], node: this.tile(field) }));
+  entries() {
+    return this.store.fields.map((field) => ({ text: nameOf(field), states: [field.state], node: this.tile(field) }));
   }
 
   tile(field) {
     const { report = {}, error } = field;
-    const size = report.bounds && report.bounds[1].map((high, i) => number(high - report.bounds[0][i], 3)).join(' × ');
-    const facts = [report.family, size, bytes(field.bytes), moment(field.created_at)].filter(Boolean).join(', ');
+    const size = sizeOf(report.surface_bounds ?? report.bounds);
+    const facts = [size, report.family, bytes(field.bytes), moment(field.created_at)].filter(Boolean).join(', ');
     const node = el('article', { className: 'tile' },
-      el('h2', {}, nameOf(field)),
+      el('h2', { tabIndex: -1 }, nameOf(field)),
       el('span', { className: 'word', 'data-tone': TONES[field.state] }, words(field.state)),
-      el('span', { className: 'note' }, error ? `${error.detail} ${error.hint ?? ''}` : facts),
+      el('span', { className: 'note' }, error ? toldOf(error) : facts),
+      ...(field.state === 'ready' ? [this.roleChoice(field)] : []),
       el('p', { className: 'row' }, ...this.actions(field)));
     if (field.state === 'ready') this.picture(field, node);
     return node;
+  }
+
+  /** What the page takes the field for; a person may know better. */
+  roleChoice(field) {
+    const role = this.store.role(field);
+    const options = [['object', 'an object'], ['scene', 'a scene']].map(([value, text]) => el('option', { value, selected: value === role }, text));
+    const select = el('select', { 'aria-label': `What ${nameOf(field)} is` }, ...options);
+    select.onchange = () => {
+      sayRole(field.sha256, select.value);
+      this.store.tell();
+    };
+    return el('label', { className: 'role note' }, 'This is ', select);
   }
 
   actions(field) {
     const remove = el('button', { type: 'button', className: 'quiet', 'aria-label': `Delete ${nameOf(field)}` }, 'Delete');
     remove.onclick = () => this.remove(field);
     if (field.state !== 'ready') return [remove];
+    const use = this.store.role(field) === 'scene' ? ['scene', 'Use as scene'] : ['object', 'Search for this'];
     return [
-      el('a', { className: 'button', href: `${this.service.root}/?scene=${field.sha256}` }, 'Use as scene'),
+      el('a', { className: 'button', href: `${this.service.root}/?${use[0]}=${field.sha256}` }, use[1]),
       ...(field.library ? [] : [el('a', { className: 'button', href: `${this.service.root}/library#add=${field.sha256}` }, 'Add to library')]),
       el('a', { className: 'button', href: field.links.mesh, download: `${nameOf(field)}.glb` }, 'Mesh'),
       remove,
@@ -45,19 +61,19 @@ export class FieldTiles {
   async picture(field, node) {
     const place = el('p', { className: 'note' }, field.views === 'pending' ? 'The picture is being drawn.' : '');
     node.prepend(place);
+    const role = this.store.role(field);
+    const label = `${nameOf(field)}: ${role === 'scene' ? 'a view and a section' : 'two views'}`;
     try {
-      place.replaceWith(await canvasOf(await this.service.picture(field.sha256), `${nameOf(field)}: two views and a section`));
+      place.replaceWith(await canvasOf(await this.service.picture(field.sha256), label, panelsOf(role)));
     } catch {
       place.remove(); // not every field has one
     }
   }
 
   async remove(field) {
-    try {
-      await this.service.request(`/fields/${field.sha256}`, { method: 'DELETE' });
-      await this.refresh();
-    } catch (error) {
-      byId('note').textContent = `${error.message} ${error.problem?.hint ?? ''}`;
-    }
+    const what = `Delete ${nameOf(field)}?`;
+    const lost = 'The service forgets the field; the file on your own disk stays. Jobs that used it keep their results.';
+    const act = () => this.service.request(`/fields/${field.sha256}`, { method: 'DELETE' });
+    if (await askFirst({ what, lost, verb: 'Delete', act })) await this.refresh();
   }
 }

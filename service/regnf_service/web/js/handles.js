@@ -8,6 +8,7 @@ import { axesOf } from './samples.js';
 const KEY_SHARE = 0.03; // of the box's size, for each press of an arrow key
 const KEY_TURN = Math.PI / 36;
 const SMALLEST = 0.01; // of the largest edge
+const CLEAR = 1.5; // of a handle's width: how far from the box's middle handles stay
 
 /** { x, y, z, w } as a list: the box's own turn about the up axis. */
 export function quaternionOf({ yaw }, up) {
@@ -71,10 +72,12 @@ export class Handles {
     const { number, outward, point } = this.face(i);
     const [size, center] = [[...this.box.size], this.box.center];
     const opposite = plus(point, outward, -size[number]);
+    let grip = null; // how far outside the face it was taken
     return (ray) => {
       const far = alongLine(ray, opposite, outward);
       if (far === null) return;
-      const edge = Math.max(far, SMALLEST * Math.max(...size));
+      grip ??= far - size[number];
+      const edge = Math.max(far - grip, SMALLEST * Math.max(...size));
       this.change({ size: size.with(number, edge), center: plus(center, outward, (edge - size[number]) / 2) });
     };
   }
@@ -132,20 +135,39 @@ export class Handles {
     const all = [...this.faces, this.move, this.turn];
     for (const node of all) node.toggleAttribute('hidden', !this.box);
     if (!this.box) return;
-    this.faces.forEach((node, i) => this.put(node, this.face(i).point));
-    this.put(this.move, this.box.center);
+    const middle = this.onScreen(this.box.center);
+    const clear = CLEAR * this.move.offsetWidth;
+    this.faces.forEach((node, i) => this.put(node, awayFrom(middle, this.onScreen(this.face(i).point), clear)));
     const [aside, , up] = this.axes();
-    const corner = plus(this.box.center, aside.direction, 0.75 * this.box.size[aside.number]);
-    this.put(this.turn, plus(corner, up.direction, -0.5 * this.box.size[up.number]));
+    const foot = plus(this.box.center, up.direction, -0.5 * this.box.size[up.number]);
+    const corner = plus(foot, aside.direction, 0.75 * this.box.size[aside.number]);
+    const bottom = awayFrom(middle, this.onScreen(foot), clear);
+    const below = { ...bottom, y: bottom.y + clear, seen: middle.seen };
+    this.put(this.move, below);
+    this.put(this.turn, awayFrom(below, this.onScreen(corner), clear));
   }
 
-  put(node, point) {
+  /** Where a point of the scene is drawn: { x, y } in pixels, and whether it is before the camera. */
+  onScreen(point) {
     const { camera, frame, renderer } = this.viewer;
     const at = frame.localToWorld(new Vector3(...point)).project(camera);
     const { clientWidth, clientHeight } = renderer.domElement;
-    node.style.transform = `translate(${((at.x + 1) / 2) * clientWidth}px, ${((1 - at.y) / 2) * clientHeight}px) translate(-50%, -50%)`;
-    if (at.z > 1) node.setAttribute('hidden', '');
+    return { x: ((at.x + 1) / 2) * clientWidth, y: ((1 - at.y) / 2) * clientHeight, seen: at.z <= 1 };
   }
+
+  put(node, { x, y, seen }) {
+    node.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
+    node.toggleAttribute('hidden', !seen);
+  }
+}
+
+/** A place on the screen, moved away from `middle` until it is so many pixels off: what is in the middle can be seen and clicked. */
+function awayFrom(middle, at, least) {
+  const [x, y] = [at.x - middle.x, at.y - middle.y];
+  const far = Math.hypot(x, y);
+  if (far >= least) return at;
+  const [dx, dy] = far > 1 ? [x / far, y / far] : [0, 0];
+  return { ...at, x: middle.x + dx * least, y: middle.y + dy * least, seen: at.seen && far > 1 };
 }
 
 const plus = (point, direction, far) => point.map((part, i) => part + far * direction[i]);

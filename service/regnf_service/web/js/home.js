@@ -1,27 +1,31 @@
 // The home page: a scene, objects, boxes around things, and what the service makes of them.
 
+import { told } from './api.js';
 import { BoxList } from './box-list.js';
-import { byId, show } from './dom.js';
+import { byId, keepPrefix, show } from './dom.js';
+import { FieldStore } from './field-store.js';
 import { ObjectList } from './object-list.js';
 import { OptionsForm } from './options-form.js';
 import { nameOf } from './uploads.js';
 import { Runs } from './runs.js';
 import { SceneChoice } from './scene-choice.js';
 import { Service } from './service.js';
-import { askForToken, keepPrefix } from './token.js';
+import { askForToken } from './token.js';
 import { Workspace } from './workspace.js';
 
 const service = new Service(askForToken);
-const options = new OptionsForm(byId('options-form'));
+const options = new OptionsForm(byId('options-form'), service);
+const store = new FieldStore(service);
 let workspace = null;
+let starting = false;
 
-const objects = new ObjectList(service, update);
-const scene = new SceneChoice(service, showScene, objects);
+const objects = new ObjectList(service, store, update);
+const scene = new SceneChoice(service, store, showScene, objects);
 const boxes = new BoxList(() => workspace, update);
 const runs = new Runs(service, () => workspace, options);
 
-/** Shows a ready field as the scene. */
-async function showScene(field, up) {
+/** Shows a ready field as the scene; isLatest(): whether no other one was chosen since. */
+async function showScene(field, up, isLatest) {
   show(byId('welcome'), false);
   show(byId('canvas'));
   show(byId('gizmo'));
@@ -31,10 +35,11 @@ async function showScene(field, up) {
   });
   boxes.clear();
   runs.clear();
+  delete document.documentElement.dataset.scene;
   objects.leaveOut(field.sha256);
-  update();
   tell(`${nameOf(field)}: its surface is being drawn.`);
   await workspace.showScene(service, field.sha256, up);
+  if (!isLatest()) return;
   tell(`${nameOf(field)}: click the thing to look for.`);
   document.documentElement.dataset.scene = field.sha256;
 }
@@ -49,19 +54,21 @@ function update() {
   const missing = [
     [!scene.field, 'a scene'], [!objects.chosen().length, 'an object'], [!boxes.boxes.length, 'a box: click a thing in the scene'],
   ].filter(([is]) => is).map(([, words]) => words);
-  byId('register').disabled = missing.length > 0;
+  byId('register').disabled = starting || missing.length > 0;
   byId('add-box').disabled = !scene.field;
   byId('missing').textContent = missing.length ? `Missing: ${missing.join('; ')}.` : '';
   if (boxes.boxes.length) tell(objects.chosen().length ? '' : 'Now add the object that this may be.');
 }
 
 byId('register').addEventListener('click', async () => {
-  byId('register').disabled = true;
+  starting = true;
+  update();
   try {
     boxes.rest();
     await runs.start(scene.field, objects.chosen(), boxes.boxes);
   } finally {
-    byId('register').disabled = false;
+    starting = false;
+    update();
   }
 });
 byId('scene-up').addEventListener('change', () => {
@@ -75,11 +82,24 @@ byId('canvas').addEventListener('keydown', (event) => {
   if (point) boxes.click(point);
 });
 
+async function load() {
+  try {
+    await store.load();
+  } catch (error) {
+    tell(`The fields could not be listed: ${told(error)} Reload the page later.`);
+  }
+}
+
+byId('options').addEventListener('toggle', async () => {
+  try {
+    await options.load();
+    byId('options-note').textContent = '';
+  } catch (error) {
+    byId('options-note').textContent = told(error);
+  }
+});
+addEventListener('pageshow', (event) => { if (event.persisted) load(); }); // the way back may show the page as it was left
 keepPrefix(service.root);
 update();
-try {
-  await Promise.all([objects.load(), scene.load()]);
-} catch (error) {
-  tell(`The fields could not be listed: ${error.message} Reload the page later.`);
-}
+await Promise.all([load(), scene.load()]);
 document.documentElement.dataset.page = 'ready';

@@ -1,7 +1,7 @@
 // The object in the scene, where the registration found it: rendered before and after, once somebody asks for it.
 
-import { ApiProblem } from './api.js';
-import { isActive, upAxisOf } from './documents.js';
+import { ApiProblem, told } from './api.js';
+import { isActive, queueWords, upAxisOf } from './documents.js';
 import { announce, byId, el, show } from './dom.js';
 import { words } from './format.js';
 import { canvasOf } from './pictures.js';
@@ -20,7 +20,7 @@ export function offerInScene(api, job, result) {
       await renderInScene(api, requestFor(job, upAxisOf(result.options)));
       show(button, false);
     } catch (error) {
-      note(error instanceof ApiProblem ? error.message : 'The picture could not be made. Try again.');
+      note(error instanceof ApiProblem ? told(error) : 'The picture could not be made. Try again.');
       button.disabled = false;
     }
   };
@@ -43,7 +43,7 @@ async function renderInScene(api, request) {
   let job = await api.startRendering(request);
   const rendering = api.ofJob(job.id);
   while (isActive(job)) {
-    note(job.status === 'accepted' ? 'In the queue' : `${words(job.phase ?? 'starting')}, ${Math.round(job.progress * 100)} %`);
+    note(job.status === 'accepted' ? queueWords(job) : `${words(job.phase ?? 'starting')}, ${Math.round(job.progress * 100)} %`);
     job = await rendering.job({ wait: job.status === 'accepted' ? 1 : 2 });
   }
   if (job.status !== 'successful') throw new ApiProblem(409, job.error ?? { detail: 'The rendering was dismissed.' });

@@ -1,9 +1,12 @@
 // One tile a job: whose objects and scene, its verdict, and what can be done with it.
 
+import { told, toldOf } from './api.js';
 import { compareJobs } from './compare.js';
+import { askFirst, deletionOf } from './confirm.js';
 import { byId, el } from './dom.js';
-import { isActive } from './documents.js';
+import { isActive, queueWords } from './documents.js';
 import { moment, seconds, words } from './format.js';
+import { boxOfJob, shortOf, titleOfJob } from './names.js';
 import { canvasOf } from './pictures.js';
 import { runAgain } from './run-again.js';
 import { nameOf } from './uploads.js';
@@ -13,47 +16,62 @@ const TONES = {
 };
 
 export class JobTiles {
-  constructor(service, refresh) {
-    Object.assign(this, { service, refresh, entries: [], chosen: new Map(), names: new Map() });
+  constructor(service, store, refresh) {
+    Object.assign(this, { service, store, refresh, chosen: new Map() });
     this.empty = 'No jobs yet. Start one on the page Register.';
     byId('compare').addEventListener('click', () => compareJobs(service, [...this.chosen.values()], this));
   }
 
-  async load() {
-    const [jobs, fields] = await Promise.all([this.service.all('jobs'), this.service.all('fields')]);
-    this.names = new Map(fields.map((field) => [field.sha256, nameOf(field)]));
-    this.chosen.clear();
+  entries() {
+    const { jobs } = this.store;
+    for (const id of this.chosen.keys()) if (!jobs.some((job) => job.id === id)) this.chosen.delete(id);
     this.mark();
-    this.entries = jobs.map((job) => ({ text: this.nameOf(job), states: [job.status, job.verdict], node: this.tile(job) }));
+    return jobs.map((job) => ({ text: this.nameOf(job), states: [job.status, job.verdict], node: this.tile(job) }));
   }
 
   /** The chair in the room. */
   nameOf(job) {
-    const { scene, object, candidates } = job.inputs;
-    const of = (sha256) => this.names.get(sha256) ?? String(sha256).slice(0, 8);
-    if (job.kind === 'render') return `Rendering of ${of(scene)}`;
-    return `${object ? of(object) : `One of ${candidates} objects`} in ${of(scene)}`;
+    const { fields } = this.store;
+    return titleOfJob(job, (sha256) => {
+      const field = fields.find((one) => one.sha256 === sha256);
+      return field ? nameOf(field) : shortOf(sha256);
+    });
   }
 
   tile(job) {
     const word = job.verdict ?? job.status;
-    const took = job.finished_at ? seconds((Date.parse(job.finished_at) - Date.parse(job.created_at)) / 1000) : null;
-    const facts = [moment(job.created_at), took && `${took} from request to end`, `seed ${job.inputs.seed ?? 0}`].filter(Boolean).join(', ');
     const node = el('article', { className: 'tile' },
-      el('h2', {}, this.nameOf(job)),
+      el('h2', { tabIndex: -1 }, this.nameOf(job)),
       el('span', { className: 'word', 'data-tone': TONES[word] ?? '' }, words(word)),
-      el('span', { className: 'note' }, job.error ? `${job.error.detail} ${job.error.hint ?? ''}` : facts),
+      ...this.lines(job).filter(Boolean).map((line) => el('span', { className: 'note' }, line)),
       el('p', { className: 'row' }, ...this.actions(job)));
     if (job.status === 'successful') this.picture(job, node);
     return node;
   }
 
+  lines(job) {
+    const { candidates } = job.inputs;
+    const took = job.finished_at ? seconds((Date.parse(job.finished_at) - Date.parse(job.created_at)) / 1000) : null;
+    const times = [moment(job.created_at), took && `${took} from request to end`, `seed ${job.inputs.seed ?? 0}`];
+    return [
+      job.error && toldOf(job.error),
+      job.status === 'accepted' && queueWords(job),
+      candidates && job.object_found && job.verdict !== 'rejected' && `the likeliest of ${candidates} objects`,
+      boxOfJob(job),
+      times.filter(Boolean).join(', '),
+    ];
+  }
+
   actions(job) {
     const name = this.nameOf(job);
-    const button = (text, act) => el('button', { type: 'button', className: 'quiet', 'aria-label': `${text}: ${name}`, onclick: act }, text);
+    const button = (text, act) => {
+      const node = el('button', { type: 'button', className: 'quiet', 'aria-label': `${text}: ${name}` }, text);
+      node.onclick = () => act(node);
+      return node;
+    };
     const open = el('a', { className: 'button', href: job.links.view, 'aria-label': `Open: ${name}` }, 'Open');
-    if (isActive(job)) return [open, button('Cancel', () => this.act(`/jobs/${job.id}/cancel`, 'POST'))];
-    const remove = button('Delete', () => this.act(`/jobs/${job.id}`, 'DELETE'));
+    if (isActive(job)) return [open, button('Cancel', (node) => this.cancel(job, node))];
+    const remove = button('Delete', () => this.remove(job));
     if (job.kind !== 'registration') return [open, remove];
     const again = button('Run again', () => runAgain(this.service, job));
     return job.status === 'successful' ? [open, again, remove, this.choice(job)] : [open, again, remove];
@@ -61,7 +79,7 @@ export class JobTiles {
 
   /** A mark for the comparison of two. */
   choice(job) {
-    const box = el('input', { type: 'checkbox', 'aria-label': `Compare: ${this.nameOf(job)}` });
+    const box = el('input', { type: 'checkbox', checked: this.chosen.has(job.id), autocomplete: 'off', 'aria-label': `Compare: ${this.nameOf(job)}` });
     box.onchange = () => {
       if (box.checked) this.chosen.set(job.id, job);
       else this.chosen.delete(job.id);
@@ -77,18 +95,25 @@ export class JobTiles {
   async picture(job, node) {
     try {
       const response = await this.service.request(`/jobs/${job.id}/artifacts/preview.png`, { cache: 'default' });
-      node.prepend(await canvasOf(await response.blob(), `${this.nameOf(job)}: before and after`));
+      const canvas = await canvasOf(await response.blob(), `${this.nameOf(job)}: before and after`, [0, 1]);
+      node.prepend(el('figure', {}, canvas, el('figcaption', { className: 'note' }, el('span', {}, 'before'), el('span', {}, 'after'))));
     } catch {
       // not every job has one
     }
   }
 
-  async act(path, method) {
+  async cancel(job, node) {
+    node.disabled = true;
     try {
-      await this.service.request(path, { method });
+      await this.service.request(`/jobs/${job.id}/cancel`, { method: 'POST' });
       await this.refresh();
     } catch (error) {
-      byId('note').textContent = `${error.message} ${error.problem?.hint ?? ''}`;
+      byId('note').textContent = told(error);
+      node.disabled = false;
     }
+  }
+
+  async remove(job) {
+    if (await askFirst(deletionOf(this.service, job, this.nameOf(job)))) await this.refresh();
   }
 }

@@ -1,6 +1,23 @@
-// What people call the fields of a job: their labels, else their family and the beginning of the digest.
+// What people call fields and jobs: fields by their labels, else by their family and the beginning of the digest.
 
+import { number } from './format.js';
 import { nameOf } from './uploads.js';
+
+/** The chair in the room. of(sha256): a field's name; found: the object of a search, as far as it is known. */
+export function titleOfJob(job, of, found = job.object_found) {
+  const { scene, object, candidates } = job.inputs ?? {};
+  if (job.kind === 'render') return `Rendering of ${of(scene)}`;
+  if (object) return `${of(object)} in ${of(scene)}`;
+  if (job.verdict === 'rejected') return `None of ${candidates ?? 'several'} objects in ${of(scene)}`;
+  return `${found ? of(found) : `One of ${candidates ?? 'several'} objects`} in ${of(scene)}`;
+}
+
+/** The box that a job looked in, in the scene's units; several in one scene are told apart by it. */
+export function boxOfJob(job) {
+  const { center, size } = job.inputs?.detection ?? {};
+  if (!center || !size) return '';
+  return `box ${size.map((edge) => number(edge, 3)).join(' × ')} at ${center.map((part) => number(part, 3)).join(', ')}`;
+}
 
 export class Names {
   constructor(api) {
@@ -17,16 +34,17 @@ export class Names {
 
   async of(sha256) {
     const field = await this.document(sha256);
-    return field ? nameOf(field) : String(sha256 ?? '').slice(0, 12);
+    return field ? nameOf(field) : shortOf(sha256);
   }
 
   /** The chair in the room; the object of a search may be known only by its result. */
   async ofJob(job, result = null) {
-    const { scene, candidates } = job.inputs ?? {};
-    const object = result?.object ?? job.inputs?.object;
-    if (job.kind === 'render') return `Rendering of ${await this.of(scene)}`;
-    if (!object) return `One of ${candidates ?? 'several'} objects in ${await this.of(scene)}`;
-    const [what, where] = await Promise.all([this.of(object), this.of(scene)]);
-    return `${what} in ${where}`;
+    const found = result?.object ?? job.object_found;
+    const known = [job.inputs?.scene, job.inputs?.object, found];
+    const names = new Map(await Promise.all(known.map(async (sha256) => [sha256, await this.of(sha256)])));
+    return titleOfJob({ ...job, verdict: result?.verdict ?? job.verdict }, (sha256) => names.get(sha256), found);
   }
 }
+
+/** What stands for a field that the service has no more. */
+export const shortOf = (sha256) => String(sha256 ?? '').slice(0, 8);

@@ -1,40 +1,38 @@
 // The objects to look for: those of the service, and files that are added.
 
 import { byId, el, show } from './dom.js';
-import { canvasOf } from './pictures.js';
+import { canvasOf, panelsOf } from './pictures.js';
 import { progressLine } from './progress.js';
+import { sayRole } from './roles.js';
 import { fieldOf, nameOf } from './uploads.js';
 
 export class ObjectList {
-  /** onChange() hears every change of the choice. */
-  constructor(service, onChange) {
-    Object.assign(this, { service, onChange, fields: [], boxes: new Map(), scene: null });
-    byId('object-file').addEventListener('change', (event) => this.take([...event.target.files]));
-    byId('all-objects').addEventListener('change', (event) => {
-      for (const box of this.shown()) box.checked = event.target.checked;
-      this.onChange();
-    });
-  }
-
-  async load() {
-    const fields = (await this.service.all('fields')).filter(({ state }) => state === 'ready');
-    this.fields = [...fields.filter(({ library }) => library), ...fields.filter(({ library }) => !library)]; // the library's first
+  /** Draws from store; onChange() hears every change of the choice. */
+  constructor(service, store, onChange) {
+    Object.assign(this, { service, store, onChange, checked: new Set(), rows: new Map(), scene: null });
     const asked = new URLSearchParams(location.search);
     const [object, tag] = [asked.get('object'), asked.get('tag')];
-    const meant = ({ sha256, library }) => sha256 === object || (tag !== null && library && (!tag || library.tags.includes(tag)));
-    for (const field of this.fields) this.add(field, meant(field));
+    this.isAskedFor = ({ sha256, library }) => sha256 === object || (tag !== null && library && (!tag || library.tags.includes(tag)));
+    byId('object-file').addEventListener('change', (event) => {
+      this.take([...event.target.files]);
+      event.target.value = ''; // the same file may be chosen again
+    });
+    byId('all-objects').addEventListener('change', (event) => {
+      for (const field of this.objects()) this.mark(field.sha256, event.target.checked);
+      this.changed();
+    });
+    store.onChange(() => this.changed());
   }
 
   /** Documents of the fields that are chosen. */
   chosen() {
-    return this.fields.filter(({ sha256 }) => sha256 !== this.scene && this.boxes.get(sha256)?.checked);
+    return this.offered().filter(({ sha256 }) => this.checked.has(sha256));
   }
 
   /** The scene is none of the objects. */
   leaveOut(sha256) {
     this.scene = sha256;
-    for (const [name, box] of this.boxes) show(box.parentElement, name !== sha256);
-    this.showAll();
+    this.changed();
   }
 
   take(files) {
@@ -45,41 +43,75 @@ export class ObjectList {
     const line = progressLine(file.name);
     byId('object-state').append(line.node);
     try {
-      this.add(await fieldOf(this.service, file, 'object', line.step), true);
+      const field = await fieldOf(this.service, file, 'object', line.step);
+      sayRole(field.sha256, 'object');
+      this.checked.add(field.sha256);
+      this.store.put(field);
       line.done();
     } catch (error) {
       line.fail(error);
     }
   }
 
-  add(field, checked) {
-    if (!this.boxes.has(field.sha256)) {
-      const box = el('input', { type: 'checkbox', value: field.sha256, onchange: () => this.onChange() });
-      const row = el('label', { className: 'check' }, box, el('span', {}, nameOf(field), ...tagsOf(field)));
-      byId('objects').append(row);
-      this.boxes.set(field.sha256, box);
-      if (!this.fields.includes(field)) this.fields.unshift(field);
-      this.picture(field, row);
-    }
-    if (checked) this.boxes.get(field.sha256).checked = true;
-    this.showAll();
+  mark(sha256, checked) {
+    if (checked) this.checked.add(sha256);
+    else this.checked.delete(sha256);
+  }
+
+  offered() {
+    return this.store.ready().filter(({ sha256 }) => sha256 !== this.scene);
+  }
+
+  /** What "all of them" means: scenes are no candidates, but may be chosen one by one. */
+  objects() {
+    return this.offered().filter((field) => this.store.role(field) === 'object');
+  }
+
+  /** Draws both lists from what is known now. */
+  changed() {
+    const offered = this.offered();
+    for (const field of offered) if (!this.rows.has(field.sha256)) this.addRow(field);
+    const objects = this.objects();
+    const scenes = offered.filter((field) => !objects.includes(field));
+    this.place(byId('objects'), objects);
+    this.place(byId('scenes-as-objects'), scenes);
+    for (const [sha256, { box }] of this.rows) box.checked = this.checked.has(sha256);
+    show(byId('objects-of-scenes'), scenes.length > 0);
+    show(byId('all-row'), objects.length > 1);
+    byId('all-objects').checked = objects.length > 0 && objects.every(({ sha256 }) => this.checked.has(sha256));
     this.onChange();
+  }
+
+  /** Has the host show the rows of these fields, in this order; rows that stay where they are keep the focus. */
+  place(host, fields) {
+    const rows = fields.map(({ sha256 }) => this.rows.get(sha256).row);
+    const shown = [...host.querySelectorAll('.check')];
+    if (rows.length !== shown.length || rows.some((row, i) => row !== shown[i])) {
+      shown.forEach((row) => row.remove());
+      host.append(...rows);
+    }
+    for (const field of fields) this.rows.get(field.sha256).name.replaceChildren(nameOf(field), ...tagsOf(field));
+  }
+
+  addRow(field) {
+    if (this.isAskedFor(field)) this.checked.add(field.sha256);
+    const box = el('input', { type: 'checkbox', value: field.sha256, autocomplete: 'off' });
+    box.onchange = () => {
+      this.mark(field.sha256, box.checked);
+      this.changed();
+    };
+    const name = el('span', {});
+    const row = el('label', { className: 'check' }, box, name);
+    this.rows.set(field.sha256, { row, box, name });
+    this.picture(field, row);
   }
 
   async picture(field, row) {
     try {
-      row.append(await canvasOf(await this.service.picture(field.sha256), ''));
+      row.append(await canvasOf(await this.service.picture(field.sha256), '', panelsOf(this.store.role(field))));
     } catch {
       // not every field has one
     }
-  }
-
-  shown() {
-    return [...this.boxes].filter(([sha256]) => sha256 !== this.scene).map(([, box]) => box);
-  }
-
-  showAll() {
-    show(byId('all-row'), this.shown().length > 1);
   }
 }
 

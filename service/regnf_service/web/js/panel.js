@@ -3,8 +3,10 @@
 import { secondsByPhase } from './documents.js';
 import { byId, copyText, el, fillFacts, show } from './dom.js';
 import { bytes, fixed, moment, number, percent, seconds, words } from './format.js';
+import { Turns } from './latest.js';
 import { inverse, partsOf, readSim3, rowsOf } from './sim3.js';
 
+const turns = new Turns();
 const DIRECTIONS = {
   T_scene_object: 'T_scene_object, the object’s pose in the scene: carries object coordinates to scene coordinates',
   T_object_scene: 'T_object_scene: carries scene coordinates to object coordinates',
@@ -115,11 +117,13 @@ export function showFiles(api, artifacts) {
 
 /** The job itself; names.js says what its fields are called. Their digests are the names' titles. */
 export async function showJob(names, job, result) {
+  const isLatest = turns.next();
   const engine = result?.engine ?? job.engine ?? {};
   const named = result?.candidates && result.object ? { 'object found': result.object } : {};
   const texts = Object.entries({ ...job.inputs, ...named }).filter(([, value]) => typeof value === 'string' && value !== '');
   const inputs = await Promise.all(texts.map(async ([name, value]) => [words(name), await valueOf(names, name, value)]));
   const title = await names.ofJob(job, result);
+  if (!isLatest()) return;
   document.title = `${title} – regnf`;
   byId('job-title').textContent = title;
   fillFacts(byId('job-facts'), [

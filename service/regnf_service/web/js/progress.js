@@ -1,5 +1,6 @@
 // One line for something that goes on: words and a bar.
 
+import { told } from './api.js';
 import { el } from './dom.js';
 
 /** { node, step(words, share), fail(error), done() } for what is called `name`. */
@@ -15,8 +16,7 @@ export function progressLine(name) {
       else bar.value = share;
     },
     fail(error) {
-      const hint = error.problem?.hint;
-      node.replaceChildren(el('p', { className: 'bad' }, `${name}: ${error.message}${hint ? ` ${hint}` : ''}`));
+      node.replaceChildren(el('p', { className: 'bad' }, `${name}: ${told(error)}`));
     },
     done() {
       node.remove();

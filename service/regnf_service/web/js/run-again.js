@@ -1,24 +1,41 @@
 // The same registration with other options: a form that begins with those of the earlier job.
 
-import { byId } from './dom.js';
+import { told } from './api.js';
+import { el } from './dom.js';
 import { OptionsForm } from './options-form.js';
 
 /** Opens the form for a registration that has ended. */
 export async function runAgain(service, job) {
-  const result = job.status === 'successful' ? await service.json(`/jobs/${job.id}/result`) : {};
-  const form = new OptionsForm(byId('again-options'), result.options, job.inputs.seed);
-  byId('again-note').textContent = '';
-  byId('again-start').onclick = async () => {
-    byId('again-start').disabled = true;
-    try {
-      const started = await service.post('/register', requestOf(job, result, form));
-      location.href = started.links.view;
-    } catch (error) {
-      byId('again-note').textContent = `${error.message} ${error.problem?.hint ?? ''}`;
-    }
-    byId('again-start').disabled = false;
-  };
-  byId('again-dialog').showModal();
+  const host = el('div', { className: 'options-form', id: 'again-options' });
+  const note = el('p', { className: 'bad', role: 'alert' });
+  const start = el('button', { type: 'button', className: 'solid', id: 'again-start', disabled: true }, 'Register');
+  const close = el('button', { type: 'button' }, 'Close');
+  const title = el('h2', { id: 'again-title' }, 'Run again with other options');
+  const dialog = el('dialog', { id: 'again-dialog', 'aria-labelledby': title.id }, title, host, note, el('div', { className: 'row end' }, close, start));
+  close.onclick = () => dialog.close();
+  dialog.addEventListener('close', () => dialog.remove());
+  document.body.append(dialog);
+  dialog.showModal(); // at once: nothing else can be clicked while the answer is on its way
+  try {
+    const result = job.status === 'successful' ? await service.json(`/jobs/${job.id}/result`) : {};
+    const form = new OptionsForm(host, service, result.options, job.inputs.seed);
+    await form.load();
+    start.onclick = () => post(service, requestOf(job, result, form), start, note);
+    start.disabled = false;
+  } catch (error) {
+    note.textContent = told(error);
+  }
+}
+
+async function post(service, request, start, note) {
+  start.disabled = true;
+  note.textContent = '';
+  try {
+    location.href = (await service.post('/register', request)).links.view;
+  } catch (error) {
+    note.textContent = told(error);
+    start.disabled = false;
+  }
 }
 
 function requestOf(job, result, form) {

@@ -1,19 +1,23 @@
 // The registrations that this page has started: their phases, and their results in the scene.
 
-import { ApiProblem } from './api.js';
+import { ApiProblem, told } from './api.js';
 import { announce, byId, el, show } from './dom.js';
+import { queueWords } from './documents.js';
 import { followJob } from './events.js';
 import { percent, seconds, words } from './format.js';
+import { Turns } from './latest.js';
 import { nameOf } from './uploads.js';
 
 const TONES = { registered: 'good', ambiguous: 'warn', rejected: 'bad' };
 
 export class Runs {
   constructor(service, workspace, options) {
-    Object.assign(this, { service, workspace, options });
+    Object.assign(this, { service, workspace, options, turns: new Turns() });
   }
 
+  /** Forgets what was started: it goes on, and its result stands on the page of jobs. */
   clear() {
+    this.turns.next();
     byId('runs').replaceChildren();
     show(byId('results'), false);
   }
@@ -21,12 +25,13 @@ export class Runs {
   /** One job for each box; with several objects, a search for which of them it is. */
   async start(scene, objects, boxes) {
     this.clear();
+    const isLatest = this.turns.next();
     show(byId('results'));
     byId('results').scrollIntoView({ block: 'nearest' });
-    await Promise.all(boxes.map(({ id, box }) => this.run(scene, objects, id, box)));
+    await Promise.all(boxes.map(({ id, box }) => this.run({ scene, objects, id, box }, isLatest)));
   }
 
-  async run(scene, objects, id, box) {
+  async run({ scene, objects, id, box }, isLatest) {
     const row = el('li', { className: 'run' });
     byId('runs').append(row);
     const began = performance.now();
@@ -39,19 +44,21 @@ export class Runs {
       if (job.status === 'failed') throw new ApiProblem(422, job.error ?? {});
       if (job.status === 'dismissed') throw new ApiProblem(409, { detail: 'The job was canceled.' });
       const result = await this.service.json(`/jobs/${job.id}/result`);
+      if (!isLatest()) return;
       const found = objects.find(({ sha256 }) => sha256 === result.object) ?? objects[0];
       this.showResult(row, id, job, result, found, performance.now() - began);
-      if (result.verdict !== 'rejected') await this.workspace().showFound(this.service, id, found.sha256, result.T_scene_object.matrix);
+      const pose = result.T_scene_object.matrix;
+      if (result.verdict !== 'rejected') await this.workspace().showFound(this.service, id, found.sha256, pose, isLatest);
     } catch (error) {
-      const hint = error.problem?.hint ?? '';
-      row.replaceChildren(el('strong', {}, `Box ${id}`), el('p', { className: 'bad' }, `${error.message} ${hint}`));
+      if (!isLatest()) return;
+      row.replaceChildren(el('strong', {}, `Box ${id}`), el('p', { className: 'bad' }, told(error)));
       announce(`Box ${id}: ${error.message}`);
     }
   }
 
   showActive(row, id, job) {
     const waits = job.status === 'accepted';
-    const text = waits ? 'In the queue' : words(job.phase ?? 'starting');
+    const text = waits ? queueWords(job) : words(job.phase ?? 'starting');
     if (row.dataset.job !== job.id) {
       row.dataset.job = job.id;
       const cancel = el('button', { type: 'button', className: 'quiet' }, 'Cancel');

@@ -4,7 +4,7 @@ import { ApiProblem, JobApi, TOKEN_KEY, problemOf } from './api.js';
 import { bytes } from './format.js';
 import { patientFetch } from './patience.js';
 
-const FOLLOW_S = 20;
+const FOLLOW_S = 4; // its place in the queue changes meanwhile, which ends no wait
 
 export class Service {
   /** onToken() is asked for a token, as a promise, whenever the service wants one. */
@@ -25,10 +25,12 @@ export class Service {
   async request(path, options = {}) {
     for (;;) {
       const { headers = {}, ...rest } = options;
-      const authorized = this.token ? { ...headers, Authorization: `Bearer ${this.token}` } : headers;
+      const { token } = this;
+      const authorized = token ? { ...headers, Authorization: `Bearer ${token}` } : headers;
       const response = await patientFetch(this.root + path, { cache: 'no-cache', ...rest, headers: { Accept: '*/*', ...authorized } });
       if (response.ok) return response;
       if (response.status !== 401) throw new ApiProblem(response.status, await problemOf(response));
+      if (this.token !== token) continue; // somebody has entered one since this was asked
       sessionStorage.setItem(TOKEN_KEY, await this.onToken());
     }
   }
@@ -52,12 +54,19 @@ export class Service {
     }
   }
 
-  /** The field's document once its import has ended. */
-  async imported(sha256) {
-    for (;;) {
-      const field = await this.field(sha256, FOLLOW_S);
+  /** The field's document once its import has ended; onNews hears of it until then. */
+  async imported(sha256, onNews = () => {}) {
+    for (let wait = 0; ; wait = FOLLOW_S) {
+      const field = await this.field(sha256, wait);
       if (!field || field.state !== 'validating') return field;
+      onNews(field);
     }
+  }
+
+  /** Gives a field a name for people; its document. */
+  async label(sha256, label) {
+    const options = { method: 'PATCH', headers: { 'Content-Type': 'application/json' }, body: JSON.stringify({ label }) };
+    return this.json(`/fields/${sha256}`, options);
   }
 
   /** All of a list, at most `most`: name is fields, jobs or library. */

@@ -4,7 +4,7 @@ import { Cloud, geometryFromArrays, geometryFromPly, isColorful } from './cloud.
 import { wireBox } from './box.js';
 import { detectionOf, upAxisOf } from './documents.js';
 import { byId, el, show } from './dom.js';
-import { ellipsoidOf } from './ellipsoid.js';
+import { Turns } from './latest.js';
 import { residualHistogram } from './plot.js';
 import { readResiduals } from './residuals.js';
 import { meshesOf } from './result-meshes.js';
@@ -23,6 +23,7 @@ export class Stage {
     this.plain = {}; // name -> Cloud
     this.meshes = null; // name -> Surface
     this.marked = []; // names of layers
+    this.turns = new Turns();
   }
 
   /** Fetches the surfaces and shows them; frames as documents.js reads them. */
@@ -47,7 +48,6 @@ export class Stage {
     show(byId('before-chip'), frames.length > 1);
     show(byId('surfaces-dial'), this.meshes !== null);
     this.addBox(box);
-    this.addUncertainty(result);
     this.draw();
     this.moveTo(frames.length - 1);
     this.wire();
@@ -140,21 +140,6 @@ export class Stage {
     if (box) this.viewer.setLayer('box', { object: wireBox(box), tint: 'cloud-box' });
   }
 
-  /** At the pose of the result, wherever the object is shown; hidden until it is asked for. */
-  addUncertainty({ covariance, center_object: center, T_object_scene: pose }) {
-    const { geometry } = this.plain.after;
-    geometry.computeBoundingBox();
-    const { min, max } = geometry.boundingBox;
-    const found = center && ellipsoidOf(covariance, center, pose.translation, min.distanceTo(max));
-    show(byId('uncertainty-chip'), Boolean(found));
-    if (!found) return;
-    const { object, factor } = found;
-    object.matrix.copy(this.poses.at(-1));
-    byId('uncertainty-name').textContent = factor > 1 ? `Uncertainty × ${factor}` : 'Uncertainty';
-    this.viewer.setLayer('uncertainty', { object, tint: 'cloud-uncertainty' });
-    this.viewer.setVisible('uncertainty', false);
-  }
-
   wire() {
     for (const input of byId('layers').querySelectorAll('input')) {
       input.onchange = () => this.viewer.setVisible(input.dataset.layer, input.checked);
@@ -180,7 +165,9 @@ export class Stage {
   }
 
   async redraw() {
+    const isLatest = this.turns.next();
     const residuals = byId('color').value === 'residual' ? await this.loadResiduals() : null;
+    if (!isLatest()) return;
     this.draw(residuals);
     this.place(this.pose);
     show(byId('legend'), Boolean(residuals));

@@ -1,6 +1,6 @@
 // The badge in the bar and the card in the view's place: loading, running, failed, dismissed, not found.
 
-import { ApiProblem } from './api.js';
+import { ApiProblem, toldOf } from './api.js';
 import { isActive, phasesOf } from './documents.js';
 import { byId, el, fillFacts, show } from './dom.js';
 import { words } from './format.js';
@@ -47,13 +47,13 @@ export function showTrouble(error) {
 export function showFailed(job) {
   showBadge('failed', job.id);
   const problem = job.error ?? {};
-  card({ eyebrow: 'The job failed', title: titleOf(problem), text: problem.detail ?? '', tone: 'bad' });
+  card({ eyebrow: 'The job failed', title: titleOf(problem), text: toldOf({ ...problem, hint: null, title: null }), tone: 'bad' });
   showProblem(problem);
 }
 
 export function showDismissed(job) {
   showBadge('dismissed', job.id);
-  card({ eyebrow: 'No result', title: 'The job was dismissed', text: 'Post the same request to start it again.', tone: 'still' });
+  card({ eyebrow: 'No result', title: 'The job was dismissed', text: 'It was canceled before it had a result. Run again starts it anew.', tone: 'still' });
 }
 
 /** A refusal of the service, or a broken connection. onRetry is offered where trying again makes sense. */
@@ -65,7 +65,7 @@ export function showError(error, onRetry) {
   card({
     eyebrow: error.status ? `The service answered ${error.status}` : 'No connection',
     title: titles[error.status] ?? problem.title ?? 'The job could not be loaded',
-    text: error.message,
+    text: toldOf({ ...problem, detail: error.message, hint: null }),
     tone: error.status === 401 ? 'wait' : 'bad',
   });
   showProblem(problem);

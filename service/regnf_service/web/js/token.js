@@ -19,8 +19,3 @@ export function askForToken() {
   });
   return asked;
 }
-
-/** Links between the pages stay below the prefix that this page was opened with. */
-export function keepPrefix(root) {
-  for (const link of document.querySelectorAll('[data-to]')) link.href = root + link.dataset.to;
-}

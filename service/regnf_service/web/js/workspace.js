@@ -4,6 +4,7 @@ import { Matrix4 } from '../vendor/three.bundle.min.js';
 import { wireBox } from './box.js';
 import { geometryFromGlb } from './glb.js';
 import { Handles, quaternionOf } from './handles.js';
+import { Turns } from './latest.js';
 import { Mover } from './mover.js';
 import { firstHit, rayAt } from './pick.js';
 import { Proposer } from './propose.js';
@@ -19,6 +20,7 @@ export class Workspace {
     this.handles = new Handles(host, this.viewer, onBox);
     this.mover = new Mover(this.viewer);
     this.up = 'z';
+    this.turns = new Turns();
     this.proposer = null;
     this.onClick = onClick;
     this.listen(canvas);
@@ -26,15 +28,18 @@ export class Workspace {
 
   /** Shows the scene: its coarse mesh first, which arrives at once, then the fine one. */
   async showScene(service, sha256, up) {
+    const isLatest = this.turns.next();
     this.clear();
     this.up = up;
     this.viewer.setUp(up);
     const coarse = geometryFromGlb(await service.mesh(sha256, 'coarse'));
+    if (!isLatest()) return;
     this.scene = new Surface(coarse, { open: isOriented(coarse) });
     this.viewer.setLayer('scene', { object: this.scene.points, cloud: this.scene, tint: 'mesh-scene' });
     this.viewer.look(['scene'], 0.9);
     this.mover.show(this.scene, coarse, coarse);
     const fine = geometryFromGlb(await service.mesh(sha256, 'fine'));
+    if (!isLatest()) return;
     this.mover.show(this.scene, fine, coarse);
     this.proposer = null;
   }
@@ -50,6 +55,7 @@ export class Workspace {
   clear() {
     for (const name of [...this.viewer.layers.keys()]) this.viewer.removeLayer(name);
     this.handles.edit(null, this.up);
+    this.scene = null; // what is not drawn cannot be clicked
     this.proposer = null;
   }
 
@@ -72,9 +78,10 @@ export class Workspace {
     this.viewer.removeLayer(`found-${id}`);
   }
 
-  /** Shows the object that was found for a box, at T_scene_object. */
-  async showFound(service, id, sha256, rows) {
+  /** Shows the object that was found for a box, at T_scene_object; isLatest(): whether it is still wanted by then. */
+  async showFound(service, id, sha256, rows, isLatest) {
     const surface = new Surface(geometryFromGlb(await service.mesh(sha256, 'coarse')), { plain: true, nearer: true });
+    if (!isLatest()) return;
     surface.place(new Matrix4().set(...rows.flat()));
     this.viewer.setLayer(`found-${id}`, { object: surface.points, cloud: surface, tint: 'cloud-after' });
     this.viewer.invalidate();
@@ -88,7 +95,7 @@ export class Workspace {
     let began = null;
     canvas.addEventListener('pointerdown', (event) => { began = event.isPrimary ? event : null; });
     canvas.addEventListener('pointerup', (event) => {
-      if (!began || !this.scene) return;
+      if (!began) return;
       const moved = Math.hypot(event.clientX - began.clientX, event.clientY - began.clientY);
       began = null;
       if (moved > CLICK_PIXELS || event.button !== 0) return;
@@ -99,6 +106,7 @@ export class Workspace {
 
   /** Where the pointer meets what is drawn of the scene: surfaces seen from behind are not. */
   hit(event) {
+    if (!this.scene) return null;
     const { uOpen } = this.scene.material.uniforms;
     return firstHit(this.mover.fine, rayAt(event, this.viewer), (volume) => uOpen.value && volume < 0);
   }

@@ -51,7 +51,7 @@ def shell(points: Tensor) -> Tensor:
 
 def judged(field: _Field, sign: int | None = 1) -> str | None:
     """None, or what is said against it."""
-    measured, _ = check_plausibility(field)
+    measured, _, _ = check_plausibility(field)
     try:
         require_plausible(measured, sign)
     except FieldFormatError as error:

@@ -46,7 +46,7 @@ def reason_of(field: _Field) -> str:
 
 def test_a_sphere_is_plausible() -> None:
     """Share inside by hand: 4/3 pi 0.5^3 of the cube's 8."""
-    figures, warnings = check_plausibility(sphere(0.5))
+    figures, warnings, _ = check_plausibility(sphere(0.5))
     assert warnings == []
     assert figures["share_inside"] == pytest.approx(0.0654, abs=0.006)
     assert figures["share_inside_at_bounds"] == 0.0
@@ -61,14 +61,14 @@ def test_the_faces_count_alike_whatever_their_size() -> None:
 
 
 def test_a_surface_too_small_for_the_samples_is_found_by_walking() -> None:
-    figures, _ = check_plausibility(sphere(0.01))
+    figures, _, _ = check_plausibility(sphere(0.01))
     assert figures["share_inside"] < 1e-3
     assert figures["surface_points"] > 100
 
 
 @pytest.mark.parametrize("factor", [0.2, 5.0])
 def test_a_gradient_far_from_one_is_warned_of(factor: float) -> None:
-    figures, warnings = check_plausibility(sphere(0.5, factor))
+    figures, warnings, _ = check_plausibility(sphere(0.5, factor))
     assert figures["gradient_median"] == pytest.approx(factor, rel=1e-3)
     assert [w.split(":")[0] for w in warnings] == ["GRADIENT_NOT_UNIT"]
 

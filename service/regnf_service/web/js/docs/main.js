@@ -1,16 +1,20 @@
 // The page of the contract: reads openapi.json, fills navigation and operations, follows the search and the address.
 
-import { byId, el, show } from '../dom.js';
+import { byId, el, keepPrefix, show } from '../dom.js';
+import { Turns } from '../latest.js';
 import { byTag, matches, operationsOf } from './contract.js';
 import { operationNode } from './operation.js';
 import { inline, paragraphs } from './text.js';
 import { token } from './token.js';
 
+const turns = new Turns();
 const ROOT = window.location.pathname.replace(/\/docs\/?$/, '');
 
 async function load() {
+  const isLatest = turns.next(); // with an older token the answer may come later
   const headers = token.value ? { Authorization: `Bearer ${token.value}` } : {};
   const response = await fetch(`${ROOT}/openapi.json`, { headers });
+  if (!isLatest()) return;
   if (response.status === 401) return complain('This service asks for an access token. Enter yours above.');
   if (!response.ok) return complain(`The contract did not come: the service answered ${response.status}.`);
   show(byId('problem'), false);
@@ -107,4 +111,5 @@ byId('token-form').addEventListener('submit', (event) => {
   load();
 });
 window.addEventListener('hashchange', follow);
+keepPrefix(ROOT);
 load();
