@@ -56,6 +56,8 @@ HINTS: dict[str, str] = {
     "CAMERAS_INTRINSICS_MISSING": "With regnf convert: --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT.",
     "CAMERAS_OF_ANOTHER_FRAME": "Give the trainer's settings, or dataset_transform in a description; or say which way "
     "cameras look: cameras.axes, opencv or opengl.",
+    "TRUNCATION_UNKNOWN": "Say the distance that the value 1 stands for: --scene-description '{\"truncation\": ...}' (of "
+    "the object: --object-description; of inspect and convert: --description), over HTTP the description's truncation.",
     "RAW_PICKLE": "Save it again with torch.save.",
     "INVALID_DETECTION": "docs/api.md shows every form of a detection.",
     "INVALID_OPTIONS": "docs/api.md lists every option with its range.",

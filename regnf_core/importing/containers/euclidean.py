@@ -4,6 +4,9 @@ A fused map measures along the cameras' axes. At a surface that was seen at an a
 distance, by 1 / cos of the angle: twice as large in the median of rooms that a camera walked through. Noise makes them
 larger too. No distance is larger than the one to the surface which the values themselves cross zero at, so that is the
 bound that they are cut to. The surface stays where it is, and values within the bound stay as they are.
+
+Where nothing says which length the value 1 stands for, the surface alone gives the distances: the place where values
+cross zero is the same whatever they were divided by.
 """
 
 from __future__ import annotations
@@ -32,6 +35,13 @@ _FEWEST = 4
 _TRIED, _LARGER, _SHARE = 20_000, 1.1, 0.05
 """Values of which so large a share is larger than their bound by so much are no distances. Exact ones in a grid are
 off by less."""
+_INNER, _OUTER = 0.3, 0.9
+"""Values between which a node is neither at the surface nor cut off in some of the images."""
+_BLOCKS, _FEWEST_RATIOS = 1_500, 200
+_EVEN, _ROUND = 1.12, 0.05
+"""Ratios as even as this, about a surface with normals to all sides, are of distances that are not projective."""
+_WHOLE = 0.05
+"""Truncations are whole numbers of nodes, and are measured so well."""
 
 
 def bound_by_surface(
@@ -60,13 +70,58 @@ def bound_by_surface(
     return True
 
 
+def measure_from_surface(values: Float32Array, seen: BoolArray, blocks: IntArray, spacing: float, most: float) -> None:
+    """Replace the values (B, R, R, R) that were seen, of any unit, by their distances from where they cross zero, cut
+    off at ``most``; changed in place. Of values that cross zero nowhere, 1 becomes ``most``.
+
+    blocks, spacing: see :func:`bound_by_surface`.
+    """
+    surface = _Surface.of(crossings(values, seen, blocks) * spacing, _APART * spacing)
+    if surface is None:
+        values *= np.float32(most)
+        return
+    seen_nodes, flat = np.flatnonzero(seen), values.reshape(-1)
+    step = np.full(3, spacing)
+    for start in range(0, len(seen_nodes), _AT_ONCE):
+        part = seen_nodes[start : start + _AT_ONCE]
+        distance = surface.distance(_places(part, values, blocks, step), most)
+        flat[part] = np.copysign(np.minimum(distance, most), flat[part])
+
+
+def length_of_one(values: Float32Array, seen: BoolArray, blocks: IntArray) -> float | None:
+    """How many nodes wide the length is that the value 1 stands for, where the values (B, R, R, R), cut off at 1, are
+    distances to the surface; None where they are projective, or too few to tell."""
+    if len(blocks) > _BLOCKS:  # so many near one another
+        middle = blocks[np.random.default_rng(0).integers(len(blocks))]
+        near = np.sort(np.argsort(np.square(blocks - middle).sum(axis=1), kind="stable")[:_BLOCKS])
+        values, seen, blocks = values[near], seen[near], blocks[near]
+    surface = crossings(values, seen, blocks)
+    chosen = np.flatnonzero(seen & (np.abs(values) > _INNER) & (np.abs(values) < _OUTER))
+    if min(len(surface), len(chosen)) < _FEWEST_RATIOS:
+        return None
+    chosen = np.random.default_rng(0).choice(chosen, min(_TRIED, len(chosen)), replace=False)
+    places, value = _places(chosen, values, blocks, np.ones(3)), values.reshape(-1)[chosen].astype(np.float64)
+    distance, nearest = cKDTree(surface).query(places)
+    ratios = distance / np.abs(value)
+    low, ratio, high = (float(ratios_at) for ratios_at in np.quantile(ratios, [0.1, 0.5, 0.9]))
+    normals = (places - surface[nearest]) / np.maximum(distance, 1e-9)[:, None]
+    if high > _EVEN * low or np.linalg.eigvalsh(normals.T @ normals / len(normals))[0] < _ROUND:
+        return None
+    return float(round(ratio)) if abs(ratio - round(ratio)) <= _WHOLE * ratio else ratio
+
+
+def _places(chosen: IntArray, values: Float32Array, blocks: IntArray, step: Float64Array) -> Float64Array:
+    """(M, 3) of the nodes number ``chosen`` (M,)."""
+    at = np.unravel_index(chosen, values.shape)
+    return np.asarray((np.array(values.shape[1:]) * blocks[at[0]] + np.stack(at[1:], axis=1)) * step, np.float64)
+
+
 def _bounds(
     surface: _Surface, values: Float32Array, blocks: IntArray, chosen: IntArray, step: Float64Array
 ) -> tuple[Float32Array, Float32Array]:
     """The sizes of the values number ``chosen`` (M,), and their distances from the surface."""
-    at = np.unravel_index(chosen, values.shape)
-    nodes = (np.array(values.shape[1:]) * blocks[at[0]] + np.stack(at[1:], axis=1)) * step
-    size = np.abs(values[at])
+    size = np.abs(values.reshape(-1)[chosen])
+    nodes = _places(chosen, values, blocks, step)
     return size, surface.distance(nodes, float(size.max())).astype(np.float32)
 
 

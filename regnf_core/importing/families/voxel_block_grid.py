@@ -11,9 +11,13 @@ import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, tensor_error
-from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface
+from regnf_core.importing.containers.euclidean import (
+    PROJECTIVE,
+    bound_by_surface,
+    length_of_one,
+    measure_from_surface,
+)
 from regnf_core.importing.containers.npz import ArraySource
-from regnf_core.importing.containers.truncation import USUAL, truncation_evidence
 from regnf_core.importing.containers.voxel_maps import (
     IntArray,
     fill_unseen,
@@ -32,6 +36,8 @@ _INDEX = re.compile(r"[0-9]{1,3}")
 _LARGEST_EDGE = 256
 _LARGEST = 1.001
 """Values beyond this were not divided by the truncation."""
+_USUAL = 8.0
+"""Open3D's default of ``trunc_voxel_multiplier``."""
 
 _T = TypeVar("_T", bound=np.generic)
 
@@ -59,10 +65,8 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     require_family(overrides, FAMILY)
     refuse_other_entries(overrides, FAMILY, ("truncation",))
     blocks = _read(arrays)
-    truncation, why, warnings = _truncation(blocks, overrides)
-    values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
     seen = blocks.weights > 0
-    projective = bound_by_surface(values, seen, blocks.keys, blocks.voxel_size)
+    values, reasons, warnings = _distances(blocks, seen, overrides)
     fill_unseen(values, seen, blocks.voxel_size, overrides.sign or 1)
     low, high = seen_extent(blocks.keys, seen)
     description = {
@@ -74,8 +78,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     told = f"arrays key, block_resolution and attr_name_tsdf: {len(blocks.keys)} blocks of {values.shape[1]}^3 voxels"
     tensors: dict[str, StoredArray] = {"values": values, "blocks": blocks.keys.astype(np.int32)}
     tensors["weights"] = stored_weights(blocks.weights)
-    reasons = (told, why, PROJECTIVE) if projective else (told, why)
-    converted = ConvertedField(FAMILY, reasons, description, tensors, warnings)
+    converted = ConvertedField(FAMILY, (told, *reasons), description, tensors, warnings)
     if "attr_name_color" not in arrays or overrides.color.keep is False:
         return converted
     return with_values(converted, lambda: _colors(arrays, blocks))
@@ -113,35 +116,37 @@ def _read(arrays: ArraySource) -> _Blocks:
     return _Blocks(tsdf[kept], weights[kept], keys[kept], voxel_size, np.asarray(kept))
 
 
-def _truncation(blocks: _Blocks, overrides: UploadDescription) -> tuple[float, str, tuple[str, ...]]:
-    """The distance that the value 1 stands for, how it was told, and warnings.
+def _distances(
+    blocks: _Blocks, seen: npt.NDArray[np.bool_], overrides: UploadDescription
+) -> tuple[Float32Array, tuple[str, ...], tuple[str, ...]]:
+    """The voxels' distances, how they were told, and warnings.
 
+    The file does not say which distance the value 1 stands for. Where the values are projective, they cannot tell it
+    either: twice the truncation and a camera that looked at 60 degrees leave the same ones. So the distances are then
+    measured from the surface, and the usual truncation says only where they are cut off.
     Raises FieldFormatError (TRUNCATION_UNKNOWN).
     """
-    if overrides.truncation is not None:
-        return overrides.truncation, f"truncation {overrides.truncation:g}, as the settings or the description say", ()
-    largest = float(np.abs(blocks.tsdf[blocks.weights > 0]).max())
-    if largest > _LARGEST:
-        said = f"values up to {largest:.3g}, where those of a map divided by its truncation end at 1"
-        raise _unknown(f"{said}; say 'truncation', the distance that the value 1 stands for")
-    found = truncation_evidence(blocks.tsdf, blocks.weights, blocks.keys)
-    if found.settled is not None:
-        why = f"truncation of {found.settled:g} voxels: the distances to the surface give {found.voxels:.3g}"
-        return found.settled * blocks.voxel_size, why, ()
-    if not found.allows_usual:
-        likely = found.nearest * blocks.voxel_size
-        said = f"the voxels that a camera faced give about {found.voxels:.2g} voxels, not Open3D's default of {USUAL:g}"
-        raise _unknown(f"{said}; say 'truncation', most likely {likely:.4g} ({found.nearest:g} voxels)")
-    distance = USUAL * blocks.voxel_size
-    told = (
-        "there is too little surface to tell" if found.voxels is None else f"the values give about {found.voxels:.2g}"
+    size, truncation = blocks.voxel_size, overrides.truncation
+    why = f"truncation {truncation:g}, as the settings or the description say" if truncation is not None else ""
+    if truncation is None:
+        largest = float(np.abs(blocks.tsdf[seen]).max())
+        if largest > _LARGEST:
+            said = f"values up to {largest:.3g}, where those of a map divided by its truncation end at 1"
+            raise FieldFormatError(f"the map's truncation is not in the file: {said}", reason="TRUNCATION_UNKNOWN")
+        if (voxels := length_of_one(blocks.tsdf, seen, blocks.keys)) is not None:
+            truncation = voxels * size
+            why = f"truncation of {voxels:g} voxels: by the distances to the surface"
+    if truncation is not None:
+        values: Float32Array = np.multiply(blocks.tsdf, np.float32(truncation))
+        projective = bound_by_surface(values, seen, blocks.keys, size)
+        return values, ((why, PROJECTIVE) if projective else (why,)), ()
+    measure_from_surface(blocks.tsdf, seen, blocks.keys, size, _USUAL * size)
+    why = f"truncation of {_USUAL:g} voxels, Open3D's default: the values do not tell it"
+    text = f"the file does not say its truncation: distances are measured from the surface, up to {_USUAL * size:.4g} "
+    text += (
+        f"({_USUAL:g} voxels, Open3D's default); if it was fused with another one, say it in a description: truncation"
     )
-    text = f"distances are cut off at {distance:.4g}, Open3D's default of {USUAL:g} voxels; if not so, say 'truncation'"
-    return distance, f"truncation of {USUAL:g} voxels, Open3D's default: {told}", (f"TRUNCATION_ASSUMED: {text}",)
-
-
-def _unknown(message: str) -> FieldFormatError:
-    return FieldFormatError(f"the map's truncation is not in the file: {message}", reason="TRUNCATION_UNKNOWN")
+    return blocks.tsdf, (why,), (f"TRUNCATION_ASSUMED: {text}",)
 
 
 def _attribute(arrays: ArraySource, name: str) -> str:

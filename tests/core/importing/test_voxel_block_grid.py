@@ -15,6 +15,7 @@ from safetensors import safe_open
 
 from regnf_core.fields.build import open_field
 from regnf_core.fields.color import has_color
+from regnf_core.hints import HINTS
 from regnf_core.importing.containers.euclidean import PROJECTIVE
 from regnf_core.importing.gate.convert import FIELD_NAME, convert_file
 from regnf_core.importing.gate.report import ImportLimits
@@ -171,18 +172,8 @@ def fused(voxels: float, aslant: float = 0.0) -> dict[str, Any]:
     }
 
 
-def test_the_default_truncation_is_assumed_where_fused_distances_allow_it(tmp_path: Path) -> None:
-    arrays = fused(8.0)
-    report = converted(tmp_path, arrays)
-    assert report["warnings"][0].startswith("TRUNCATION_ASSUMED: ")
-    assert "0.16" in report["warnings"][0]
-
-
-def test_fused_distances_become_those_to_the_surface(tmp_path: Path) -> None:
-    """Before surfaces that were seen at an angle the file's values are too large; the exact scene is known."""
-    arrays = fused(8.0)
-    report = converted(tmp_path, arrays)
-    assert PROJECTIVE in report["why"]
+def before_the_box(arrays: dict[str, Any], voxels: float) -> tuple[NDArray[np.float64], ...]:
+    """Nodes that were seen before a surface of the exact scene, their distances, and what the file says of them."""
     seen = np.argwhere(arrays["value_001"][..., 0] > 0)
     block, z, y, x = seen.T
     nodes = 0.02 * (16 * arrays["key"][block] + np.stack((x, y, z), axis=1))
@@ -190,11 +181,39 @@ def test_fused_distances_become_those_to_the_surface(tmp_path: Path) -> None:
         outside(nodes, [0.0, 0.0, 0.25], [0.3, 0.25, 0.25]), outside(nodes, [0.0, 0.0, -0.05], [1.0, 1.0, 0.05])
     )
     before = (true > 0.01) & (true < 0.08) & (np.abs(nodes[:, :2]).max(axis=1) < 0.7)
-    stored = 0.16 * arrays["value_000"][tuple(seen.T)][before, 0]
-    distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(nodes[before])).numpy()
-    assert np.median(np.abs(stored - true[before])) > 0.04
+    stored = 0.02 * voxels * arrays["value_000"][tuple(seen.T)][before, 0]
+    return nodes[before], true[before], stored
+
+
+def test_fused_distances_become_those_to_the_surface(tmp_path: Path) -> None:
+    """Before surfaces that were seen at an angle the file's values are too large; the exact scene is known."""
+    arrays = fused(8.0)
+    report = converted(tmp_path, arrays, {"truncation": 0.16})
+    assert PROJECTIVE in report["why"]
+    assert report["warnings"] == []
+    nodes, true, stored = before_the_box(arrays, 8.0)
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(torch.from_numpy(nodes)).numpy()
+    assert np.median(np.abs(stored - true)) > 0.04
     assert (np.abs(distance) <= np.abs(stored) + 1e-6).all()
-    assert np.median(np.abs(distance - true[before])) < 0.002  # what stands behind another thing was not seen
+    assert np.median(np.abs(distance - true)) < 0.002  # what stands behind another thing was not seen
+
+
+@pytest.mark.parametrize("voxels", [4.0, 5.0, 8.0, 10.0, 12.0, 16.0])
+@pytest.mark.parametrize("aslant", [0.0, 0.2])
+def test_distances_are_right_whatever_they_were_divided_by(tmp_path: Path, voxels: float, aslant: float) -> None:
+    """The file does not say it: nothing is refused, and a warning says where distances are cut off."""
+    arrays = fused(voxels, aslant)
+    report = converted(tmp_path, arrays)
+    assert [warning.split(":")[0] for warning in report["warnings"]] == ["TRUNCATION_ASSUMED"]
+    assert "up to 0.16 (8 voxels, Open3D's default)" in report["warnings"][0]
+    nodes, true, stored = before_the_box(arrays, voxels)
+    free = stored > 0.0  # wide truncations reach through the box to its other side, and are matter there
+    nodes, true = torch.from_numpy(nodes[free]), true[free]
+    distance = open_field(tmp_path / FIELD_NAME).signed_distance(nodes).numpy()
+    converted(tmp_path, arrays, {"truncation": 0.02 * voxels})
+    told = open_field(tmp_path / FIELD_NAME).signed_distance(nodes).numpy()
+    assert np.median(np.abs(distance - true)) < 1.05 * np.median(np.abs(told - true)) < 0.003
+    assert np.median(np.abs(distance / told - 1.0)) < 0.01
 
 
 def outside(points: NDArray[np.float64], center: list[float], half: list[float]) -> NDArray[np.float64]:
@@ -202,19 +221,11 @@ def outside(points: NDArray[np.float64], center: list[float], half: list[float])
     return np.asarray(np.linalg.norm(np.maximum(np.abs(points - center) - half, 0.0), axis=1))
 
 
-@pytest.mark.parametrize("voxels", [4.0, 5.0, 12.0, 16.0])
-def test_fused_distances_of_another_truncation_are_asked_about(tmp_path: Path, voxels: float) -> None:
-    arrays = fused(voxels, aslant=0.2)
-    assert_refused(lambda: converted(tmp_path, arrays), "TRUNCATION_UNKNOWN")
-    report = converted(tmp_path, arrays, {"truncation": 0.02 * voxels})
-    assert "TRUNCATION_ASSUMED" not in [warning.split(":")[0] for warning in report["warnings"]]
-    assert f"truncation {0.02 * voxels:g}, as the settings or the description say" in report["why"]
-
-
 def test_values_that_were_not_divided_by_a_truncation_are_asked_about(tmp_path: Path) -> None:
     arrays = ball(4.0)
     arrays["value_000"] = 40.0 * arrays["value_000"]
     assert_refused(lambda: converted(tmp_path, arrays), "TRUNCATION_UNKNOWN")
+    assert "--scene-description" in HINTS["TRUNCATION_UNKNOWN"]
 
 
 def test_weights_are_kept_and_zero_where_nothing_was_seen(tmp_path: Path) -> None:
