@@ -8,4 +8,4 @@ of this engine. The version of the package does not say this. It changes with ea
 have changed. A test fails when the engine's code has changed and this was not done.
 """
 
-ENGINE_REVISION = 22
+ENGINE_REVISION = 23

@@ -26,7 +26,7 @@ from typing import Any
 import httpx
 import numpy as np
 
-from regnf_cli.demo import MAX_ROTATION_RAD, MAX_SCALE_SHARE, MAX_CENTER_SHARE
+from regnf_cli.demo import MAX_CENTER_SHARE, MAX_ROTATION_RAD, MAX_SCALE_SHARE
 from regnf_cli.embedded_redis import answers, server_binary
 from regnf_cli.remote import RemoteService
 from regnf_core.errors import RegnfError

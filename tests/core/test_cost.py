@@ -62,7 +62,7 @@ def test_every_option_that_makes_work_makes_cost(name: tuple[str, str]) -> None:
         ("resampling", "radius_fraction"), ("robust", "held_out_share"), ("robust", "inlier_distance"),
         ("robust", "min_inlier_share"), ("robust", "min_explained_share"), ("robust", "max_free_space_violations"),
         ("robust", "max_occluded_share"), ("robust", "rival_margin"), ("robust", "box_tolerance"),
-            ("robust", "min_probability"),
+            ("robust", "min_probability"), ("robust", "share_limits_below"),
     }  # fmt: skip
     assert (name in found) != (name in without_work)
 

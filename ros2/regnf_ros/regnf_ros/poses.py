@@ -107,9 +107,9 @@ def field_from_map(dataparser_transforms: str) -> Matrix:
 class ObjectPose:
     """Where an object stands. position and quaternion: of T_map_object, its scale taken out: the object's origin.
 
-    scale: meters of one object unit · covariance: 6x6, of x, y, z and rotations about the map's fixed axes (REP 103), of
-    the same origin. It does not depend on where the map's origin is. An object's origin that lies far from its surface
-    is moved by the rotation's uncertainty.
+    scale: meters of one object unit · covariance: 6x6, of x, y, z and rotations about the map's fixed axes (REP 103),
+    of the same origin. It does not depend on where the map's origin is. An object's origin that lies far from its
+    surface is moved by the rotation's uncertainty.
     """
 
     position: tuple[float, float, float]
