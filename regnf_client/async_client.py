@@ -154,7 +154,7 @@ class AsyncClient:
     async def batch(
         self, requests: Iterable[PairLike], progress: Report | None = None, timeout_s: float | None = None
     ) -> AsyncIterator[PairResult]:
-        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come, each batch in its order.
+        """Any number of registrations, each a ``Pair`` or the members of a request; results as they come.
 
         A pair that fails stops no other. Called again with the same requests after an interruption, it goes on.
         """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -148,9 +148,10 @@ class BatchReader:
         refused = []
         size = sum(len(line) for _, line in self._lines)
         while len(self._lines) < PAIRS_AT_ONCE and size < _BYTES_AT_ONCE:
-            index, given = next(self._requests, (None, None))
-            if index is None:
+            following = next(self._requests, None)
+            if following is None:
                 break
+            index, given = following
             try:
                 line = json.dumps((yield from self._line(Pair.of(given)))).encode()
                 self._lines.append((index, line))

@@ -87,8 +87,10 @@ class Posting:
             line.is_done = is_told and status in ("running", "successful")
 
     def require_room(self) -> None:
-        """Raises Problem QUOTA_BATCHES, QUOTA_STORED_BYTES, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS; nothing
-        is started then."""
+        """Raises Problem QUOTA_BATCHES, QUOTA_STORED_BYTES, QUOTA_ACTIVE_JOBS, QUEUE_FULL, QUOTA_WORKER_SECONDS.
+
+        Then nothing is started.
+        """
         services, caller = self._services, self._caller
         self._require_batches()
         new = {line.job for line in self.lines if line.is_new}
@@ -186,8 +188,8 @@ def find_batch(services: Services, caller: str, batch_id: str) -> Batch:
 def jobs_of(services: Services, job_ids: Sequence[str]) -> dict[str, _Held]:
     """The jobs of these ids, some at a time; None for one that is gone."""
     found: dict[str, _Held] = {}
-    for start in range(0, len(job_ids), _AT_ONCE):
-        few = job_ids[start : start + _AT_ONCE]
+    for first in range(0, len(job_ids), _AT_ONCE):
+        few = job_ids[first : first + _AT_ONCE]
         found |= dict(zip(few, services.records.get_jobs(few), strict=True))
     return found
 
@@ -242,10 +244,10 @@ def results_page(services: Services, batch: Batch, after: int, limit: int, statu
 
 def _ended(services: Services, batch: Batch, after: int) -> Iterator[tuple[int, Pair, _Held]]:
     """The pairs behind the first ``after`` with their numbers and jobs, up to the first that has not ended."""
-    for start in range(after, min(after + _LOOKED_AT, len(batch.pairs)), _AT_ONCE):
-        few = batch.pairs[start : start + _AT_ONCE]
+    for first in range(after, min(after + _LOOKED_AT, len(batch.pairs)), _AT_ONCE):
+        few = batch.pairs[first : first + _AT_ONCE]
         jobs = jobs_of(services, list(dict.fromkeys(pair.job for pair in few if pair.job is not None)))
-        for number, pair in enumerate(few, start + 1):
+        for number, pair in enumerate(few, first + 1):
             job = jobs[pair.job] if pair.job is not None else None
             if isinstance(job, JobRecord) and job.status in ACTIVE:
                 return

@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,12 @@ from tests.contract.world import BOX, RESULT, World
 @pytest.fixture
 def working(world: World) -> Iterator[World]:
     """A worker has every job succeed, until the test ends."""
-    yield from at_work(world)
+    with at_work(world):
+        yield world
 
 
-def at_work(world: World) -> Iterator[World]:
+@contextmanager
+def at_work(world: World) -> Iterator[None]:
     ended = threading.Event()
     world.valid_request()
 
@@ -36,9 +39,11 @@ def at_work(world: World) -> Iterator[World]:
 
     worker = threading.Thread(target=run)
     worker.start()
-    yield world
-    ended.set()
-    worker.join()
+    try:
+        yield
+    finally:
+        ended.set()
+        worker.join()
 
 
 def requests(world: World, count: int) -> Iterator[dict[str, Any]]:
@@ -94,7 +99,7 @@ def test_more_pairs_than_the_service_has_room_for_become_several_batches(
 ) -> None:
     """Each as large as there is room: here two jobs at once, and three lines a batch."""
     world = worlds(quota_active_jobs=2, max_batch_pairs=3)
-    for _ in at_work(world):
+    with at_work(world):
         posts = []
         transport = AppTransport(world.app)
         whole = transport.handle_request
@@ -139,7 +144,7 @@ def test_an_interrupted_call_goes_on(worlds: Callable[..., World]) -> None:
             next(begun)
         jobs = [job_id for job_id, _ in world.queue.registrations]
         assert len(jobs) == 4
-        for _ in at_work(world):
+        with at_work(world):
             found = [*client.batch(requests(world, 2)), *client.batch(requests(world, 6))]
     assert [one.job for one in found[2:6]] == jobs
     assert {world.records.get_job(one.job).attempt for one in found} == {1}  # type: ignore[union-attr, arg-type]

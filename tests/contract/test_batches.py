@@ -275,7 +275,9 @@ def test_the_library_is_looked_up_once_for_all_lines(world: World, monkeypatch: 
     looks: list[str] = []
     for look in ("list_entries", "entries_named"):
         whole = getattr(world.records, look)
-        monkeypatch.setattr(world.records, look, lambda *args, whole=whole: looks.append(look) or whole(*args))
+        monkeypatch.setattr(
+            world.records, look, lambda *args, whole=whole, look=look: looks.append(look) or whole(*args)
+        )
     del request["object"]
     lines = [{**request, "seed": n, "candidates": {"library": {"tags": ["chair"]}}} for n in range(30)]
     lines += [{**request, "seed": n, "object": {"library": "a"}} for n in range(30)]
@@ -430,7 +432,7 @@ def test_a_post_that_dies_midway_is_taken_up_by_the_next(
         assert post(world, lines).status_code == 500
         assert world.client.get("/batches").json()["batches"] == [], "no half batch"
     batch_id = posted(world, lines)
-    assert len(work(world)) == len(set(one["job"] for one in results(world, batch_id))) == 4
+    assert len(work(world)) == len({one["job"] for one in results(world, batch_id)}) == 4
     assert {world.records.get_job(one["job"]).attempt for one in results(world, batch_id)} == {1}
 
 

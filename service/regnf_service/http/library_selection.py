@@ -61,7 +61,10 @@ class CallersLibrary:
         new = [name for name in dict.fromkeys(names.values()) if name not in self._by_name]
         if new:
             entries = self._services.records.entries_named(self._caller, new)
-            held = [one and _Entry(sha256_of(one.field.sha256), one.field.state == "rejected") for one in entries]
+            held = [
+                None if one is None else _Entry(sha256_of(one.field.sha256), one.field.state == "rejected")
+                for one in entries
+            ]
             self._by_name.update(zip(new, held, strict=True))
         found = {pointer: self._by_name[name] for pointer, name in names.items()}
         missing = [pointer for pointer, entry in found.items() if entry is None]
