@@ -76,14 +76,16 @@ class RemoteService:
                 return sha256
             if source.said or settings is not None:
                 _require_same(checked(known), source, settings)
-        self._name(checked(known), source)
+        self._name(sha256, checked(known).get("label"), source)
         return sha256
 
-    def _name(self, held: dict[str, Any], source: FieldSource) -> None:
-        """Call a field that the service holds as the user now does, or by the file's name where it has none."""
-        label = held.get("label")
-        if source.label and label != source.label and (label is None or "label" in source.said):
-            checked(self._http.patch(f"/fields/{held['sha256']}", json={"label": source.label}))
+    def _name(self, sha256: str, held: str | None, source: FieldSource) -> None:
+        """Call a field that the service holds as the user now does, or by the file's name where it has none.
+
+        What refuses a name takes the registration nevertheless.
+        """
+        if source.label and held != source.label and (held is None or "label" in source.said):
+            self._http.patch(f"/fields/{sha256}", json={"label": source.label})
 
     def _send(self, source: FieldSource, settings: Path | None, report: Report) -> None:
         """The bytes, what is said of them, and their settings."""

@@ -133,7 +133,7 @@ def _named(asking: Asking, known: Field, source: FieldSource) -> Flow[Field]:
     if not source.label or known.label == source.label or (known.label is not None and "label" not in source.said):
         return known
     answer = yield from call(asking.patience, "PATCH", f"/fields/{known.sha256}", json={"label": source.label})
-    return parsed(Field, checked(answer))
+    return parsed(Field, checked(answer)) if answer.is_success else known  # a name is no condition
 
 
 def find(asking: Asking, field: FieldLike) -> Flow[Field]:

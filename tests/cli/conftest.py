@@ -70,7 +70,7 @@ def serve() -> Iterator[Serve]:
                 self.end_headers()
                 self.wfile.write(body.encode())
 
-            do_GET = do_PUT = do_POST = answer  # noqa: N815 (the names that http.server calls)
+            do_GET = do_PUT = do_POST = do_PATCH = answer  # noqa: N815 (the names that http.server calls)
 
             def log_message(self, *_: Any) -> None:
                 """Say nothing."""

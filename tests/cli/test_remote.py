@@ -44,6 +44,19 @@ def test_the_verdict_decides(verdict: str, code: int, run: Run, demo: list[objec
     assert outcome.stdout.startswith(f"verdict      {verdict}  (BECAUSE)")
 
 
+def test_fields_that_the_service_has_without_a_name_get_one(run: Run, demo: list[object], serve: Serve) -> None:
+    asked: list[str] = []
+
+    def answers(method: str, path: str) -> Answer:
+        if path.startswith("/fields/"):
+            asked.append(method)
+        return service("registered")(method, path)
+
+    outcome = run(*demo, "--server", serve(answers))
+    assert outcome.code == 0, outcome.stderr
+    assert asked.count("PATCH") == 2
+
+
 def without_worker(stuck: str, checks: object = None) -> Answers:
     """A service whose fields (``stuck`` = fields) or jobs never end, for want of a worker or as ``checks`` say."""
     ready = service("registered")

@@ -31,6 +31,15 @@ def test_put_stores_the_bytes_and_queues_their_import(world: World) -> None:
     assert world.queue.imports == [(sha256(A), 1)]
 
 
+def test_an_import_that_waits_says_how_many_are_before_it(world: World) -> None:
+    for name in ("a", "b"):
+        data = field_bytes(name)
+        world.client.put(f"/fields/{sha256(data)}", content=data)
+    assert world.client.get(f"/fields/{sha256(B)}").json()["queue_position"] == 2
+    listed = world.client.get("/fields", headers={"Accept": "application/json"}).json()["fields"]
+    assert [one["queue_position"] for one in listed] == [None, None]
+
+
 def test_the_same_upload_twice_is_one_field(world: World) -> None:
     assert [world.client.put(f"/fields/{sha256(A)}", content=A).status_code for _ in range(2)] == [201, 200]
     assert world.queue.imports == [(sha256(A), 1)]

@@ -49,7 +49,9 @@ class PretendWorker:
                     self._finish(job)
 
     def _import(self, field: FieldRecord) -> None:
-        report = {"family": "mesh", "bounds": self._mesh(field).bounds.tolist()}
+        low, high = self._mesh(field).bounds
+        padded = [(low - 0.1 * (high - low)).tolist(), (high + 0.1 * (high - low)).tolist()]
+        report = {"family": "mesh", "bounds": padded, "surface_bounds": [low.tolist(), high.tolist()]}
         self._records.update_field(field.sha256, attempt=field.attempt, state="ready", report=report, views="pending")
 
     def _draw(self, field: FieldRecord) -> None:
@@ -70,11 +72,15 @@ class PretendWorker:
     def _finish(self, job: JobRecord) -> None:
         self._records.update_job(job.id, 1, status="running", phase="optimizing", progress=0.5)
         scene_object = np.array(self._pose)
+        candidates = job.request.get("candidates")
+        candidates = candidates and [sha256_of(one) for one in candidates]
+        found = job.inputs.get("object") or candidates[0]
         result: dict[str, Any] = {
             "verdict": "registered",
             "verdict_reason": "SURFACES_AGREE",
             "verdict_detail": "Object and scene match on held-out points.",
-            "object": job.inputs.get("object"),
+            "object": found,
+            "candidates": candidates and [{"object": one, "stage": "refined", "score": 0.1} for one in candidates],
             "T_object_scene": _transform(np.linalg.inv(scene_object)),
             "T_scene_object": _transform(scene_object),
             "probability": 0.97,
@@ -86,7 +92,8 @@ class PretendWorker:
         self._blobs.put(f"jobs/{job.id}/1/result.json", data)
         listed = [{"name": "result.json", "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}]
         self._blobs.put(f"jobs/{job.id}/manifest.json", json.dumps({"attempt": 1, "artifacts": listed}).encode())
-        self._records.update_job(job.id, 1, status="successful", verdict="registered")
+        searched = {"object_found": found} if candidates else {}
+        self._records.update_job(job.id, 1, status="successful", verdict="registered", **searched)
 
 
 def _transform(matrix: np.ndarray[Any, Any]) -> dict[str, Any]:

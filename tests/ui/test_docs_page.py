@@ -31,10 +31,10 @@ def open_docs(visit: Visit, service: RealService, anchor: str = "") -> Page:
 
 def test_every_operation_is_listed_and_folded(visit: Visit, service: RealService) -> None:
     page = open_docs(visit, service)
-    expect(page.locator("nav a[href='#register']")).to_have_text("POST /register")
+    expect(page.locator("nav[aria-label='Addresses'] a[href='#register']")).to_have_text("POST /register")
     assert page.locator("details.operation[open]").count() == 0
-    assert page.locator("details.operation").count() == page.locator("nav a").count()
-    page.locator("nav a[href='#register']").click()
+    assert page.locator("details.operation").count() == page.locator("nav[aria-label='Addresses'] a").count()
+    page.locator("nav[aria-label='Addresses'] a[href='#register']").click()
     expect(page.locator("#register textarea")).to_be_visible()
     assert visit.complaints == []
     assert [url for url in visit.requests if not url.startswith(service.origin + "/")] == []
@@ -90,7 +90,7 @@ def test_a_token_is_asked_for_and_sent(visit: Visit) -> None:
         page.locator("#token").fill(TOKEN)
         page.locator("#token-form button").click()
         page.wait_for_selector("html[data-page=ready]")
-        page.locator("nav a[href='#list_jobs']").click()
+        page.locator("nav[aria-label='Addresses'] a[href='#list_jobs']").click()
         page.locator("#list_jobs").get_by_role("button", name="Send GET").click()
         expect(page.locator("#list_jobs .answer")).to_contain_text("200")
         page.evaluate("sessionStorage.clear()")
@@ -101,6 +101,6 @@ def test_it_fits_a_phone(visit: Visit, service: RealService) -> None:
     page = open_docs(visit, service)
     page.set_viewport_size({"width": 360, "height": 700})
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
-    page.locator("nav a[href='#register']").click()
+    page.locator("nav[aria-label='Addresses'] a[href='#register']").click()
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     page.set_viewport_size({"width": 1100, "height": 700})

@@ -48,7 +48,7 @@ def test_a_rendering_that_fails_says_why(visit: Visit) -> None:
     failed = {"id": "x", "kind": "render", "status": "failed", "error": {"detail": "the camera at (1, 2) is in matter"}}
     page.route("**/render", lambda route: route.fulfill(status=200, json=failed))
     page.locator("#render-in-scene").click()
-    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is in matter")
+    expect(page.locator("#in-scene-note")).to_have_text("the camera at (1, 2) is in matter.")
 
 
 @pytest.mark.parametrize("story", ["bare", "ambiguous", "failed"])

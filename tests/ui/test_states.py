@@ -66,6 +66,8 @@ def test_cancel_ends_the_job(visit: Visit) -> None:
     page.locator("#cancel").click()
     page.wait_for_selector("text=The job was dismissed")
     expect(page.locator("#status")).to_have_text("Dismissed")
+    expect(page.locator("#message-text")).to_contain_text("Run again starts it anew.")
+    expect(page.locator("#run-again")).to_be_visible()
 
 
 def test_failure_tells_reason_and_detail_as_text(visit: Visit) -> None:

@@ -1,10 +1,14 @@
 """Results in the blob store: a job has one."""
 
 import hashlib
+import json
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 from regnf_state.manifest import Artifact, Manifest, read_manifest
-from regnf_worker.artifacts import discard_others, publish, store_artifacts
+from regnf_worker.artifacts import discard_others, publish, store_artifacts, told_by_result
 from tests.stores import HeldBlobs
 
 
@@ -33,3 +37,24 @@ def test_a_job_has_one_result(tmp_path: Path) -> None:
         blobs.put(key, b".")
     discard_others(blobs, first)
     assert sorted(blobs.blobs) == ["jobs/j1/1/x", "jobs/j1/manifest.json", "jobs/j10/2/x"]
+
+
+@pytest.mark.parametrize(
+    ("result", "told"),
+    [
+        ({"verdict": "registered", "object": "a1"}, {"verdict": "registered", "object_found": None}),
+        (
+            {"verdict": "rejected", "object": "a1", "candidates": [{"object": "a1"}]},
+            {"verdict": "rejected", "object_found": "a1"},
+        ),
+        ({"verdict": "?", "object": 3, "candidates": [{}]}, {"verdict": None, "object_found": None}),
+        ([], {}),
+    ],
+)
+def test_a_record_says_the_verdict_and_which_object_a_search_has_found(
+    tmp_path: Path, result: Any, told: dict[str, Any]
+) -> None:
+    blobs = HeldBlobs(tmp_path)
+    manifest = Manifest("j1", 1, (Artifact("result.json", 1, "0"),))
+    blobs.put(manifest.key("result.json"), json.dumps(result).encode())
+    assert told_by_result(blobs, manifest) == told

@@ -21,7 +21,7 @@ import {
 import { Playback } from './playback.js';
 import { DistancePlot } from './plot.js';
 import { showRanking } from './ranking.js';
-import { runAgain } from './run-again.js';
+import { canRunAgain, runAgain } from './run-again.js';
 import { Service } from './service.js';
 import { inverse, readSim3 } from './sim3.js';
 import { Stage } from './stage.js';
@@ -61,7 +61,7 @@ async function main() {
 /** What can be done with a job that has ended. */
 function offerActs(job) {
   const service = new Service(() => Promise.reject(new Error('The token is no longer taken. Reload the page.')));
-  show(byId('run-again'), job.kind === 'registration');
+  show(byId('run-again'), canRunAgain(job));
   show(byId('delete-job'));
   byId('run-again').onclick = () => runAgain(service, job);
   byId('delete-job').onclick = async () => {

@@ -60,6 +60,6 @@ function apart(results) {
 }
 
 function shown(name, value) {
-  if (typeof value === 'number') return isShare(name, value) ? percent(value) : number(value, 4);
+  if (typeof value === 'number') return isShare(name, value) || /probability|violations/.test(name) ? percent(value) : number(value, 4);
   return typeof value === 'string' || typeof value === 'boolean' ? String(value) : null;
 }

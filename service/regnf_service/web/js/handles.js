@@ -136,15 +136,12 @@ export class Handles {
     for (const node of all) node.toggleAttribute('hidden', !this.box);
     if (!this.box) return;
     const middle = this.onScreen(this.box.center);
-    const clear = CLEAR * this.move.offsetWidth;
-    this.faces.forEach((node, i) => this.put(node, awayFrom(middle, this.onScreen(this.face(i).point), clear)));
     const [aside, , up] = this.axes();
     const foot = plus(this.box.center, up.direction, -0.5 * this.box.size[up.number]);
     const corner = plus(foot, aside.direction, 0.75 * this.box.size[aside.number]);
-    const bottom = awayFrom(middle, this.onScreen(foot), clear);
-    const below = { ...bottom, y: bottom.y + clear, seen: middle.seen };
-    this.put(this.move, below);
-    this.put(this.turn, awayFrom(below, this.onScreen(corner), clear));
+    const below = { ...middle, y: Math.max(this.onScreen(foot).y, middle.y) + 1 };
+    const wanted = [...this.faces.map((_, i) => this.onScreen(this.face(i).point)), below, this.onScreen(corner)];
+    spread(middle, wanted, this.move.offsetWidth).forEach((at, i) => this.put(all[i], at));
   }
 
   /** Where a point of the scene is drawn: { x, y } in pixels, and whether it is before the camera. */
@@ -161,13 +158,22 @@ export class Handles {
   }
 }
 
-/** A place on the screen, moved away from `middle` until it is so many pixels off: what is in the middle can be seen and clicked. */
-function awayFrom(middle, at, least) {
-  const [x, y] = [at.x - middle.x, at.y - middle.y];
-  const far = Math.hypot(x, y);
-  if (far >= least) return at;
-  const [dx, dy] = far > 1 ? [x / far, y / far] : [0, 0];
-  return { ...at, x: middle.x + dx * least, y: middle.y + dy * least, seen: at.seen && far > 1 };
+/**
+ * Places on the screen, moved away from `middle` so that what is there can be seen and clicked, and farther until each has
+ * room: none is nearer than `width` to the ones before. A direction that points at the reader has no place.
+ */
+function spread(middle, places, width) {
+  const placed = [];
+  for (const at of places) {
+    const [x, y] = [at.x - middle.x, at.y - middle.y];
+    const far = Math.hypot(x, y);
+    const moved = (to) => ({ x: middle.x + (x / far) * to, y: middle.y + (y / far) * to, seen: at.seen });
+    let to = Math.max(far, CLEAR * width);
+    const isTaken = () => placed.some((one) => one.seen && Math.hypot(one.x - moved(to).x, one.y - moved(to).y) < width);
+    while (far > 0 && isTaken()) to += width / 4;
+    placed.push(far > 0 ? moved(to) : { ...at, seen: false });
+  }
+  return placed;
 }
 
 const plus = (point, direction, far) => point.map((part, i) => part + far * direction[i]);

@@ -8,7 +8,7 @@ import { isActive, queueWords } from './documents.js';
 import { moment, seconds, words } from './format.js';
 import { boxOfJob, shortOf, titleOfJob } from './names.js';
 import { canvasOf } from './pictures.js';
-import { runAgain } from './run-again.js';
+import { canRunAgain, runAgain } from './run-again.js';
 import { nameOf } from './uploads.js';
 
 const TONES = {
@@ -72,7 +72,7 @@ export class JobTiles {
     const open = el('a', { className: 'button', href: job.links.view, 'aria-label': `Open: ${name}` }, 'Open');
     if (isActive(job)) return [open, button('Cancel', (node) => this.cancel(job, node))];
     const remove = button('Delete', () => this.remove(job));
-    if (job.kind !== 'registration') return [open, remove];
+    if (!canRunAgain(job)) return [open, remove];
     const again = button('Run again', () => runAgain(this.service, job));
     return job.status === 'successful' ? [open, again, remove, this.choice(job)] : [open, again, remove];
   }

@@ -9,13 +9,16 @@ import { el } from './dom.js';
  */
 export async function canvasOf(blob, label, panels = null) {
   const picture = await createImageBitmap(blob);
-  const edge = panels ? picture.width / 3 : picture.width;
-  const height = panels ? edge : picture.height;
   const said = label ? { role: 'img', 'aria-label': label } : { 'aria-hidden': 'true' };
-  const canvas = el('canvas', { width: edge * (panels?.length ?? 1), height, ...said });
+  const step = panels ? picture.width / 3 : picture.width;
+  const caption = panels ? picture.height - step : 0;
+  const rim = caption / 3; // captions reach a little into the panels
+  const [width, height] = [step - 2 * rim, picture.height - caption - 2 * rim];
+  const canvas = el('canvas', { width: width * (panels?.length ?? 1), height, ...said });
   const pencil = canvas.getContext('2d');
-  const top = picture.height - height;
-  (panels ?? [0]).forEach((panel, i) => pencil.drawImage(picture, panel * edge, top, edge, height, i * edge, 0, edge, height));
+  (panels ?? [0]).forEach((panel, i) => pencil.drawImage(
+    picture, panel * step + rim, caption + rim, width, height, i * width, 0, width, height,
+  ));
   return canvas;
 }
 

@@ -4,6 +4,9 @@ import { told } from './api.js';
 import { el } from './dom.js';
 import { OptionsForm } from './options-form.js';
 
+/** Whether a job's request can be made anew from its documents: a search's candidates stand in its result alone. */
+export const canRunAgain = ({ kind, status, inputs }) => kind === 'registration' && Boolean(inputs?.object || status === 'successful');
+
 /** Opens the form for a registration that has ended. */
 export async function runAgain(service, job) {
   const host = el('div', { className: 'options-form', id: 'again-options' });

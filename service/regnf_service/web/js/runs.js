@@ -27,7 +27,7 @@ export class Runs {
     this.clear();
     const isLatest = this.turns.next();
     show(byId('results'));
-    byId('results').scrollIntoView({ block: 'nearest' });
+    byId('stage').scrollIntoView(); // on a phone the button lies far below
     await Promise.all(boxes.map(({ id, box }) => this.run({ scene, objects, id, box }, isLatest)));
   }
 

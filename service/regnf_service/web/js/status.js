@@ -4,6 +4,7 @@ import { ApiProblem, toldOf } from './api.js';
 import { isActive, phasesOf } from './documents.js';
 import { byId, el, fillFacts, show } from './dom.js';
 import { words } from './format.js';
+import { canRunAgain } from './run-again.js';
 
 const TONES = {
   accepted: 'wait', running: 'wait', successful: 'good', failed: 'bad', dismissed: 'still',
@@ -52,8 +53,9 @@ export function showFailed(job) {
 }
 
 export function showDismissed(job) {
+  const again = canRunAgain(job) ? 'Run again starts it anew.' : 'Start it anew on the page Register.';
   showBadge('dismissed', job.id);
-  card({ eyebrow: 'No result', title: 'The job was dismissed', text: 'It was canceled before it had a result. Run again starts it anew.', tone: 'still' });
+  card({ eyebrow: 'No result', title: 'The job was dismissed', text: `It was canceled before it had a result. ${again}`, tone: 'still' });
 }
 
 /** A refusal of the service, or a broken connection. onRetry is offered where trying again makes sense. */

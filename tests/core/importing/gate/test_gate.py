@@ -210,6 +210,7 @@ GOOD = {
     "kind": "k",
     "why": [],
     "bounds": [[0, 0, 0], [1, 1, 1]],
+    "surface_bounds": [[0, 0, 0], [1, 1, 1]],
     "parameters": 1,
     "plausibility": {},
     "warnings": [],

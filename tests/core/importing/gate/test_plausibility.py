@@ -98,3 +98,9 @@ def test_numbers_that_are_not_finite_are_refused() -> None:
 def test_gradients_whose_norm_overflows_are_refused() -> None:
     """Each part is a number, its square is not."""
     assert reason_of(sphere(0.5, 1e25)) == "FIELD_NOT_FINITE"
+
+
+def test_the_surface_is_smaller_than_the_bounds() -> None:
+    _, _, (low, high) = check_plausibility(sphere(0.5))
+    assert low == pytest.approx([-0.5] * 3, abs=0.01)
+    assert high == pytest.approx([0.5] * 3, abs=0.01)

@@ -15,7 +15,7 @@ async function load() {
   const headers = token.value ? { Authorization: `Bearer ${token.value}` } : {};
   const response = await fetch(`${ROOT}/openapi.json`, { headers });
   if (!isLatest()) return;
-  if (response.status === 401) return complain('This service asks for an access token. Enter yours above.');
+  if (response.status === 401) return complain('This service asks for an access token. Enter yours below.');
   if (!response.ok) return complain(`The contract did not come: the service answered ${response.status}.`);
   show(byId('problem'), false);
   fill(await response.json());

@@ -1,0 +1,368 @@
+"""What the pages say: names, finds, sizes, every error, questions before a deletion; and room for all of it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import fields as fields_of
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trimesh
+from playwright.sync_api import Page, Route, expect
+
+from regnf_core.options import RobustOptions
+from regnf_state.settings import Settings
+from tests.ui import room
+from tests.ui.conftest import Visit
+from tests.ui.test_accessibility import NONE, in_both_themes
+from tests.ui.test_home import CHAIR, click_at, give_files, home
+
+pytestmark = pytest.mark.browser
+JSON = {"Accept": "application/json"}
+FAULTS = {
+    "reason": "INVALID_OPTIONS",
+    "detail": "An option is wrong.",
+    "hint": "See the table.",
+    "errors": [
+        {"pointer": "/options/robust", "detail": "min_scale 2 is larger than max_scale 1"},
+        {"pointer": "/seed", "detail": "must not be negative"},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    folder = tmp_path_factory.mktemp("own")
+    stool = folder / "stool.glb"
+    trimesh.creation.box((0.4, 0.3, 0.5)).export(stool)
+    return (*room.write_room_and_chair(folder), stool)
+
+
+@pytest.fixture
+def context_options() -> dict[str, Any]:
+    return {"viewport": {"width": 1280, "height": 800}, "reduced_motion": "reduce"}
+
+
+@pytest.fixture(scope="module")
+def module_service() -> Iterator[str]:
+    with home(Settings()) as address:
+        yield address
+
+
+@pytest.fixture
+def service(module_service: str, visit: Visit) -> Iterator[str]:
+    """The address of a service that has nothing yet."""
+    yield module_service
+    page = visit.page
+    for kind, key in (("jobs", "id"), ("library", "name"), ("fields", "sha256")):
+        listed = page.request.get(f"{module_service}/{kind}", headers=JSON).json()
+        for one in listed.get(kind) or listed.get("entries") or []:
+            page.request.delete(f"{module_service}/{kind}/{one[key]}")
+    page.goto("about:blank")
+
+
+def found(page: Page, service: str, files: tuple[Path, Path, Path], objects: int = 1) -> None:
+    """Has the page register the chair, or search for it among so many objects."""
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    give_files(page, files[:2])
+    if objects == 2:
+        page.set_input_files("#object-file", files[2])
+        expect(page.locator("#objects input:checked")).to_have_count(2)
+    click_at(page, CHAIR)
+    page.click("#register")
+    page.wait_for_selector(".run[data-verdict]")
+
+
+def test_the_card_of_a_search_says_what_was_found_where_and_in_which_box(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    found(page, service, files, 2)
+    (job,) = page.request.get(f"{service}/jobs", headers=JSON).json()["jobs"]
+    named = {
+        one["sha256"]: one["label"] for one in page.request.get(f"{service}/fields", headers=JSON).json()["fields"]
+    }
+    page.goto(f"{service}/jobs")
+    expect(page.locator(".tile h2")).to_have_text(f"{named[job['object_found']]} in room.ply")
+    expect(page.locator(".tile .word")).to_have_text("Registered")
+    expect(page.locator(".tile")).to_contain_text("the likeliest of 2 objects")
+    expect(page.locator(".tile")).to_contain_text(
+        re.compile(r"box [\d.]+ × [\d.]+ × [\d.]+ at [−\d.]+, [−\d.]+, [−\d.]+")
+    )
+    page.get_by_role("link", name="Open").click()
+    expect(page.locator("#job-title")).to_have_text(f"{named[job['object_found']]} in room.ply")
+
+
+def test_every_member_of_a_problem_is_shown(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+    page = visit.page
+    found(page, service, files)
+    page.route("**/register", lambda route: route.fulfill(status=422, json=FAULTS))
+    page.click("#register")
+    faults = "options.robust: min_scale 2 is larger than max_scale 1. seed: must not be negative."
+    expect(page.locator(".run .bad")).to_have_text(f"An option is wrong. {faults} See the table.")
+    page.unroute("**/register")
+    page.goto(f"{service}/jobs")
+    page.get_by_role("button", name="Run again").click()
+    page.get_by_label(re.compile("^Min. scale")).fill("2")
+    page.get_by_label("Max. scale").fill("1")
+    page.click("#again-start")
+    expect(page.locator("dialog[open] .bad")).to_contain_text("min_scale 2 is larger than max_scale 1")
+
+
+def test_a_deletion_asks_and_the_focus_goes_to_what_is_there_then(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    found(page, service, files, 2)
+    page.goto(f"{service}/jobs")
+    page.get_by_role("button", name="Delete").click()
+    expect(page.locator("dialog[open]")).to_contain_text("in room.ply”?")
+    expect(page.get_by_role("button", name="Keep")).to_be_focused()
+    assert in_both_themes(page) == NONE
+    page.keyboard.press("Escape")
+    expect(page.locator("dialog")).to_have_count(2)  # those of the page itself
+    expect(page.get_by_role("button", name="Delete")).to_be_focused()
+    expect(page.locator(".tile")).to_have_count(1)
+    page.keyboard.press("Enter")
+    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+    expect(page.locator("#list")).to_be_focused()  # nothing is left in it
+    page.goto(f"{service}/fields")
+    page.get_by_role("button", name="Delete chair.glb").click()
+    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+    expect(page.locator(".tile h2").nth(1)).to_be_focused()
+
+
+def test_a_field_is_called_what_its_file_is_called_now(
+    visit: Visit, service: str, files: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    page = visit.page
+    upload = {"file": {"name": "x", "mimeType": "application/octet-stream", "buffer": files[1].read_bytes()}}
+    page.request.post(f"{service}/fields", multipart={"description": '{"as": "object"}', **upload})
+    mine = tmp_path / "my chair.glb"
+    mine.write_bytes(files[1].read_bytes())
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.set_input_files("#object-file", mine)
+    expect(page.locator("#objects")).to_contain_text("my chair.glb")
+    page.goto(f"{service}/fields")
+    expect(page.locator(".tile h2")).to_have_text("my chair.glb")
+
+
+def test_the_page_of_a_job_leads_on(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+    page = visit.page
+    found(page, service, files)
+    page.click(".run a")
+    expect(page.locator("#verdict-word")).to_have_text("Registered")
+    assert page.locator("header nav a").all_inner_texts() == ["Register", "Library", "Jobs", "Fields", "API"]
+    page.get_by_role("button", name="Run again").click()
+    expect(page.locator("#again-start")).to_be_enabled()
+    page.get_by_role("button", name="Close").click()
+    page.get_by_role("button", name="Delete").click()
+    page.locator("dialog[open]").get_by_role("button", name="Delete").click()
+    page.wait_for_url("**/jobs")
+    expect(page.locator("#note")).to_contain_text("No jobs yet")
+
+
+def test_rooms_are_no_candidates_unless_a_person_says_so(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    for name, role in zip(files, ("scene", "object", "object"), strict=True):
+        upload = {"file": {"name": name.name, "mimeType": "application/octet-stream", "buffer": name.read_bytes()}}
+        description = f'{{"as": "{role}", "label": "{name.name}"}}'
+        field = page.request.post(f"{service}/fields", multipart={"description": description, **upload}).json()
+        assert page.request.get(f"{service}/fields/{field['sha256']}?wait=20").json()["state"] == "ready"
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.locator("#all-objects").check()
+    assert sorted(page.locator("label:has(input:checked)").all_inner_texts()) == [
+        "All of them: find out which it is",
+        "chair.glb",
+        "stool.glb",
+    ]
+    page.goto(f"{service}/fields")
+    page.get_by_label("What stool.glb is").select_option("scene")
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    assert page.locator("#objects .check").all_inner_texts() == ["chair.glb"]
+    groups = page.locator("#scene-known optgroup")
+    assert [groups.nth(i).get_attribute("label") for i in range(groups.count())] == ["Scenes", "Objects"]
+
+
+def test_sizes_are_those_of_the_surface(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+    page = visit.page
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.set_input_files("#object-file", files[2])
+    expect(page.locator("#objects input:checked")).to_have_count(1)
+    page.goto(f"{service}/fields")
+    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
+    page.get_by_role("link", name="Add to library").click()
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".tile")).to_contain_text("0.4 × 0.3 × 0.5")
+
+
+def test_several_files_become_entries_and_leaving_meanwhile_is_asked_about(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    asks = "() => !window.dispatchEvent(new Event('beforeunload', { cancelable: true }))"
+    page.goto(f"{service}/library")
+    page.wait_for_selector("html[data-page=ready]")
+    page.click("#add")
+    page.set_input_files("#entry-file", list(files[1:]))
+    page.fill("#entry-tags", "seat")
+    held: list[Route] = []
+    page.route("**/fields", lambda route: held.append(route))
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator("#entry-state")).to_contain_text(re.compile("Uploading.*Uploading"))
+    assert page.evaluate(asks)
+    expect(page.locator("#entry-close")).to_be_disabled()
+    page.keyboard.press("Escape")
+    expect(page.locator("#entry-dialog")).to_be_visible()
+    for route in held:
+        route.continue_()
+    expect(page.locator("#entry-dialog")).to_be_hidden(timeout=20_000)
+    assert sorted(page.locator(".tile h2").all_inner_texts()) == ["chair", "stool"]
+    expect(page.get_by_role("button", name="Show the tag seat")).to_have_count(2)
+    assert not page.evaluate(asks)
+
+
+def test_an_import_that_waits_says_so(visit: Visit, service: str, files: tuple[Path, Path, Path]) -> None:
+    page = visit.page
+    waiting = {"sha256": "0" * 64, "state": "validating", "queue_position": 3, "bytes": 1, "description": {}}
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.route(re.compile(r"/fields/[0-9a-f]{64}"), lambda route: route.fulfill(json=waiting))
+    page.set_input_files("#scene-file", files[0])
+    for place in ("#scene-state", "#welcome-state"):
+        expect(page.locator(place)).to_contain_text("Waiting for a worker: 2 before it")
+    expect(page.locator("#welcome .steps")).to_be_hidden()
+
+
+def test_a_comparison_opens_at_its_top_in_the_words_of_a_jobs_page(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    found(page, service, files)
+    page.goto(f"{service}/jobs")
+    page.get_by_role("button", name="Run again").click()
+    page.get_by_label("Seed").fill("7")
+    page.click("#again-start")
+    page.wait_for_url("**/view")
+    page.set_viewport_size({"width": 600, "height": 320})
+    page.goto(f"{service}/jobs")
+    for mark in page.get_by_role("checkbox", name=re.compile("^Compare")).all():
+        mark.check()
+    page.click("#compare")
+    expect(page.locator("#comparison")).to_contain_text("Residual RMS")
+    expect(page.locator("#compare-title")).to_be_focused()
+    expect(page.locator("#compare-title")).to_be_in_viewport()
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
+def test_the_result_lies_over_the_scene_and_nothing_scrolls_but_the_panel(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.locator("#options > summary").click()
+    expect(page.locator("#options-form input[placeholder]")).not_to_have_count(0)
+    give_files(page, files[:2])
+    click_at(page, CHAIR)
+    page.click("#register")
+    page.wait_for_selector(".run[data-verdict]")
+    stage, results = page.locator("#stage").bounding_box(), page.locator("#results").bounding_box()
+    assert stage is not None
+    assert results is not None
+    assert results["x"] >= stage["x"]
+    assert results["x"] + results["width"] <= stage["x"] + stage["width"]
+    assert results["y"] + results["height"] <= 800
+    assert page.evaluate("document.scrollingElement.scrollHeight") <= 800
+    assert in_both_themes(page) == NONE
+
+
+def test_options_are_those_of_the_contract(visit: Visit, service: str) -> None:
+    page = visit.page
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    page.locator("#options > summary").click()
+    page.locator("#options-form details summary").click()
+    rows = page.locator("#options-form input[placeholder]")
+    expect(rows).not_to_have_count(0)
+    shown = [str(rows.nth(i).get_attribute("placeholder")).replace(",", "") for i in range(rows.count())]
+    defaults = [one.default for one in fields_of(RobustOptions) if not isinstance(one.default, bool | str)]
+    assert sorted(shown) == sorted("not known" if usual is None else f"{usual:g}" for usual in defaults)
+
+
+CROWDED = """() => {
+  const seen = [...document.querySelectorAll('button, .button, .pick, select')]
+    .filter((node) => node.checkVisibility() && !node.closest('.handles'));
+  const boxes = seen.map((node) => [node, node.getBoundingClientRect()]);
+  const touching = [];
+  for (const [a, p] of boxes) for (const [b, q] of boxes) {
+    const apart = Math.max(q.left - p.right, p.left - q.right, q.top - p.bottom, p.top - q.bottom);
+    if (a !== b && a.parentElement === b.parentElement && apart < 3) touching.push([a.outerHTML, b.outerHTML, apart]);
+  }
+  const pencil = document.createElement('canvas').getContext('2d');
+  const cut = seen.filter((node) => node.tagName === 'SELECT' && node.selectedOptions.length).filter((node) => {
+    pencil.font = getComputedStyle(node).font;
+    return pencil.measureText(node.selectedOptions[0].text).width + 28 > node.getBoundingClientRect().width;
+  }).map((node) => node.selectedOptions[0].text);
+  return { touching, cut, wide: document.documentElement.scrollWidth - innerWidth };
+}"""
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_buttons_have_gaps_and_no_choice_is_cut(
+    visit: Visit, service: str, files: tuple[Path, Path, Path], width: int
+) -> None:
+    page = visit.page
+    found(page, service, files)
+    page.set_viewport_size({"width": width, "height": 800})
+    page.locator("#options > summary").click()
+    clear = {"touching": [], "cut": []}
+    looks = {"home": page.evaluate(CROWDED)}
+    for place in ("jobs", "fields", "library", "docs"):
+        page.goto(f"{service}/{place}")
+        page.wait_for_selector("html[data-page=ready]")
+        looks[place] = page.evaluate(CROWDED)
+        assert page.locator("header nav a").count() == 5
+    page.goto(f"{service}/jobs")
+    page.get_by_role("button", name="Run again").click()
+    expect(page.locator("#again-start")).to_be_enabled()
+    looks["again"] = page.evaluate(CROWDED)
+    for place, look in looks.items():
+        assert look.pop("wide") <= 0, place
+        assert look == clear, place
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
+@pytest.fixture
+def phone(context_options: dict[str, Any]) -> None:
+    context_options |= {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+
+
+@pytest.mark.usefixtures("phone")
+def test_handles_leave_the_thing_in_sight_on_a_phone(
+    visit: Visit, service: str, files: tuple[Path, Path, Path]
+) -> None:
+    page = visit.page
+    page.goto(service)
+    page.wait_for_selector("html[data-page=ready]")
+    give_files(page, files[:2])
+    click_at(page, CHAIR)
+    expect(page.locator("#boxes li")).to_have_count(1)
+    view = page.locator("#canvas").bounding_box()
+    assert view is not None
+    at = [view["x"] + CHAIR[0] * view["width"], view["y"] + CHAIR[1] * view["height"]]
+    assert page.evaluate("([x, y]) => document.elementFromPoint(x, y).id", at) == "canvas"
+    boxes = [one.bounding_box() for one in page.locator(".handle:visible").all()]
+    assert len(boxes) >= 7
+    centers = [(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2) for box in boxes if box is not None]
+    near = [(a, b) for i, a in enumerate(centers) for b in centers[:i] if abs(a[0] - b[0]) + abs(a[1] - b[1]) < 24]
+    assert near == []
