@@ -1,6 +1,7 @@
 """The command ``regnf``: runs the sub-command that is asked for and turns errors into exit codes.
 
 Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable ·
+70 an error of regnf itself ·
 128 + N ended by signal N: 130 by Ctrl+C, 143 by SIGTERM, 129 by SIGHUP, 141 because nobody reads the output any more.
 
 Only Python's own modules are loaded with this one: a signal that comes while others load is to end the command quietly.
@@ -23,8 +24,8 @@ _AGAIN_AFTER_S = 0.1
 """When an interrupt that something has swallowed comes again."""
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _CLOSED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-_OUTPUT = frozenset({*_FULL, *_CLOSED, errno.EIO})
-"""What may befall the standard output too, of whose errors none names a file."""
+_OUTPUT = frozenset({*_FULL, *_CLOSED, errno.EIO, None})
+"""What a write that names no file fails with; numpy and PIL give no number either."""
 
 
 def main() -> None:
@@ -40,6 +41,9 @@ def main() -> None:
         code = command(ended_by)
     except KeyboardInterrupt:
         pass
+    except Exception:
+        sys.excepthook(*sys.exc_info())
+        code = os.EX_SOFTWARE
     for number in (*_SIGNALS, signal.SIGALRM):
         signal.signal(number, signal.SIG_IGN)
     atexit._run_exitfuncs()
@@ -71,7 +75,8 @@ def command(ended_by: list[int] | None = None) -> int:
             raise
         from regnf_cli.console import fail
 
-        return fail("FILE_UNUSABLE", f"{error.filename or 'output'}: {error.strerror}", hint=_what_to_do(error.errno))
+        told = error.strerror or str(error)
+        return fail("FILE_UNUSABLE", f"{error.filename or 'output'}: {told}", hint=_what_to_do(error.errno))
     except BaseException:
         if ended_by:  # a compiled library has made another error of the interrupt
             return 128 + signal.SIGINT
@@ -154,7 +159,7 @@ def _run() -> int:
 def _what_to_do(number: int | None) -> str | None:
     if number in _CLOSED:
         return "Check who may write there, or name another place."
-    return "Make room on the disk, or name another place." if number in _FULL else None
+    return "Make room on the disk, or name another place." if number in (*_FULL, None) else None
 
 
 if __name__ == "__main__":

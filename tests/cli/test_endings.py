@@ -30,7 +30,12 @@ from regnf_cli.main import main
 sys.meta_path.insert(0, At())
 main()
 """
-PAIR = [str(DATA / "mix-room.safetensors"), str(DATA / "armchair.safetensors"), "--detection", str(DATA / "detection.json")]
+PAIR = [
+    str(DATA / "mix-room.safetensors"),
+    str(DATA / "armchair.safetensors"),
+    "--detection",
+    str(DATA / "detection.json"),
+]
 SEARCH = [PAIR[0], PAIR[1], *PAIR[2:]]
 CUT_OFF = [
     *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.console", "numpy")],
@@ -53,7 +58,11 @@ CUT_OFF = [
 
 
 def run(arguments: Sequence[str], folder: Path, **how: object) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | {"XDG_CACHE_HOME": str(folder / "cache"), "TMPDIR": str(folder / "tmp"), "COLUMNS": "120"}
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "TMPDIR": str(folder / "tmp"),
+        "COLUMNS": "120",
+    }
     (folder / "tmp").mkdir(exist_ok=True)
     return subprocess.run(  # type: ignore[call-overload,no-any-return]
         [sys.executable, *arguments], cwd=folder, env=environment, text=True, timeout=250, check=False,
@@ -68,7 +77,9 @@ def left(folder: Path) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize(("name", "module", "command"), CUT_OFF, ids=[f"{one[2][0]}-{one[1]}-{one[0]}" for one in CUT_OFF])
+@pytest.mark.parametrize(
+    ("name", "module", "command"), CUT_OFF, ids=[f"{one[2][0]}-{one[1]}-{one[0]}" for one in CUT_OFF]
+)
 def test_a_signal_ends_a_command_silently(name: str, module: str, command: list[str], tmp_path: Path) -> None:
     number = signal.Signals[name]
     said = ["--output", "out/below"] if command[0] in ("register", "search", "render") else []
@@ -142,7 +153,15 @@ def test_compiled_libraries_do_not_complain_of_what_is_left_over(tmp_path: Path)
 
 @pytest.mark.parametrize(
     "command",
-    [["--help"], ["register", "--help"], ["manual"], ["manual", "api"], ["--version"], ["inspect", PAIR[1]], ["doctor"]],
+    [
+        ["--help"],
+        ["register", "--help"],
+        ["manual"],
+        ["manual", "api"],
+        ["--version"],
+        ["inspect", PAIR[1]],
+        ["doctor"],
+    ],
     ids=" ".join,
 )
 def test_a_closed_pipe_is_no_rejection(command: list[str], tmp_path: Path) -> None:
