@@ -41,7 +41,7 @@ def main() -> None:
         code = command(ended_by)
     except KeyboardInterrupt:
         pass
-    except Exception:
+    except Exception:  # noqa: BLE001 - it is told as Python would
         sys.excepthook(*sys.exc_info())
         code = os.EX_SOFTWARE
     for number in (*_SIGNALS, signal.SIGALRM):

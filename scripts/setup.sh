@@ -14,7 +14,7 @@ scripts/system-packages.sh runtime
 stamp=.venv/.regnf-setup
 state=$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum)
 have() { [[ -f $1 && $(cat "$1") == "$state" ]]; }
-if have "$stamp" || [[ ${1-} == demo ]] && have "$stamp-demo"; then
+if have "$stamp" || { [[ ${1-} == demo ]] && have "$stamp-demo"; }; then
     .venv/bin/python scripts/native_library.py # its C files may have changed
     exit 0
 fi
