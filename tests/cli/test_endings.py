@@ -1,4 +1,4 @@
-"""How commands end that are cut off: by a signal at any moment, a closed pipe, a full disk. Silently, leaving nothing."""
+"""How commands end that are cut off, by a signal, a closed pipe or a full disk: silently, leaving nothing."""
 
 from __future__ import annotations
 
@@ -36,13 +36,12 @@ PAIR = [
     "--detection",
     str(DATA / "detection.json"),
 ]
-SEARCH = [PAIR[0], PAIR[1], *PAIR[2:]]
 CUT_OFF = [
     *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.console", "numpy")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch", "torch._C", "torch.nn")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_core.registration", "scipy.spatial", "PIL.Image")],
     *[(name, "torch", ["register", *PAIR]) for name in ("SIGTERM", "SIGHUP")],
-    *[("SIGINT", name, ["search", *SEARCH]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
+    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
     *[("SIGINT", name, ["inspect", PAIR[1]]) for name in ("regnf_cli.inspect", "torch")],
     ("SIGINT", "igl", ["convert", PAIR[1], "chair.ply"]),
     ("SIGINT", "igl.pyigl_core", ["convert", PAIR[1], "chair.ply"]),

@@ -254,8 +254,8 @@ BOOLEANS = {
 def of_rcl(text: str) -> Any:
     """A parameter's value as rcl takes it from YAML: github.com/ros2/rcl, rcl_yaml_param_parser, `get_value`.
 
-    Quoted scalars are texts. Of others, words for booleans come first, then what C's strtol takes to any base, then what
-    its strtod takes; null and ~ are texts.
+    Quoted scalars are texts. Of others, words for booleans come first, then whole numbers to any base, then what
+    strtod takes; null and ~ are texts.
     """
     (event,) = (one for one in yaml.parse(text) if isinstance(one, yaml.ScalarEvent))
     if event.style in ("'", '"'):
@@ -288,7 +288,7 @@ def test_an_axis_arrives_whatever_yaml_makes_of_it(passed: Callable[[str], Any],
 @pytest.mark.parametrize("passed", PASSED)
 @pytest.mark.parametrize("said", ["n", "no", "off", "null", "~", "1", "-y", "up", "nan"])
 def test_what_is_no_axis_is_refused(passed: Callable[[str], Any], said: str) -> None:
-    with pytest.raises(ValueError, match="up_axis: .* is none of x, y and z"):
+    with pytest.raises(ValueError, match=r"up_axis: .* is none of x, y and z"):
         part("parameters").axis_of("up_axis", passed(said))
 
 
@@ -302,7 +302,7 @@ def test_a_share_is_a_number_of_any_kind(passed: Callable[[str], Any], said: str
 @pytest.mark.parametrize("said", ["1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03", "[0.1]"])
 def test_what_is_no_share_is_refused(passed: Callable[[str], Any], said: str) -> None:
     value = [0.1] if said == "[0.1]" else passed(said)
-    with pytest.raises(ValueError, match="scale_tolerance: .* is no number"):
+    with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
         part("parameters").share_of("scale_tolerance", value)
 
 
@@ -370,7 +370,7 @@ def test_the_token_is_in_a_file_or_a_variable_and_no_parameter(tmp_path: Path) -
         assert token(str(file), {"REGNF_API_TOKEN": "other"}) == "open-sesame"
     assert token("", {"REGNF_API_TOKEN": "open-sesame\r"}) == "open-sesame"
     assert token("", {}) == ""
-    with pytest.raises(ValueError, match="token_file: .*nothing cannot be read"):
+    with pytest.raises(ValueError, match=r"token_file: .*nothing cannot be read"):
         token(str(tmp_path / "nothing"), {})
 
 

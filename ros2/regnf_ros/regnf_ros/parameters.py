@@ -1,7 +1,7 @@
 """What the node is told: parameters as ROS hands them on. No ROS.
 
-Launch files and command lines pass them through YAML, which makes a boolean of y, a number of 0.03 and a double of 1e-3.
-So a parameter may have any type here, and each is read for what it is to mean.
+Launch files and command lines pass them through YAML, which makes a boolean of y and a number of 0.03 or 1e-3. So
+a parameter may have any type here, and each is read for what it is to mean.
 """
 
 from __future__ import annotations
@@ -76,9 +76,7 @@ def objects_of(value: Any) -> dict[str, str]:
         name, sign, digest = str(entry).rpartition("=")
         name, digest = name.strip(), digest.strip()
         if not (name and sign and _DIGEST.fullmatch(digest)) or name in table:
-            raise ValueError(
-                f"objects: {entry!r} is not CLASS=SHA256 (64 hexadecimal digits), or names its class again"
-            )
+            raise ValueError(f"objects: {entry!r} is not CLASS=SHA256 (64 hex digits), or names its class again")
         table[name] = digest.lower()
     return table
 
