@@ -4,7 +4,8 @@
 setup:
 	@scripts/setup.sh
 
-demo: setup
+demo:
+	@scripts/setup.sh demo
 	@.venv/bin/regnf demo --state-dir .demo
 
 test: setup

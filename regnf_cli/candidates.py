@@ -10,6 +10,7 @@ from pathlib import Path
 from regnf_cli.console import err
 from regnf_core.errors import RegnfError
 from regnf_core.field_candidates import Candidate, Said
+from regnf_core.files import filled_folder
 
 
 def show_candidates(error: RegnfError) -> None:
@@ -25,8 +26,9 @@ def show_candidates(error: RegnfError) -> None:
 
 def keep_pictures(asked: Sequence[Candidate], folder: Path) -> None:
     """Write the candidates' pictures, 1.png and so on as they are numbered; the folder is made if need be."""
-    folder.mkdir(exist_ok=True)
-    for number, one in enumerate(asked, 1):
-        if one.picture is not None:
-            (folder / f"{number}.png").write_bytes(one.picture)
-            err.print(f"wrote {folder / f'{number}.png'}", markup=False, soft_wrap=True)
+    pictures = {f"{number}.png": one.picture for number, one in enumerate(asked, 1) if one.picture is not None}
+    with filled_folder(folder) as work:
+        for name, picture in pictures.items():
+            (work / name).write_bytes(picture)
+    for name in pictures:
+        err.print(f"wrote {folder / name}", markup=False, soft_wrap=True)

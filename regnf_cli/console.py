@@ -12,8 +12,6 @@ EXIT_NOT_REGISTERED = 1
 EXIT_BAD_INPUT = 2
 EXIT_UNAVAILABLE = 3
 EXIT_AMBIGUOUS = 4
-EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)

@@ -129,5 +129,5 @@ def _show(result: dict[str, Any]) -> bool:
 
 def _wait_for_enter() -> None:
     out.print("\nOpen the page; press Enter here to stop the service.")
-    with contextlib.suppress(KeyboardInterrupt, EOFError):
+    with contextlib.suppress(EOFError):
         input()

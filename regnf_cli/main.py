@@ -1,42 +1,86 @@
 """The command ``regnf``: runs the sub-command that is asked for and turns errors into exit codes.
 
-Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable · 130 interrupted ·
-143 terminated.
+Exit codes: 0 registered (or done) · 4 ambiguous · 1 rejected · 2 bad input · 3 service unavailable ·
+70 an error of regnf itself ·
+128 + N ended by signal N: 130 by Ctrl+C, 143 by SIGTERM, 129 by SIGHUP, 141 because nobody reads the output any more.
+
+Only Python's own modules are loaded with this one: a signal that comes while others load is to end the command quietly.
 """
 
 from __future__ import annotations
 
+import atexit
 import errno
 import gc
 import os
 import signal
 import sys
-from types import FrameType
-from typing import cast
-
-import typer
-
-from regnf_cli.commands import COMMANDS, GROUPS, app_of
-from regnf_cli.console import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_UNAVAILABLE, fail
-from regnf_cli.usage import usage_fault
-from regnf_core.errors import RegnfError
 
 _ONE_THREAD = {"register", "search", "render", "edit"}
 _COLLECT_AFTER = 20_000
 """Objects between two collections of garbage. With Python's 700 they take .06 s of the time in which torch loads."""
-_UsageError = cast(type[Exception], typer.BadParameter.__mro__[1])
-"""What typer raises for arguments that it cannot use; it does not export the name."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_AGAIN_AFTER_S = 0.1
+"""When an interrupt that something has swallowed comes again."""
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_CLOSED = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
+_OUTPUT = frozenset({*_FULL, *_CLOSED, errno.EIO, None})
+"""What a write that names no file fails with; numpy and PIL give no number either."""
 
 
 def main() -> None:
-    """Entry point of the console script."""
-    _set_threads()
+    """Entry point of the console script. The process ends here, without the interpreter's own last steps.
+
+    These walk all that torch has made (.4 s), and compiled libraries that are cut off in their work complain of what is
+    left over (nanobind: "leaked function"). What was registered to be done at the exit is done.
+    """
     ended_by: list[int] = []
-    _clean_up_when_terminated(ended_by)
+    code = 128 + signal.SIGINT
+    try:
+        _turn_signals_into_interrupts(ended_by)
+        code = command(ended_by)
+    except KeyboardInterrupt:
+        pass
+    except Exception:  # noqa: BLE001 - it is told as Python would
+        sys.excepthook(*sys.exc_info())
+        code = os.EX_SOFTWARE
+    for number in (*_SIGNALS, signal.SIGALRM):
+        signal.signal(number, signal.SIG_IGN)
+    atexit._run_exitfuncs()
+    os._exit(128 + ended_by[0] if ended_by else code)
+
+
+def command(ended_by: list[int] | None = None) -> int:
+    """Run what ``sys.argv`` asks for; the exit code. ``ended_by``: where the signals' numbers are put as they come."""
+    _set_threads()
     gc.set_threshold(_COLLECT_AFTER)
-    code = _run()
-    gc.freeze()  # the interpreter's last collection would walk all that torch has made: .4 s
-    sys.exit(EXIT_TERMINATED if ended_by and code == EXIT_INTERRUPTED else code)
+    try:
+        code = _run()
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+        return code
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+    except BrokenPipeError:
+        return 128 + signal.SIGPIPE
+    except SystemExit as error:
+        if error.code != 1:
+            raise
+        return 128 + signal.SIGPIPE  # rich makes this of a closed pipe, and nothing else does
+    except OSError as error:
+        if ended_by:
+            return 128 + signal.SIGINT
+        if error.filename is None and error.errno not in _OUTPUT:
+            raise
+        from regnf_cli.console import fail
+
+        told = error.strerror or str(error)
+        return fail("FILE_UNUSABLE", f"{error.filename or 'output'}: {told}", hint=_what_to_do(error.errno))
+    except BaseException:
+        if ended_by:  # a compiled library has made another error of the interrupt
+            return 128 + signal.SIGINT
+        raise
 
 
 def _set_threads() -> None:
@@ -50,31 +94,57 @@ def _set_threads() -> None:
         os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
-def _clean_up_when_terminated(ended_by: list[int]) -> None:
-    """Let SIGTERM do what Ctrl-C does, so that no scratch files are left. The signal is put into ``ended_by``.
+def _turn_signals_into_interrupts(ended_by: list[int]) -> None:
+    """Let SIGTERM and SIGHUP do what Ctrl-C does, so that no scratch files are left. Each is put into ``ended_by``.
 
-    Commands that serve set handlers of their own.
+    Commands that serve set handlers of their own. What was ignored from the start, by nohup for instance, stays so.
     """
 
-    def end(number: int, _: FrameType | None) -> None:
-        ended_by.append(number)
+    def end(number: int, _: object) -> None:
+        if number != signal.SIGALRM:
+            ended_by.append(number)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_AFTER_S, _AGAIN_AFTER_S)
+        elif _is_unwinding(sys.exception()):
+            return
         raise KeyboardInterrupt
 
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, end)
+    def unraisable(given: sys.UnraisableHookArgs) -> None:
+        if not isinstance(given.exc_value, KeyboardInterrupt):
+            sys.__unraisablehook__(given)
+
+    for number in _SIGNALS:
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, end)
+    signal.signal(signal.SIGALRM, end)
+    sys.unraisablehook = unraisable
+
+
+def _is_unwinding(handled: BaseException | None) -> bool:
+    """Whether the interrupt is on its way. Finalizers, and libraries that try whether another is there, swallow it."""
+    while handled is not None and not isinstance(handled, KeyboardInterrupt):
+        handled = handled.__context__
+    return handled is not None
 
 
 def _run() -> int:
     """Run the command that the arguments name; the exit code. Errors of users take two lines."""
+    import typer
+
+    from regnf_cli.commands import COMMANDS, GROUPS, app_of
+    from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
+    from regnf_cli.usage import usage_fault
+    from regnf_core.errors import RegnfError
+
+    usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # typer does not export its name
     asked = sys.argv[1:2]
     app = app_of(asked) if set(asked) & {*COMMANDS, *GROUPS} else app_of()
     try:
         code = app(standalone_mode=False)
         return code if isinstance(code, int) else 0
-    except _UsageError as error:
+    except usage_error as error:
         return usage_fault(error)
-    except (typer.Abort, KeyboardInterrupt):
-        return EXIT_INTERRUPTED
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
     except RegnfError as error:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
         from regnf_cli.candidates import show_candidates
@@ -84,16 +154,12 @@ def _run() -> int:
         return code
     except FileNotFoundError as error:
         return fail("FILE_NOT_FOUND", f"{error.filename}: no such file", hint="Check the path.")
-    except OSError as error:
-        if error.filename is None and error.errno != errno.ENOSPC:
-            raise
-        return fail("FILE_UNUSABLE", str(error), hint=_what_to_do(error.errno))
 
 
 def _what_to_do(number: int | None) -> str | None:
-    if number in (errno.EACCES, errno.EPERM, errno.EROFS):
+    if number in _CLOSED:
         return "Check who may write there, or name another place."
-    return "Make room on the disk, or name another place." if number == errno.ENOSPC else None
+    return "Make room on the disk, or name another place." if number in (*_FULL, None) else None
 
 
 if __name__ == "__main__":

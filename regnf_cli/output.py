@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from regnf_cli.console import err
+from regnf_core.files import filled_folder, require_writable
 
 if TYPE_CHECKING:
     from regnf_core.geometry.box import OrientedBox
@@ -26,10 +26,11 @@ class Files:
         """Whether anything is."""
         return self.output is not None or self.recording is not None
 
-    def prepare(self) -> None:
-        """Make the folders before the work."""
-        prepare(self.output)
-        prepare(self.recording and self.recording.parent)
+    def check(self) -> None:
+        """Raises PermissionError before the work, which would be lost if nothing may be written there."""
+        for folder in (self.output, self.recording and self.recording.parent):
+            if folder is not None:
+                require_writable(folder)
 
     def write(self, result: RegistrationResult, box: OrientedBox, **said: Any) -> None:
         """Write what is wanted, each file whole or not at all; ``said`` goes on to ``write_artifacts``."""
@@ -38,12 +39,6 @@ class Files:
         write_into(self.output, result, **said)
         if self.recording is not None:
             write_recording(result, self.recording, box, said["object_name"])
-
-
-def prepare(output: Path | None) -> None:
-    """Make the folder before the work, which would be lost if it cannot be made."""
-    if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
 
 
 def tell_files(output: Path | None, recording: Path | None = None) -> None:
@@ -60,6 +55,5 @@ def write_into(output: Path | None, result: RegistrationResult, **said: Any) -> 
 
     if output is None:
         return
-    with tempfile.TemporaryDirectory(dir=output) as folder:
-        for name in write_artifacts(result, Path(folder), **said):
-            (Path(folder) / name).replace(output / name)
+    with filled_folder(output) as folder:
+        write_artifacts(result, folder, **said)

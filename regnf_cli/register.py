@@ -140,7 +140,7 @@ def _register_here(
     box = OrientedBox.from_detection(detection)
     start = Sim3.from_matrix(request["initial_transform"]) if request["initial_transform"] else None
     truth = Sim3.from_matrix(request["ground_truth"]["T_object_scene"]) if request["ground_truth"] else None
-    files.prepare()
+    files.check()
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
         opened, obj = open_scene(scene, detection), load_field(object_)

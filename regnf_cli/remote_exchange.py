@@ -17,6 +17,7 @@ from regnf_cli.remote_errors import unreachable
 from regnf_client.errors import ServiceError
 from regnf_core.field_candidates import Said
 from regnf_core.field_source import FieldSource
+from regnf_core.files import filled_folder
 
 _NOT_OF_A_FILE = frozenset({"UNAUTHENTICATED", "RATE_LIMITED", "TOO_MANY_WRITES", ServiceError.reason})
 
@@ -154,7 +155,7 @@ def _leave(service: RemoteService, job_id: str, cancel: bool) -> None:
 def _fetch(service: RemoteService, job_id: str, document: dict[str, Any], output: Path | None) -> None:
     if output is None:
         return
-    output.mkdir(parents=True, exist_ok=True)
-    for artifact in document["artifacts"]:
-        name = artifact["name"]
-        service.fetch_artifact(job_id, name, output / Path(name).name)  # never outside the folder
+    with filled_folder(output) as folder:
+        for artifact in document["artifacts"]:
+            name = artifact["name"]
+            service.fetch_artifact(job_id, name, folder / Path(name).name)  # never outside the folder

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 from regnf_cli.console import out, phase_progress
 from regnf_core.field_source import FieldSource, find_source
+from regnf_core.files import filled_folder, require_writable
 from regnf_core.rendering.request import RenderRequest
 
 
@@ -20,12 +20,12 @@ def render_here(scene: FieldSource, request: RenderRequest, output: Path, jobs: 
     from regnf_core.loading import load_field
     from regnf_core.rendering.job import run_render
 
-    output.mkdir(parents=True, exist_ok=True)
+    require_writable(output)
 
     def open_object(name: str) -> SdfField:
         return load_field(find_source(Path(name))).field
 
-    with phase_progress() as bar, tempfile.TemporaryDirectory(dir=output) as folder:
+    with phase_progress() as bar, filled_folder(output) as folder:
         task = bar.add_task("loading", total=1.0)
         field = load_field(scene).field
         bar.update(task, description="rendering")
@@ -33,8 +33,6 @@ def render_here(scene: FieldSource, request: RenderRequest, output: Path, jobs: 
         def tell(share: float) -> None:
             bar.update(task, completed=share)
 
-        report = run_render(field, request, open_object, Path(folder), tell, processes=jobs or os.cpu_count() or 1)
-        for artifact in report.artifacts:
-            (Path(folder) / artifact.name).replace(output / artifact.name)
+        report = run_render(field, request, open_object, folder, tell, processes=jobs or os.cpu_count() or 1)
     for artifact in report.artifacts:
         out.print(str(output / artifact.name), markup=False, soft_wrap=True)

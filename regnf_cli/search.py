@@ -28,7 +28,7 @@ from regnf_cli.options import (
     Token,
     WorkerTimeout,
 )
-from regnf_cli.output import prepare, tell_files, write_into
+from regnf_cli.output import Files, tell_files, write_into
 from regnf_cli.paths import JSON_FILE, library_path
 from regnf_cli.report import exit_code, show
 from regnf_cli.request_files import read_detection, read_options
@@ -155,7 +155,7 @@ def _search_here(
 
     options = RegistrationOptions.from_dict(request["options"])
     box = OrientedBox.from_detection(detection)
-    prepare(output)
+    Files(output).check()
     with phase_progress() as bar:
         task = bar.add_task("library", total=1.0)
         opened = open_scene(scene, detection)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
@@ -29,6 +31,37 @@ def atomic_path(path: str | os.PathLike[str], durable: bool = False) -> Iterator
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def made_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """The folder, made with those above it if need be. After an error the made ones go again, if they are empty."""
+    folder = Path(path)
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except BaseException:
+        for one in missing:
+            with suppress(OSError):
+                one.rmdir()
+        raise
+
+
+@contextmanager
+def filled_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A folder to write files into, which lie in the folder ``path`` at the end. After an error none of them does."""
+    with made_folder(path) as target, tempfile.TemporaryDirectory(dir=target) as work:
+        yield Path(work)
+        for made in sorted(Path(work).iterdir()):
+            made.replace(target / made.name)
+
+
+def require_writable(folder: str | os.PathLike[str]) -> None:
+    """Raises PermissionError unless the folder may be written into, or made. Nothing is made."""
+    place = next(one for one in (Path(folder).absolute(), *Path(folder).absolute().parents) if one.exists())
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
 
 
 def new_file(path: str | os.PathLike[str], suffix: str) -> Path:

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Makes .venv with everything in it. Quick when nothing has changed since the last time.
+# Makes .venv: with what the service, the command line and a demo need (`setup.sh demo`), or with everything that tests,
+# lint and docs need too. Quick when nothing has changed since the last time.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -12,22 +13,29 @@ scripts/system-packages.sh runtime
 
 stamp=.venv/.regnf-setup
 state=$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum)
-if [[ -f $stamp && $(cat "$stamp") == "$state" ]]; then
+have() { [[ -f $1 && $(cat "$1") == "$state" ]]; }
+if have "$stamp" || { [[ ${1-} == demo ]] && have "$stamp-demo"; }; then
     .venv/bin/python scripts/native_library.py # its C files may have changed
     exit 0
 fi
 
 [[ -x .venv/bin/python ]] || "$python" -m venv .venv
 pip=(.venv/bin/python -m pip --disable-pip-version-check --quiet)
+export PIP_NO_COMPILE=1 # Python compiles what is used, when it is: a quarter of a gigabyte less, and half a minute
 echo "Installing into .venv (the first time takes a few minutes) ..."
 # torch first and by its pinned version: an open range may resolve to a build with gigabytes of GPU libraries.
 "${pip[@]}" install -c constraints.txt torch
-"${pip[@]}" install -c constraints.txt -e '.[dev]'
-# The benchmark's peers weigh 2 MB, but not every machine has wheels of them: without them their tests are skipped.
-"${pip[@]}" install -c constraints.txt --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
-    echo "The benchmark's optional packages do not install here; tests of them will be skipped." >&2
-# Makes a client from the contract, in a test. Last, because it asks for an older typer than ours; it works with ours.
-"${pip[@]}" install -c constraints.txt --no-deps openapi-python-client
+if [[ ${1-} == demo ]]; then
+    "${pip[@]}" install -c constraints.txt -e '.[all]'
+    stamp+=-demo
+else
+    "${pip[@]}" install -c constraints.txt -e '.[dev]'
+    # The benchmark's peers weigh 2 MB, but not every machine has wheels of them: without them their tests are skipped.
+    "${pip[@]}" install -c constraints.txt --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
+        echo "The benchmark's optional packages do not install here; tests of them will be skipped." >&2
+    # Makes a client from the contract, in a test. Last, because it asks for an older typer than ours; it works with ours.
+    "${pip[@]}" install -c constraints.txt --no-deps openapi-python-client
+fi
 if ! .venv/bin/python -c 'import open3d' 2>.venv/open3d-error.txt; then
     echo "open3d does not load; a system library is missing:" >&2
     tail -n 1 .venv/open3d-error.txt >&2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from html import escape
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
+from regnf_core.files import filled_folder
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.result import RegistrationResult
 from regnf_core.verdicts import verdict_in_words
@@ -76,10 +76,9 @@ class Registered(RegistrationResult):
         if target.exists() and not target.is_dir():
             hint = "Name a folder; it is made if need be."
             raise InvalidInputError(f"{target}: a file, expected a folder", reason="FILE_IS_NO_FOLDER", hint=hint)
-        target.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target) as made:
-            names = write_artifacts(self, Path(made), object_name=self.object_name, fields=self.notes)
-            return [(Path(made) / name).replace(target / name) for name in names]
+        with filled_folder(target) as folder:
+            names = write_artifacts(self, folder, object_name=self.object_name, fields=self.notes)
+        return [target / name for name in names]
 
     def plot(self, path: str | Path | None = None, window: bool | None = None) -> Image:
         """The picture of the registration, written to ``path`` too if there is one.

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from regnf_core.errors import MissingExtraError
-from regnf_core.files import RECORDING_SUFFIX, atomic_path, new_file
+from regnf_core.files import RECORDING_SUFFIX, atomic_path, made_folder, new_file
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.result import RegistrationResult
 
@@ -30,7 +30,6 @@ def write_recording(
     from regnf_core.viewing.recording_content import recorded
 
     content = recorded(result, detection, object_name)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(target) as part:
+    with made_folder(target.parent), atomic_path(target) as part:
         part.write_bytes(content)
     return target

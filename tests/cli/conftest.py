@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from regnf_cli.main import main
+from regnf_cli.main import command
 
 DATA = Path(__file__).resolve().parents[2] / "examples" / "data"
 
@@ -39,11 +39,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> R
 
     def call(*arguments: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["regnf", *(str(argument) for argument in arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
+        code = command()
         captured = capfd.readouterr()
-        code = ended.value.code
-        return Outcome(code if isinstance(code, int) else 0, captured.out, captured.err)
+        return Outcome(code, captured.out, captured.err)
 
     return call
 

@@ -23,7 +23,7 @@ SYMMETRY = {"order": 4, "axis": [0, 0, 1], "continuous": False}
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     monkeypatch.setattr("sys.argv", ["regnf", *map(str, arguments)])
-    return cli._run()
+    return cli.command()
 
 
 @pytest.fixture(scope="module")

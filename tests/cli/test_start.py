@@ -22,12 +22,13 @@ SOUGHT = {"charset_normalizer", "cython_runtime", "pygments", "markdown_it", "md
 CODE = """
 import sys
 sys.argv = ["regnf", *sys.argv[1:]]
-from regnf_cli.main import main
+from regnf_cli.main import command
 try:
-    main()
+    code = command()
 finally:
     names = {name.partition(".")[0] for name in sys.modules if not name.startswith("_")}
     print(*sorted(names - set(sys.stdlib_module_names)), file=sys.stderr)
+sys.exit(code)
 """
 
 

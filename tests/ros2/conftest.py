@@ -13,7 +13,7 @@ import pytest
 from tests.ros2.messages import TYPES
 
 PACKAGE = Path(__file__).resolve().parents[2] / "ros2" / "regnf_ros"
-LOADED = ("regnf_ros", "rclpy", "tf2_ros", "geometry_msgs", "vision_msgs", "launch", "launch_ros")
+LOADED = ("regnf_ros", "rclpy", "rcl_interfaces", "tf2_ros", "geometry_msgs", "vision_msgs", "launch", "launch_ros")
 
 
 class Recorder:
@@ -42,13 +42,17 @@ class Log:
 class Node:
     """What the node uses of rclpy's. ``given``: parameters, as a launch file gives them."""
 
-    given: ClassVar[dict[str, str]] = {}
+    given: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, name: str) -> None:
         self.name, self.log = name, Log()
 
-    def declare_parameter(self, name: str, default: str) -> SimpleNamespace:
-        return SimpleNamespace(value=self.given.get(name, default))
+    def declare_parameter(self, name: str, default: Any, descriptor: Any = None) -> SimpleNamespace:
+        """Of the default's type alone, unless the descriptor says that any type will do."""
+        value = self.given.get(name, default)
+        if type(value) is not type(default) and not getattr(descriptor, "dynamic_typing", False):
+            raise TypeError(f"InvalidParameterTypeException: {name} is {value!r}")
+        return SimpleNamespace(value=value)
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> Recorder:
         return Recorder(kind, topic, depth)
@@ -89,6 +93,9 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     time = type("Time", (), {"from_msg": staticmethod(lambda stamp: stamp)})
     module("rclpy", init=None, spin=None, try_shutdown=None)
     module("rclpy.node", Node=Node)
+    module("rclpy.logging", get_logger=lambda name: Node(name).log)
+    module("rcl_interfaces")
+    module("rcl_interfaces.msg", ParameterDescriptor=SimpleNamespace)
     module("rclpy.time", Time=time)
     tf = {"Buffer": Buffer, "TransformListener": Recorder, "TransformBroadcaster": Recorder}
     module("tf2_ros", **tf, TransformException=TransformException)

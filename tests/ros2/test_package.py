@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -60,8 +61,9 @@ class Answers:
         return httpx.Response(200, json={"id": "j1", "status": "successful"})
 
 
-def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: str) -> Any:
-    usual = {"server": "http://127.0.0.1:1", "token": "open-sesame", "scene": SCENE, "objects": f"chair={CHAIR}"}
+def make_node(monkeypatch: pytest.MonkeyPatch, answers: Callable[[httpx.Request], httpx.Response], **given: Any) -> Any:
+    monkeypatch.setenv("REGNF_API_TOKEN", "open-sesame")
+    usual = {"server": "http://127.0.0.1:1", "scene": SCENE, "objects": f"chair={CHAIR}"}
     monkeypatch.setattr(Node, "given", usual | given)
     node_part = part("node")
     service = part("service").Service
@@ -243,17 +245,140 @@ def test_a_bad_dataparser_file_is_named(tmp_path: Path, text: str) -> None:
         part("poses").field_from_map(str(file))
 
 
-@pytest.mark.parametrize("text", ["chair", "chair=", "=ab", "chair=ab chair=cd"])
-def test_a_bad_table_of_objects_is_refused(text: str) -> None:
+BOOLEANS = {
+    **dict.fromkeys(("y", "Y", "yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"), True),
+    **dict.fromkeys(("n", "N", "no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"), False),
+}
+
+
+def of_rcl(text: str) -> Any:
+    """A parameter's value as rcl takes it from YAML: github.com/ros2/rcl, rcl_yaml_param_parser, `get_value`.
+
+    Quoted scalars are texts. Of others, words for booleans come first, then whole numbers to any base, then what
+    strtod takes; null and ~ are texts.
+    """
+    (event,) = (one for one in yaml.parse(text) if isinstance(one, yaml.ScalarEvent))
+    if event.style in ("'", '"'):
+        return event.value
+    if event.value in BOOLEANS:
+        return BOOLEANS[event.value]
+    for kind in (lambda word: int(word, 0), float):
+        if "_" not in event.value:
+            try:
+                return kind(event.value)
+            except ValueError:
+                pass
+    return event.value
+
+
+def launched(text: str) -> Any:
+    """A text of a launch file: launch_ros writes it with PyYAML, which quotes by YAML 1.1 of its own, rcl reads it."""
+    return of_rcl(yaml.dump({"p": text}).partition(":")[2])
+
+
+PASSED = [launched, of_rcl]
+
+
+@pytest.mark.parametrize("passed", PASSED)
+@pytest.mark.parametrize("said", ["x", "y", "z", "X", "Y", "Z", "+y", "axis_y", "y-axis"])
+def test_an_axis_arrives_whatever_yaml_makes_of_it(passed: Callable[[str], Any], said: str) -> None:
+    assert part("parameters").axis_of("up_axis", passed(said)) == re.sub("axis|[-+_]", "", said).lower()
+
+
+@pytest.mark.parametrize("passed", PASSED)
+@pytest.mark.parametrize("said", ["n", "no", "off", "null", "~", "1", "-y", "up", "nan"])
+def test_what_is_no_axis_is_refused(passed: Callable[[str], Any], said: str) -> None:
+    with pytest.raises(ValueError, match=r"up_axis: .* is none of x, y and z"):
+        part("parameters").axis_of("up_axis", passed(said))
+
+
+@pytest.mark.parametrize("passed", PASSED)
+@pytest.mark.parametrize(("said", "share"), [("0.03", 0.03), ("1e-3", 0.001), ("0", 0.0), ("3e-2", 0.03), (".5", 0.5)])
+def test_a_share_is_a_number_of_any_kind(passed: Callable[[str], Any], said: str, share: float) -> None:
+    assert part("parameters").share_of("scale_tolerance", passed(said)) == share
+
+
+@pytest.mark.parametrize("passed", PASSED)
+@pytest.mark.parametrize("said", ["1", "-0.1", "3%", "true", "y", "no", "nan", ".nan", ".inf", "inf", "0,03", "[0.1]"])
+def test_what_is_no_share_is_refused(passed: Callable[[str], Any], said: str) -> None:
+    value = [0.1] if said == "[0.1]" else passed(said)
+    with pytest.raises(ValueError, match=r"scale_tolerance: .* is no number"):
+        part("parameters").share_of("scale_tolerance", value)
+
+
+@pytest.mark.parametrize("said", ["on", "no", "y", "12", "0x1f", "1e5", "0.5", "nan"])
+def test_a_text_that_yaml_has_changed_is_refused_and_quotes_keep_it(said: str) -> None:
+    with pytest.raises(ValueError, match=f"map_frame: .*{of_rcl(said)!r}.*quotes"):
+        part("parameters").text_of("map_frame", of_rcl(said))
+    assert part("parameters").text_of("map_frame", of_rcl(f"'{said}'")) == said
+
+
+NAMES = ["chair", "dining table", "a=b", "a, b", "rack: left", "Stühle", "y", "12", "{x}", "a;b", 'the "big" one']
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_classes_have_any_name(name: str) -> None:
+    objects, table = part("parameters").objects_of, {name: CHAIR, "other one": SCENE}
+    entries = [f"{one}={digest}" for one, digest in table.items()]
+    for separator in (" ", ", ", ";", "\n"):
+        assert objects(launched(separator.join(reversed(entries)))) == table
+    assert objects(entries) == table
+    for said in (json.dumps(entries), json.dumps(table), json.dumps(table, ensure_ascii=False)):
+        assert objects(launched(said)) == table
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["chair", "chair=", "=" + CHAIR, "chair=ab", f"a={CHAIR} a={SCENE}", f"a={CHAIR} b", ["chair"], [5], True, 3, "[1]",
+     '["a', f'{{"a": "{CHAIR}", "a": "{SCENE}"}}'],
+)  # fmt: skip
+def test_a_bad_table_of_objects_is_refused(value: Any) -> None:
     with pytest.raises(ValueError, match="objects"):
-        part("objects").objects_of(text)
+        part("parameters").objects_of(value)
+
+
+def test_parameters_of_any_type_reach_the_registration(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = Answers(result())
+    given = {"up_axis": launched("y"), "scale_tolerance": of_rcl("0.03"), "objects": [f"dining table={CHAIR}"]}
+    node = make_node(monkeypatch, answers, **given)
+    node.answer(detections("dining table"))
+    options = answers.requests[0]["options"]
+    assert (options["up_axis"], answers.requests[0]["object"]) == ("y", CHAIR)
+    assert options["robust"] == pytest.approx({"min_scale": 0.97, "max_scale": 1.03})
+
+
+def test_a_wrong_parameter_ends_the_node_with_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="map_frame"):
+        make_node(monkeypatch, Answers(result()), map_frame=True)
+    log = Node("regnf").log
+    monkeypatch.setattr(part("node"), "get_logger", lambda name: log)
+    for name in ("init", "try_shutdown"):
+        monkeypatch.setattr(sys.modules["rclpy"], name, lambda: None)
+    log.fatal = log.info  # type: ignore[attr-defined]
+    assert part("node").main() == 2
+    assert log.lines == [
+        "map_frame: expected a text, and YAML has made True of it; put it into quotes: map_frame:=\"'...'\""
+    ]
+
+
+def test_the_token_is_in_a_file_or_a_variable_and_no_parameter(tmp_path: Path) -> None:
+    token = part("parameters").token_of
+    assert "token" not in part("node").PARAMETERS
+    file = tmp_path / "token"
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        file.write_bytes("open-sesame\r\n".encode(encoding))
+        assert token(str(file), {"REGNF_API_TOKEN": "other"}) == "open-sesame"
+    assert token("", {"REGNF_API_TOKEN": "open-sesame\r"}) == "open-sesame"
+    assert token("", {}) == ""
+    with pytest.raises(ValueError, match=r"token_file: .*nothing cannot be read"):
+        token(str(tmp_path / "nothing"), {})
 
 
 def test_the_launch_file_gives_each_parameter_of_the_node() -> None:
     made = runpy.run_path(str(PACKAGE / "launch" / "regnf.launch.py"))["generate_launch_description"]()
     *declared, node = made
     names = {one.arguments[0] for one in declared}
-    assert names == set(node.named["parameters"][0]) == set(part("node").TEXTS)
+    assert names == set(node.named["parameters"][0]) == set(part("node").PARAMETERS)
     assert (node.named["package"], node.named["executable"]) == ("regnf_ros", "register_objects")
 
 

@@ -8,16 +8,20 @@ from threading import Thread
 
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.time import Time
 from tf2_ros import Buffer, TransformBroadcaster, TransformException, TransformListener
 from vision_msgs.msg import Detection3D, Detection3DArray, ObjectHypothesisWithPose
 
-from regnf_ros.objects import Found, Registrar, objects_of, options_of
+from regnf_ros.objects import Found, Registrar
+from regnf_ros.parameters import axis_of, objects_of, options_of, share_of, text_of, token_of
 from regnf_ros.poses import Box, ObjectPose, field_from_map, quaternion_xyzw, rigid
 from regnf_ros.service import Service, ServiceError
 
-TEXTS = ("server", "token", "scene", "objects", "map_frame", "dataparser_transforms", "up_axis", "scale_tolerance")
+TEXTS = ("server", "token_file", "scene", "map_frame", "dataparser_transforms")
+PARAMETERS = (*TEXTS, "objects", "up_axis", "scale_tolerance")
 DEFAULTS = {"server": "http://127.0.0.1:8080", "map_frame": "map"}
 WAITING = 16
 """Arrays of detections that may wait for the service; later ones are dropped, which is said in the log."""
@@ -28,15 +32,22 @@ class RegisterObjects(Node):
 
     def __init__(self) -> None:
         super().__init__("regnf")
-        said = {name: self.declare_parameter(name, DEFAULTS.get(name, "")).value for name in TEXTS}
+        # of any type: YAML makes a boolean of `up_axis: y`, and a parameter of one type would end the node there
+        any_type = ParameterDescriptor(dynamic_typing=True)
+        given = {name: self.declare_parameter(name, DEFAULTS.get(name, ""), any_type).value for name in PARAMETERS}
+        said = {name: text_of(name, given[name]) for name in TEXTS}
         self.map_frame = said["map_frame"]
         T_field_map = field_from_map(said["dataparser_transforms"])
         self.registrar = Registrar(
-            Service(said["server"], said["token"]),
+            Service(said["server"], token_of(said["token_file"])),
             said["scene"],
-            objects_of(said["objects"]),
+            objects_of(given["objects"]),
             T_field_map,
-            options_of(said["up_axis"], said["scale_tolerance"], T_field_map),
+            options_of(
+                axis_of("up_axis", given["up_axis"]),
+                share_of("scale_tolerance", given["scale_tolerance"]),
+                T_field_map,
+            ),
         )
         self.transforms = Buffer()
         self.listener = TransformListener(self.transforms, self)
@@ -156,10 +167,16 @@ def _quaternion(message) -> tuple[float, float, float, float]:
     return message.x, message.y, message.z, message.w
 
 
-def main() -> None:
+def main() -> int:
     rclpy.init()
-    node = RegisterObjects()
+    try:
+        node = RegisterObjects()
+    except ValueError as error:
+        get_logger("regnf").fatal(str(error))
+        rclpy.try_shutdown()
+        return 2
     with suppress(KeyboardInterrupt):
         rclpy.spin(node)
     node.destroy_node()
     rclpy.try_shutdown()
+    return 0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from regnf_ros.poses import Box, Matrix, ObjectPose, object_pose, scale_of
+from regnf_ros.poses import Box, Matrix, ObjectPose, object_pose
 from regnf_ros.service import Request, Service
 
 
@@ -23,30 +23,6 @@ class Found:
     box: Box
     probability: float
     verdict: str
-
-
-def objects_of(text: str) -> dict[str, str]:
-    """``chair=SHA table=SHA`` as a table. Raises ValueError for an entry that is none, or a class that comes twice."""
-    table: dict[str, str] = {}
-    for entry in text.split():
-        name, sign, digest = entry.partition("=")
-        if not (name and sign and digest) or name in table:
-            raise ValueError(f"objects: {entry!r} is not CLASS=SHA256, or names its class again")
-        table[name] = digest
-    return table
-
-
-def options_of(up_axis: str, scale_tolerance: str, T_field_map: Matrix) -> dict[str, Any]:
-    """The options of every registration. scale_tolerance: by what share the objects' units may differ from meters; "":
-    they are not known. Raises ValueError for one that is no share."""
-    options: dict[str, Any] = {"up_axis": up_axis} if up_axis else {}
-    if scale_tolerance:
-        share = float(scale_tolerance)
-        if not 0.0 <= share < 1.0:
-            raise ValueError(f"scale_tolerance: {scale_tolerance!r} is not at least 0 and less than 1")
-        metric = 1.0 / scale_of(T_field_map)
-        options["robust"] = {"min_scale": (1.0 - share) * metric, "max_scale": (1.0 + share) * metric}
-    return options
 
 
 class Registrar:

@@ -93,7 +93,7 @@ def field_from_map(dataparser_transforms: str) -> Matrix:
     if not dataparser_transforms:
         return np.eye(4)
     try:
-        said = json.loads(Path(dataparser_transforms).read_text(encoding="utf-8"))
+        said = json.loads(Path(dataparser_transforms).read_bytes())
         T = np.eye(4)
         T[:3] = float(said["scale"]) * np.asarray(said["transform"], dtype=np.float64)[:3, :4]
     except (KeyError, TypeError, ValueError, IndexError) as error:

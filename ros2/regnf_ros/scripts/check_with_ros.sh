@@ -12,7 +12,8 @@ source install/setup.bash
 for message in vision_msgs/msg/Detection3DArray geometry_msgs/msg/PoseWithCovarianceStamped; do
     ros2 interface show "$message" >/dev/null
 done
-ros2 run regnf_ros register_objects --ros-args -p scene:=none -p objects:=chair=none &
+ros2 run regnf_ros register_objects --ros-args -p scene:=none -p "objects:=dining table=$(printf '0%.0s' {1..64})" \
+    -p up_axis:=y -p scale_tolerance:=0.03 &
 node=$!
 for _ in $(seq 30); do
     if info=$(ros2 node info /regnf 2>/dev/null) && grep -q Detection3DArray <<<"$info"; then

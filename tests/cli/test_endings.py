@@ -1,0 +1,207 @@
+"""How commands end that are cut off, by a signal, a closed pipe or a full disk: silently, leaving nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import DATA
+
+SIGNALED = """
+import os, signal, sys
+
+class At:
+    "Sends a signal to this process when a module is asked for."
+
+    def find_spec(self, name, path=None, target=None):
+        if name == module:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), number)
+
+module, number = sys.argv[1], int(sys.argv[2])
+sys.argv = ["regnf", *sys.argv[3:]]
+from regnf_cli.main import main
+sys.meta_path.insert(0, At())
+main()
+"""
+PAIR = [
+    str(DATA / "mix-room.safetensors"),
+    str(DATA / "armchair.safetensors"),
+    "--detection",
+    str(DATA / "detection.json"),
+]
+CUT_OFF = [
+    *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.console", "numpy")],
+    *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch", "torch._C", "torch.nn")],
+    *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_core.registration", "scipy.spatial", "PIL.Image")],
+    *[(name, "torch", ["register", *PAIR]) for name in ("SIGTERM", "SIGHUP")],
+    *[("SIGINT", name, ["search", *PAIR]) for name in ("regnf_cli.search", "torch", "regnf_core.viewing.artifacts")],
+    *[("SIGINT", name, ["inspect", PAIR[1]]) for name in ("regnf_cli.inspect", "torch")],
+    ("SIGINT", "igl", ["convert", PAIR[1], "chair.ply"]),
+    ("SIGINT", "igl.pyigl_core", ["convert", PAIR[1], "chair.ply"]),
+    ("SIGTERM", "regnf_core.surface.isosurface", ["convert", PAIR[1], "chair.ply"]),
+    ("SIGINT", "regnf_core.rendering.job", ["render", PAIR[0], "--size", "24x18", "--frames", "1"]),
+    ("SIGINT", "pydantic_settings", ["serve", "--port", "0", "--state-dir", "state"]),
+    ("SIGHUP", "regnf_cli.supervisor", ["serve", "--port", "0", "--state-dir", "state"]),
+    ("SIGINT", "httpx", ["register", *PAIR, "--server", "http://127.0.0.1:9"]),
+    ("SIGINT", "regnf_cli.doctor", ["doctor"]),
+    ("SIGINT", "regnf_cli.batch_here", ["batch", str(DATA / "detection.json")]),
+    ("SIGINT", "rich.markdown", ["manual", "api"]),
+]  # fmt: skip
+
+
+def run(arguments: Sequence[str], folder: Path, **how: object) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "TMPDIR": str(folder / "tmp"),
+        "COLUMNS": "120",
+    }
+    (folder / "tmp").mkdir(exist_ok=True)
+    return subprocess.run(  # type: ignore[call-overload,no-any-return]
+        [sys.executable, *arguments], cwd=folder, env=environment, text=True, timeout=250, check=False,
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | how,
+    )  # fmt: skip
+
+
+def left(folder: Path) -> list[str]:
+    """What lies there beside the caches, with what they have left in the folder for temporary files."""
+    return [one.name for one in folder.iterdir() if one.name not in ("cache", "tmp", "state")] + [
+        one.name for one in (folder / "tmp").iterdir()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "command"), CUT_OFF, ids=[f"{one[2][0]}-{one[1]}-{one[0]}" for one in CUT_OFF]
+)
+def test_a_signal_ends_a_command_silently(name: str, module: str, command: list[str], tmp_path: Path) -> None:
+    number = signal.Signals[name]
+    said = ["--output", "out/below"] if command[0] in ("register", "search", "render") else []
+    done = run(["-c", SIGNALED, module, str(int(number)), *command, *said], tmp_path)
+    lines = [line for line in done.stderr.splitlines() if line.strip() and "0:00:" not in line]  # the bar's last state
+    assert (done.returncode, done.stdout, lines) == (128 + number, "", [])
+    assert left(tmp_path) == []
+
+
+SWALLOWED = """
+import os, signal, sys
+sys.argv = ["regnf", "manual", "api"]
+from regnf_cli import main as regnf
+class Finalized:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000): pass
+def run():
+    Finalized()
+    while True: signal.pause()
+regnf._run = run
+regnf.main()
+"""
+
+
+def test_an_interrupt_in_a_finalizer_is_not_lost(tmp_path: Path) -> None:
+    done = run(["-c", SWALLOWED], tmp_path)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+CLEANING = """
+import os, signal, sys, time
+sys.argv = ["regnf", "manual", "api"]
+from regnf_cli import main as regnf
+def run():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        while True: pass
+    finally:
+        time.sleep(3 * regnf._AGAIN_AFTER_S)
+        print("cleaned", flush=True)
+regnf._run = run
+regnf.main()
+"""
+
+
+def test_an_interrupt_does_not_interrupt_the_cleaning(tmp_path: Path) -> None:
+    done = run(["-c", CLEANING], tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "cleaned\n", "")
+
+
+HELD = """
+import os, signal, sys
+sys.argv = ["regnf", "manual", "api"]
+from regnf_cli import main as regnf
+def run():
+    import igl
+    sys.kept = igl.winding_number
+    sys.modules["kept"] = [igl, sys.kept]
+    os.kill(os.getpid(), signal.SIGINT)
+    while True: pass
+regnf._run = run
+regnf.main()
+"""
+
+
+def test_compiled_libraries_do_not_complain_of_what_is_left_over(tmp_path: Path) -> None:
+    done = run(["-c", HELD], tmp_path)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["--help"],
+        ["register", "--help"],
+        ["manual"],
+        ["manual", "api"],
+        ["--version"],
+        ["inspect", PAIR[1]],
+        ["doctor"],
+    ],
+    ids=" ".join,
+)
+def test_a_closed_pipe_is_no_rejection(command: list[str], tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = run(["-m", "regnf_cli.main", *command], tmp_path, stdout=writing)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
+
+
+@pytest.mark.parametrize("command", [["manual", "api"], ["--version"], ["--help"], ["inspect", PAIR[1]]], ids=" ".join)
+def test_a_full_output_says_so(command: list[str], tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = run(["-m", "regnf_cli.main", *command], tmp_path, stdout=full)
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == [
+        "FILE_UNUSABLE output: No space left on device",
+        "hint: Make room on the disk, or name another place.",
+    ]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["convert", PAIR[1], "made/chair.ply"],
+        ["render", PAIR[0], "--size", "64x48", "--frames", "1", "--output", "new/below"],
+        ["register", *PAIR, "--output", "new/below"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_full_disk_leaves_nothing(command: list[str], tmp_path: Path) -> None:
+    """A limit of the size of files stands in for it: the write fails in the same place."""
+    (tmp_path / "made").mkdir()
+    limited = (
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500)); sys.argv[0] = 'regnf';"
+        "from regnf_cli.main import main; main()"
+    )
+    done = run(["-c", limited, *command], tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert "FILE_UNUSABLE" in done.stderr
+    assert "Make room" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert left(tmp_path) == ["made"]
+    assert list((tmp_path / "made").iterdir()) == []
