@@ -10,7 +10,7 @@ from typing import Any
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_service.batches.feeder import Requests
 from regnf_service.http.batch_lines import LINE_BYTES, Line
-from regnf_service.http.by_reference import asked_by_reference
+from regnf_service.http.by_reference import Library, asked_by_reference
 from regnf_service.http.problems import problem_of
 from regnf_service.http.schemas.batches import BatchPair
 from regnf_service.http.schemas.reading import read_model
@@ -29,7 +29,7 @@ _PROBLEMS_SHOWN = 32
 
 def read_again(services: Services, caller: str, request: dict[str, Any]) -> tuple[RegistrationRequest, dict[str, str]]:
     """A kept line's request, and the fields that it names. Raises Problem."""
-    return asked_by_reference(services, caller, read_model(RegisterRequest, json.dumps(request).encode()))
+    return asked_by_reference(Library(services, caller), read_model(RegisterRequest, json.dumps(request).encode()))
 
 
 REQUESTS = Requests(read_again, problem_of)
@@ -43,6 +43,7 @@ class Intake:
         self._services = services
         self._caller = caller
         self._pairs = pairs
+        self._library = Library(services, caller)
         self._count = 0
         self._refused = 0
         self._problems: list[dict[str, Any]] = []
@@ -90,7 +91,7 @@ class Intake:
         if spec.key is not None and spec.key in self._keys:
             fault = {"pointer": "/key", "detail": f"Line {self._keys[spec.key]} has the same key."}
             raise Problem("INVALID_REQUEST", errors=[fault])
-        asked, _ = asked_by_reference(self._services, self._caller, spec)
+        asked, _ = asked_by_reference(self._library, spec)
         self._check(asked)
         members = {name: value for name, value in parse_json(line.text).items() if name != "key"}
         meant = {"object": asked.object, "candidates": asked.candidates and list(asked.candidates)}

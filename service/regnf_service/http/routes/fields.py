@@ -184,7 +184,8 @@ def _seen(record: FieldRecord, data: bytes, media_type: str, caching: str) -> Re
     response_model=FieldPage,
     responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
 )
-async def list_fields(
+@blocking
+def list_fields(
     request: Request,
     services: ServicesDep,
     caller: CallerDep,
@@ -199,7 +200,7 @@ async def list_fields(
     """
     if wants_page(request.scope):
         return page("lists.html")
-    found = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
+    found = services.records.list_fields(label, limit, decode_token(page_token), caller)
     documents = [field_document(record, prefix) for record in found.records]
     document = {"fields": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})
