@@ -46,7 +46,8 @@ class Library:
     def _by_name(self, names: Mapping[str, str]) -> list[str]:
         """Of each entry; ``names`` by the places where the request has them."""
         new = [name for name in dict.fromkeys(names.values()) if name not in self._named]
-        self._named |= zip(new, self._records.entries_named(self._caller, new), strict=True)
+        if new:
+            self._named |= zip(new, self._records.entries_named(self._caller, new), strict=True)
         found = {pointer: self._named[name] for pointer, name in names.items()}
         missing = [pointer for pointer, entry in found.items() if entry is None]
         if missing:

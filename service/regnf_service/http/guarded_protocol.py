@@ -82,7 +82,8 @@ class GuardedProtocol(H11Protocol):
                     await self.flow.drain()
                 block = body[begin : begin + _BLOCK_BYTES]
                 self._pending = len(body) - begin - len(block)
-                await send(message | {"body": block, "more_body": message.get("more_body", False) or self._pending > 0})
+                more = message.get("more_body", False) or self._pending > 0
+                await send({"type": message["type"], "body": block, "more_body": more})
 
         await app(scope, receive, send_in_blocks)
 
