@@ -67,6 +67,9 @@ class BlobWriter(Protocol):
 class BlobStore(Protocol):
     """Blobs by key. Missing keys raise FileNotFoundError, malformed ones ValueError. Every method is blocking."""
 
+    block_bytes: int
+    """As few as can be read at once without being slow."""
+
     def writer(self) -> AbstractContextManager[BlobWriter]: ...
 
     def put(self, key: str, data: bytes) -> None: ...
@@ -76,6 +79,10 @@ class BlobStore(Protocol):
         ...
 
     def open(self, key: str) -> BinaryIO: ...
+
+    def stream(self, key: str) -> BinaryIO:
+        """The same for what is sent on as it is read: nothing is read ahead. Read ``block_bytes`` at a time."""
+        ...
 
     def local_copy(self, key: str) -> AbstractContextManager[Path]:
         """A readable file with the blob's bytes: the file itself where the store is local."""

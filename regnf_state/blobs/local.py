@@ -95,6 +95,8 @@ class LocalBlobStore:
     for, ``wait_s`` seconds at most; then StorageUnavailableError is raised. ``existing``: nothing is made.
     """
 
+    block_bytes = 64 * 1024
+
     def __init__(self, root: Path, wait_s: float = 0.0, existing: bool = False) -> None:
         self._wait_s = wait_s
         if not existing:
@@ -177,6 +179,9 @@ class LocalBlobStore:
 
     def open(self, key: str) -> BinaryIO:
         return self.tried(lambda: self.path_of(key).open("rb"))
+
+    def stream(self, key: str) -> BinaryIO:
+        return self.open(key)
 
     @contextmanager
     def local_copy(self, key: str) -> Iterator[Path]:

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, cast
 from uuid import uuid4
 
 import obstore
@@ -138,6 +138,8 @@ class ObjectBlobStore:
     repeated for ``wait_s`` seconds; then StorageUnavailableError is raised. Fields are kept in ``cache``, if given.
     """
 
+    block_bytes = 512 * 1024
+
     def __init__(self, url: str, wait_s: float = 10.0, cache: FileCache | None = None) -> None:
         self._wait_s = wait_s
         self._cache = cache
@@ -187,6 +189,9 @@ class ObjectBlobStore:
         if isinstance(found, bytes):
             return io.BytesIO(found)
         return io.BufferedReader(_RangedReader(self, key, found), buffer_size=4 << 20)
+
+    def stream(self, key: str) -> BinaryIO:
+        return cast(BinaryIO, _RangedReader(self, key, self._head(key)))
 
     @contextmanager
     def local_copy(self, key: str) -> Iterator[Path]:

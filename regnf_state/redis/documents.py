@@ -13,7 +13,7 @@ from uuid import uuid4
 from redis import Redis
 from redis.exceptions import ResponseError
 
-from regnf_state.pages import LOOKED_AT, Page, Position
+from regnf_state.pages import LOOKED_AT, PAGE_BYTES, Page, Position
 from regnf_state.record_format import FORMAT, decoded, encoded
 from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
 from regnf_state.redis.keys import PREFIX
@@ -138,16 +138,35 @@ class RedisDocuments:
             answers = pipeline.execute(raise_on_error=False)
         return [(name, stored_in(answer)) for name, answer in zip(names, answers, strict=True)]
 
+    def _fetch_in_portions(self, kind: Kind[Any], names: Sequence[str]) -> Iterator[tuple[str, int, Stored | None]]:
+        """The same a few at a time, as they are asked for, with the bytes of each: at most PAGE_BYTES are held."""
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for name in names:
+                pipeline.hstrlen(kind.key(name), "document")
+            sizes = [_size_in(answer) for answer in pipeline.execute(raise_on_error=False)]
+        begin = 0
+        while begin < len(names):
+            end, held = begin + 1, sizes[begin]
+            while end < len(names) and held + sizes[end] <= PAGE_BYTES:
+                held += sizes[end]
+                end += 1
+            for size, (name, stored) in zip(sizes[begin:end], self._fetch(kind, names[begin:end]), strict=True):
+                yield name, size, stored
+            begin = end
+
     def _page(
         self, index: str, kind: Kind[_Record], limit: int, before: Position | None, wanted: Callable[[_Record], bool]
     ) -> Page[_Record]:
         """The newest ``limit`` of the records in ``index`` that are ``wanted``, older than ``before``.
 
-        Looks at LOOKED_AT records at most: the next page goes on after the last that was looked at.
+        Looks at LOOKED_AT records and PAGE_BYTES at most: the next page goes on after the last that was looked at.
         """
         found: list[_Record] = []
-        last = before
-        for looked_at, (position, record) in enumerate(self._newest_first(index, kind, before), 1):
+        last, left = before, PAGE_BYTES
+        for looked_at, (position, size, record) in enumerate(self._newest_first(index, kind, before), 1):
+            left -= size
+            if left < 0 and looked_at > 1:
+                return Page(found, last)
             if record is not None and wanted(record):
                 if len(found) == limit:
                     return Page(found, last)
@@ -159,8 +178,8 @@ class RedisDocuments:
 
     def _newest_first(
         self, index: str, kind: Kind[_Record], before: Position | None
-    ) -> Iterator[tuple[Position, _Record | None]]:
-        """What the sorted set ``index`` lists by time of creation, older than ``before``.
+    ) -> Iterator[tuple[Position, int, _Record | None]]:
+        """What the sorted set ``index`` lists by time of creation, older than ``before``: position, bytes, record.
 
         A record that is gone or cannot be read is None.
         """
@@ -170,9 +189,10 @@ class RedisDocuments:
             answer: Any = self._redis.zrevrangebyscore(index, highest, "-inf", seen_at_highest, _PAGE, withscores=True)
             page = [(float(score), text(name)) for name, score in answer]
             older = [position for position in page if before is None or position < before]
-            read = self._fetch(kind, [name for _, name in older])
-            for position, (name, stored) in zip(older, read, strict=True):
-                yield position, self._readable(kind, name, stored)
+            for position, (name, size, stored) in zip(
+                older, self._fetch_in_portions(kind, [name for _, name in older]), strict=True
+            ):
+                yield position, size, self._readable(kind, name, stored)
             if len(page) < _PAGE:
                 return
             # continue from the last score, not by offset: records created in between would shift the offsets
@@ -260,6 +280,15 @@ def stored_in(answer: Any) -> Stored | None:
     if isinstance(answer, Exception):
         raise answer
     return None if answer == [None, None, None] else Stored(True, *answer)
+
+
+def _size_in(answer: Any) -> int:
+    """The bytes of a document; 0 of what is none. Raises RedisError but for a key of another type."""
+    if is_wrong_type(answer):
+        return 0
+    if isinstance(answer, Exception):
+        raise answer
+    return int(answer)
 
 
 def is_wrong_type(answer: object) -> bool:

@@ -321,4 +321,7 @@ class RedisRecordStore(RedisLibrary):
 
     def jobs_using_field(self, sha256: str) -> Iterator[str]:
         names = sorted(map(text, self._redis.smembers(_active_key(owner_of(sha256)))))
-        return (record.id for record in self._read_many(JOB, names) if transitions.uses_field(record, sha256))
+        for name, _, stored in self._fetch_in_portions(JOB, names):
+            record = self._readable(JOB, name, stored)
+            if record is not None and transitions.uses_field(record, sha256):
+                yield record.id

@@ -10,8 +10,7 @@ from typing import Any
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_service.batches import Line, Posting
 from regnf_service.http.batch_lines import LINE_BYTES, TextLine
-from regnf_service.http.by_reference import asked_by_reference
-from regnf_service.http.library_selection import CallersLibrary
+from regnf_service.http.by_reference import Library, asked_by_reference
 from regnf_service.http.schemas.batches import BatchPair
 from regnf_service.http.schemas.reading import read_model
 from regnf_service.problem import CLOSE, Problem
@@ -43,7 +42,7 @@ class Intake:
     def __init__(self, services: Services, caller: str) -> None:
         self._services = services
         self._caller = caller
-        self._library = CallersLibrary(services, caller)
+        self._library = Library(services, caller)
         self._lines: list[Line] = []
         self._keys: dict[str, int] = {}
         self._count = 0

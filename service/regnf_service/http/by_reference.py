@@ -1,22 +1,94 @@
-"""A registration request whose fields are named: what it asks for, and which fields the caller must have."""
+"""A registration request whose fields are named, by their digests or as entries of the caller's library."""
 
 from __future__ import annotations
 
-from regnf_service.http.library_selection import CallersLibrary
-from regnf_service.http.schemas.library import LibrarySelection
+from collections.abc import Iterator, Mapping, Sequence
+
+from regnf_service.http.schemas.library import MAX_SELECTED, LibraryFilter, LibraryReference, LibrarySelection
 from regnf_service.http.schemas.registrations import RegisterRequest
+from regnf_service.problem import MAX_ERRORS, Problem
+from regnf_service.services import Services
+from regnf_state.library import LibraryEntry
+from regnf_state.ownership import sha256_of
+from regnf_state.pages import LOOKED_AT, Page, Position, all_of
+from regnf_state.records import FieldRecord
 from regnf_state.registration_request import RegistrationRequest
 
 
-def asked_by_reference(library: CallersLibrary, spec: RegisterRequest) -> tuple[RegistrationRequest, dict[str, str]]:
+class Library:
+    """A caller's library as one request sees it: what it names is read once, however often. Blocking."""
+
+    def __init__(self, services: Services, caller: str) -> None:
+        self._records = services.records
+        self._caller = caller
+        self._named: dict[str, LibraryEntry | None] = {}
+        self._usable: list[tuple[str, frozenset[str]]] | None = None
+
+    def one(self, name: str, pointer: str) -> str:
+        """SHA-256 of the entry's field. Raises as ``selected``."""
+        return self._by_name({pointer: name})[0]
+
+    def selected(self, wanted: LibraryFilter) -> list[str]:
+        """SHA-256s of the fields that are meant.
+
+        Raises Problem LIBRARY_ENTRY_NOT_FOUND, FIELD_REJECTED, LIBRARY_EMPTY, LIBRARY_TOO_LARGE.
+        """
+        found = self._by_name({f"/candidates/library/names/{n}": name for n, name in enumerate(wanted.names or ())})
+        if wanted.tags is not None or wanted.names is None:
+            found += self._by_tags(wanted.tags)
+        meant = list(dict.fromkeys(found))
+        if not meant:
+            raise Problem("LIBRARY_EMPTY", errors=[{"pointer": "/candidates/library", "detail": "no entry is meant"}])
+        if len(meant) > MAX_SELECTED:
+            raise Problem("LIBRARY_TOO_LARGE", f"{len(meant)} entries are meant; one search takes {MAX_SELECTED}.")
+        return meant
+
+    def _by_name(self, names: Mapping[str, str]) -> list[str]:
+        """Of each entry; ``names`` by the places where the request has them."""
+        new = [name for name in dict.fromkeys(names.values()) if name not in self._named]
+        if new:
+            self._named |= zip(new, self._records.entries_named(self._caller, new), strict=True)
+        found = {pointer: self._named[name] for pointer, name in names.items()}
+        missing = [pointer for pointer, entry in found.items() if entry is None]
+        if missing:
+            faults = [{"pointer": pointer, "detail": "no such entry"} for pointer in missing[:MAX_ERRORS]]
+            raise Problem("LIBRARY_ENTRY_NOT_FOUND", errors=faults)
+        rejected = [pointer for pointer, entry in found.items() if entry and entry.field.state == "rejected"]
+        if rejected:
+            faults = [{"pointer": pointer, "detail": "rejected"} for pointer in rejected[:MAX_ERRORS]]
+            raise Problem("FIELD_REJECTED", errors=faults)
+        return [sha256_of(entry.field.sha256) for entry in found.values() if entry is not None]
+
+    def _by_tags(self, tags: Sequence[str] | None) -> list[str]:
+        """Of all entries with any of the tags; None: of all. Rejected ones are left out."""
+        if self._usable is None:
+            self._usable = list(self._read())
+        return [sha256 for sha256, has in self._usable if tags is None or not has.isdisjoint(tags)]
+
+    def _read(self) -> Iterator[tuple[str, frozenset[str]]]:
+        """Digest and tags of each entry that is not rejected."""
+
+        def page(before: Position | None) -> Page[FieldRecord]:
+            return self._records.list_entries(self._caller, None, None, LOOKED_AT, before)
+
+        for field in all_of(page):
+            if field.state != "rejected" and field.library is not None:
+                yield sha256_of(field.sha256), frozenset(field.library["tags"])
+
+
+def asked_by_reference(library: Library, spec: RegisterRequest) -> tuple[RegistrationRequest, dict[str, str]]:
     """The job's request, and the fields that the caller must have beside the scene's, by where they are named.
 
-    Raises Problem LIBRARY_ENTRY_NOT_FOUND, LIBRARY_EMPTY, LIBRARY_TOO_LARGE.
+    Raises Problem LIBRARY_ENTRY_NOT_FOUND, FIELD_REJECTED, LIBRARY_EMPTY, LIBRARY_TOO_LARGE.
     """
-    object_, candidates = library.objects_meant(spec.object, spec.candidates)
+    object_, candidates = spec.object, spec.candidates
+    if isinstance(object_, LibraryReference):
+        object_ = library.one(object_.library, "/object/library")
     named = {"/scene": spec.scene}
     if object_ is not None:
         named["/object"] = object_
-    if not isinstance(spec.candidates, LibrarySelection):  # the library's are there
+    if isinstance(candidates, LibrarySelection):
+        candidates = library.selected(candidates.library)  # they are there
+    else:
         named |= {f"/candidates/{place}": sha256 for place, sha256 in enumerate(candidates or ())}
     return spec.to_request(spec.scene, object_, candidates), named

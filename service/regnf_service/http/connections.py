@@ -2,7 +2,8 @@
 
 A connection is either served, or the server waits for its client: for a head, for a body, or until the client reads.
 Such a client has a time by which it must be done, the later the more bytes it moves; then the connection is closed.
-Where there is no room for a new one, the address with the most connections loses the one that is due first.
+Where there is no room for a new one, the address with the most connections loses the one that is due first. Where more
+bytes of answers wait to be read than may, the caller that has most of them loses the one that has read nothing longest.
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ class Guarded(Protocol):
         """Whether something of its client waits to be read."""
         ...
 
-    def unread(self) -> int:
-        """Bytes of answers that its client has not read."""
+    def stuck_since(self) -> float:
+        """The loop's time since when its client has read nothing, if something waits to be read."""
         ...
 
     def end(self, *, politely: bool) -> None:
@@ -72,12 +73,15 @@ def site_of(host: str) -> str:
 
 
 class Connections:
-    """For one event loop: ``most`` in all, ``most_of_site`` of an address, ``most_unread`` bytes of unread answers."""
+    """For one event loop: ``most`` in all, ``most_of_site`` of an address, ``most_unread`` bytes of unread answers,
+    of which a caller has a quarter at most."""
 
     def __init__(self, most: int, most_of_site: int, most_unread: int) -> None:
         self._most = most
         self._most_of_site = most_of_site
         self._most_unread = most_unread
+        self._unread: dict[Guarded, tuple[str, int]] = {}
+        self._unread_of: Counter[str] = Counter()
         self._open: set[Guarded] = set()
         self._of_site: Counter[str] = Counter()
         self._ranked: dict[str, list[Guarded]] = {}
@@ -109,6 +113,30 @@ class Connections:
             self._of_site[one.site] -= 1
             if not self._of_site[one.site]:
                 del self._of_site[one.site]
+        self._forget_unread(one)
+
+    def note_unread(self, one: Guarded, who: str, size: int) -> None:
+        """So many bytes of an answer to a call of ``who`` wait until the client of ``one`` reads them."""
+        self._forget_unread(one)
+        if not size:
+            return
+        self._unread[one] = who, size
+        self._unread_of[who] += size
+        while self._unread_of[who] > self._most_unread // 4:
+            self._end_unread(who)
+        while self._unread_of.total() > self._most_unread:
+            self._end_unread(self._unread_of.most_common(1)[0][0])
+
+    def _forget_unread(self, one: Guarded) -> None:
+        who, size = self._unread.pop(one, ("", 0))
+        self._unread_of[who] -= size
+        if not self._unread_of[who]:
+            del self._unread_of[who]
+
+    def _end_unread(self, who: str) -> None:
+        of_caller = (one for one, (owner, _) in self._unread.items() if owner == who)
+        self.ended["unread"] += 1
+        self._end(min(of_caller, key=lambda one: one.stuck_since()), politely=False)
 
     def shed(self, count: int) -> None:
         """Close so many that keep the server waiting, for want of descriptors."""
@@ -143,20 +171,12 @@ class Connections:
         self._next_ranking = ended + (ended - began) / _RANKING_SHARE
 
     def _look(self) -> None:
-        """Close what is overdue, and those with the most unread bytes where there are too many of them."""
+        """Close what is overdue."""
         loop = asyncio.get_running_loop()
         now = loop.time()
         for one in [one for one in self._open if one.due() <= now]:
             self.ended["slow"] += 1
             self._end(one, politely=True)
-        unread = [(held, one) for one in self._open if (held := one.unread())]
-        total = sum(held for held, _ in unread)
-        for held, one in sorted(unread, key=lambda pair: -pair[0]):
-            if total <= self._most_unread:
-                break
-            total -= held
-            self.ended["unread"] += 1
-            self._end(one, politely=False)
         self._sweep = loop.call_later(_SWEEP_EVERY_S, self._look) if self._open else None
 
     def _end(self, one: Guarded, *, politely: bool) -> None:

@@ -9,6 +9,8 @@ from typing import Annotated
 from fastapi import Depends, Header
 from starlette.responses import Response
 
+from regnf_state.records import FieldRecord
+
 _TAG = re.compile(r'(?:W/)?("[\x21\x23-\x7e\x80-\xff]*")')
 _LIST = re.compile(rf"[ \t,]*{_TAG.pattern}(?:[ \t]*,[ \t,]*{_TAG.pattern})*[ \t,]*")
 _KEPT = ("etag", "cache-control", "retry-after")
@@ -32,7 +34,7 @@ class IfNoneMatch:
 
     def apply(self, answer: Response) -> Response:
         """The answer, or 304 with its headers when the client holds that version."""
-        if not self.matches(answer.headers["etag"]):
+        if not self.matches(answer.headers.get("etag", "")):
             return answer
         return Response(
             status_code=304, headers={name: answer.headers[name] for name in _KEPT if name in answer.headers}
@@ -46,6 +48,11 @@ def parse_if_none_match(header: str | None) -> IfNoneMatch:
     if header is None or not _LIST.fullmatch(header):
         return IfNoneMatch()
     return IfNoneMatch(True, frozenset(_TAG.findall(header)))
+
+
+def field_etag(record: FieldRecord) -> str:
+    """Changes with every change of the field's record."""
+    return f'"{record.sha256[:16]}.{record.version}"'
 
 
 async def _of_request(

@@ -6,15 +6,21 @@ import asyncio
 import math
 import select
 import socket
+from functools import partial
 from typing import Any
 
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from regnf_service.http.bounded_parser import BoundedParser
 from regnf_service.http.connections import ClientClock, Connections, site_of
 from regnf_service.http.raw_answers import raw_answer
+from regnf_service.http.turns import fair_key
+from regnf_state.ownership import ANONYMOUS
 
 _SLICE_BYTES = 16 * 1024
+_BLOCK_BYTES = 64 * 1024
+"""Of an answer, that is handed to the connection at once."""
 _LINGER_S = 10.0
 """How long what was answered last may take to be read, and what a client still sends to come to its end."""
 _VANISHED_MS = 60_000
@@ -38,7 +44,13 @@ class GuardedProtocol(H11Protocol):
         self.quiet_since = self._paused_at = 0.0
         """When its client was answered last, or connected."""
         self._paused_with = 0
+        self._behind_s = 0.0
+        """How much later its client reads than the slowest that may: what it has waited less what it has read."""
+        self._pending = 0
+        """Bytes of the answer that are not handed to the connection yet."""
+        self._who = ""
         self._closing_since: float | None = None
+        self.app: Any = partial(self._answer_in_blocks, self.app)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self.site = site_of(str((transport.get_extra_info("peername") or ("",))[0]))
@@ -49,8 +61,34 @@ class GuardedProtocol(H11Protocol):
             transport.write(raw_answer("TOO_MANY_CONNECTIONS"))
             transport.close()
             return
-        _notice_vanished_peers(transport.get_extra_info("socket"))
+        _set_options(transport.get_extra_info("socket"))
+        transport.set_write_buffer_limits(high=0)  # so that what is not read at once is counted, and ends the writing
         super().connection_made(transport)
+
+    async def _answer_in_blocks(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+        """The application. Whatever it answers waits here until the client reads, and is counted from the first byte
+        that has to wait."""
+
+        async def send_in_blocks(message: Message) -> None:
+            body: bytes = message.get("body", b"")
+            if not body:
+                await send(message)
+                return
+            self._who = fair_key(scope, scope["state"].get("owner") or ANONYMOUS)
+            for begin in range(0, len(body), _BLOCK_BYTES):
+                if self.flow.write_paused:
+                    self._pending = len(body) - begin
+                    self._count_unread()
+                    await self.flow.drain()
+                block = body[begin : begin + _BLOCK_BYTES]
+                self._pending = len(body) - begin - len(block)
+                more = message.get("more_body", False) or self._pending > 0
+                await send({"type": message["type"], "body": block, "more_body": more})
+
+        await app(scope, receive, send_in_blocks)
+
+    def _count_unread(self) -> None:
+        self._held.note_unread(self, self._who, self._pending + self.transport.get_write_buffer_size())
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._held.remove(self)
@@ -77,8 +115,15 @@ class GuardedProtocol(H11Protocol):
 
     def pause_writing(self) -> None:
         self._paused_at = self.loop.time()
-        self._paused_with = self.unread()
+        self._paused_with = self.transport.get_write_buffer_size()
         super().pause_writing()
+        self._count_unread()
+
+    def resume_writing(self) -> None:
+        late_s = self.loop.time() - self._paused_at - self._paused_with / self._clock.bytes_per_s
+        self._behind_s = max(0.0, self._behind_s + late_s)
+        super().resume_writing()
+        self._count_unread()
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002 -- the base class's signature
         """What follows cannot be understood. An answer of the application that has begun is left as it is."""
@@ -98,7 +143,8 @@ class GuardedProtocol(H11Protocol):
             self._closing_since = self._closing_since or self.loop.time()
             return self._closing_since + _LINGER_S
         if self.flow.write_paused:
-            return self._clock.due(self._paused_at, max(0, self._paused_with - self.unread()))
+            read = max(0, self._paused_with - self.transport.get_write_buffer_size())
+            return self._clock.due(self._paused_at, read) - self._behind_s
         if self.cycle is None or self.cycle.response_complete:
             return self.quiet_since + self._clock.head_s
         if self.cycle.more_body and not self.flow.read_paused:
@@ -118,9 +164,9 @@ class GuardedProtocol(H11Protocol):
         look.register(self.transport.get_extra_info("socket").fileno(), select.POLLIN)
         return bool(look.poll(0))
 
-    def unread(self) -> int:
-        """Bytes of answers that the client has not read."""
-        return self.transport.get_write_buffer_size()
+    def stuck_since(self) -> float:
+        """Since when the client has read nothing, if something waits to be read."""
+        return self._paused_at if self.flow.write_paused else self.loop.time()
 
     def end(self, *, politely: bool) -> None:
         """Close the connection; politely: with an answer to a head that has not come to its end."""
@@ -137,13 +183,16 @@ class GuardedProtocol(H11Protocol):
         self.transport.close()
 
 
-def _notice_vanished_peers(connection: socket.socket | None) -> None:
-    """A peer that is gone without a word is noticed within a minute or two, also while nothing is sent."""
+def _set_options(connection: socket.socket | None) -> None:
+    """A peer that is gone without a word is noticed within a minute or two, also while nothing is sent.
+
+    The kernel takes no more ahead than it can soon send: else it would hold megabytes for a client that does not read,
+    and one that reads slowly would seem not to read at all.
+    """
     if connection is None or connection.family not in (socket.AF_INET, socket.AF_INET6):
         return
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    for name, value in (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 15), ("TCP_KEEPCNT", 4)):
+    values = {"TCP_KEEPIDLE": 60, "TCP_KEEPINTVL": 15, "TCP_KEEPCNT": 4, "TCP_USER_TIMEOUT": _VANISHED_MS}
+    for name, value in (values | {"TCP_NOTSENT_LOWAT": _BLOCK_BYTES}).items():
         if hasattr(socket, name):
             connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _VANISHED_MS)

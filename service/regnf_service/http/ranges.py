@@ -1,14 +1,25 @@
-"""Byte ranges (RFC 9110, section 14): one range is honored, several are answered with the whole."""
+"""Stored files as answers, a block at a time: whole, or a byte range (RFC 9110, section 14).
+
+One range is honored, several are answered with the whole.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, BinaryIO
 
 from fastapi import Depends, Header
+from starlette.requests import Request
+from starlette.responses import Response, StreamingResponse
+from starlette.types import Receive, Scope, Send
 
+from regnf_service.concurrency import in_thread
+from regnf_service.http.etags import IfNoneMatch
 from regnf_service.problem import Problem
+from regnf_state.blobs.base import BlobStore
 
 _ONE_RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 
@@ -66,3 +77,56 @@ async def range_headers(
 
 
 RangeDep = Annotated[RangeHeaders, Depends(range_headers)]
+
+
+class _FileAnswer(StreamingResponse):
+    """Closes its file, however it ends."""
+
+    def __init__(self, file: BinaryIO, part: ByteRange, block_bytes: int, **said: Any) -> None:
+        super().__init__(_blocks(file, part, block_bytes), **said)
+        self._file = file
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._file.close()
+
+
+async def file_answer(
+    request: Request,
+    blobs: BlobStore,
+    key: str,
+    media_type: str,
+    headers: Mapping[str, str],
+    held: IfNoneMatch,
+    part: ByteRange | None = None,
+) -> Response:
+    """The bytes of a blob, or a part of them; 304 where the client holds those with the ETag of ``headers``.
+
+    At no time is more of it held than a block. Raises FileNotFoundError.
+    """
+    file, size = await in_thread(_opened, blobs, key)
+    chosen = part or ByteRange(0, size)
+    said = {**headers, "Content-Length": str(chosen.length)}
+    if part is not None:
+        said["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"
+    status = 200 if part is None else 206
+    if request.method == "HEAD" or held.matches(headers.get("ETag", "")):
+        file.close()
+        return held.apply(Response(None, status, said, media_type))
+    return _FileAnswer(file, chosen, blobs.block_bytes, status_code=status, headers=said, media_type=media_type)
+
+
+def _opened(blobs: BlobStore, key: str) -> tuple[BinaryIO, int]:
+    file = blobs.stream(key)
+    return file, file.seek(0, os.SEEK_END)
+
+
+async def _blocks(file: BinaryIO, part: ByteRange, block_bytes: int) -> AsyncIterator[bytes]:
+    """The part's bytes, each block read in a thread when the one before it is on its way."""
+    left = part.length
+    await in_thread(file.seek, part.start)
+    while left and (block := await in_thread(file.read, min(left, block_bytes))):
+        left -= len(block)
+        yield block

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from regnf_service.concurrency import Slots
 from regnf_service.http.middleware import is_open
@@ -31,7 +31,18 @@ class RequestGate:
         except Problem as problem:
             await problem_response(problem, scope)(scope, receive, send)
             return
+        held = [who]
+
+        def free() -> None:
+            while held:
+                self._slots.free(held.pop())
+
+        async def send_last(message: Message) -> None:
+            if message["type"] == "http.response.body" and not message.get("more_body", False):
+                free()  # whether its client reads the answer is not the caller's next request's concern
+            await send(message)
+
         try:
-            await self._app(scope, receive, send)
+            await self._app(scope, receive, send_last)
         finally:
-            self._slots.free(who)
+            free()

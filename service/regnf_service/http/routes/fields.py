@@ -12,15 +12,16 @@ from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import redescribe
-from regnf_service.fields.views import stored_view
+from regnf_service.fields.views import view_answer
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.description_change import described_anew
 from regnf_service.http.digests import is_sha256
-from regnf_service.http.etags import IfNoneMatchDep
+from regnf_service.http.etags import IfNoneMatchDep, field_etag
 from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.parsing import read_body
+from regnf_service.http.ranges import file_answer
 from regnf_service.http.routes.documentation import (
     BINARY,
     FIELD_LINKS,
@@ -31,7 +32,6 @@ from regnf_service.http.routes.documentation import (
     refusals,
 )
 from regnf_service.http.routes.pages import HTML, page
-from regnf_service.http.routes.uploads import field_etag
 from regnf_service.http.schemas.fields import FieldChange, FieldDocument, FieldPage, field_document
 from regnf_service.http.schemas.references import reference
 from regnf_service.http.waiting import wait_for
@@ -46,7 +46,6 @@ router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
-_PRIVATE_HOUR = "private, max-age=3600"
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
@@ -106,15 +105,15 @@ async def get_field(
     response_class=Response,
     responses=_PICTURE_ANSWERS,
 )
-@blocking
-def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep) -> Response:
+async def get_field_preview(
+    request: Request, sha256: str, services: ServicesDep, caller: CallerDep, held: IfNoneMatchDep
+) -> Response:
     """The surface from two sides, and its section with lines of equal distance: orange is inside.
 
     Made once the field is ready, as the mesh is.
     """
-    record = _require(services, caller, sha256)
-    found = stored_view(services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND")
-    return held.apply(_seen(record, found, "image/png", _PRIVATE_HOUR))
+    record = await in_thread(_require, services, caller, sha256)
+    return await view_answer(request, services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND", "image/png", held)
 
 
 @get_and_head(
@@ -128,8 +127,8 @@ def get_field_preview(sha256: str, services: ServicesDep, caller: CallerDep, hel
         **refusals("INVALID_QUERY", "FIELD_NOT_FOUND", "FIELD_MESH_NOT_FOUND"),
     },
 )
-@blocking
-def get_field_mesh(
+async def get_field_mesh(
+    request: Request,
     sha256: str,
     services: ServicesDep,
     caller: CallerDep,
@@ -144,11 +143,10 @@ def get_field_mesh(
     404 has `Retry-After`. A small surface has one mesh for both. A `.glb` of `POST /render` is made with the resolution
     that you ask for.
     """
-    record = _require(services, caller, sha256)
+    record = await in_thread(_require, services, caller, sha256)
     fine, coarse = MESH_NAMES
     names = (coarse, fine) if detail == "coarse" else (fine,)
-    found = stored_view(services, record, names, "FIELD_MESH_NOT_FOUND")
-    return held.apply(_seen(record, found, "model/gltf-binary", _PRIVATE_HOUR))
+    return await view_answer(request, services, record, names, "FIELD_MESH_NOT_FOUND", "model/gltf-binary", held)
 
 
 @get_and_head(
@@ -158,8 +156,8 @@ def get_field_mesh(
     response_class=Response,
     responses=_PICTURE_ANSWERS,
 )
-@blocking
-def get_candidate_picture(
+async def get_candidate_picture(
+    request: Request,
     sha256: str,
     number: Annotated[str, Path(description="Which candidate of the field's error, from 1.")],
     services: ServicesDep,
@@ -167,19 +165,15 @@ def get_candidate_picture(
     held: IfNoneMatchDep,
 ) -> Response:
     """One of the `candidates` of a field's error, for as long as the upload is kept (`kept_until`)."""
-    record = _require(services, caller, sha256)
+    record = await in_thread(_require, services, caller, sha256)
     if number not in _NUMBERS or not record.has_candidate_picture(int(number)):
         raise Problem("FIELD_PREVIEW_NOT_FOUND")
+    headers = {"ETag": field_etag(record), "Cache-Control": "private, no-cache"}
     try:
-        with services.blobs.open(candidate_key(record.sha256, int(number))) as file:
-            found = file.read()
+        key = candidate_key(record.sha256, int(number))
+        return await file_answer(request, services.blobs, key, "image/png", headers, held)
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
-    return held.apply(_seen(record, found, "image/png", "private, no-cache"))
-
-
-def _seen(record: FieldRecord, data: bytes, media_type: str, caching: str) -> Response:
-    return Response(data, media_type=media_type, headers={"ETag": field_etag(record), "Cache-Control": caching})
 
 
 @router.get(
@@ -188,7 +182,8 @@ def _seen(record: FieldRecord, data: bytes, media_type: str, caching: str) -> Re
     response_model=FieldPage,
     responses={200: {"content": HTML}, **refusals("INVALID_QUERY", "INVALID_PAGE_TOKEN")},
 )
-async def list_fields(
+@blocking
+def list_fields(
     request: Request,
     services: ServicesDep,
     caller: CallerDep,
@@ -203,7 +198,7 @@ async def list_fields(
     """
     if wants_page(request.scope):
         return page("lists.html")
-    found = await in_thread(services.records.list_fields, label, limit, decode_token(page_token), caller)
+    found = services.records.list_fields(label, limit, decode_token(page_token), caller)
     documents = [field_document(record, prefix) for record in found.records]
     document = {"fields": documents, "next_page_token": encode_token(found.rest)}
     return JSONResponse(document, headers={"Vary": "Accept"})

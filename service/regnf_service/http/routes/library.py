@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query
 from starlette.requests import Request
@@ -13,9 +12,11 @@ from regnf_core.library_entries import MAX_NAME, MAX_TAG, EntryNotes
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep
+from regnf_service.http.etags import IfNoneMatch
 from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.parsing import read_body
+from regnf_service.http.ranges import file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, header, refusals
 from regnf_service.http.routes.pages import HTML, page
 from regnf_service.http.schemas.library import (
@@ -34,7 +35,6 @@ from regnf_state.library import LibraryEntry
 from regnf_state.ownership import sha256_of
 
 router = APIRouter(tags=["library"])
-_BLOCK_BYTES = 256 * 1024
 _PATCHES = (JSON, "application/merge-patch+json")
 _BODY_REFUSALS = (
     "INVALID_HEADER",
@@ -170,31 +170,17 @@ def delete_library_entry(name: NamePath, services: ServicesDep, caller: CallerDe
         **refusals("LIBRARY_ENTRY_NOT_FOUND", "FIELD_VALIDATING"),
     },
 )
-async def get_library_file(name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
+async def get_library_file(request: Request, name: NamePath, services: ServicesDep, caller: CallerDep) -> Response:
     """What the import made of the upload (docs/safe-format.md): libraries are carried elsewhere with it."""
-    file, size, digest = await in_thread(_open, services, caller, name)
-    headers = {"Content-Length": str(size), "Content-Disposition": f'attachment; filename="{digest}.safetensors"'}
-    return StreamingResponse(_blocks(file), media_type="application/octet-stream", headers=headers)
-
-
-def _open(services: Services, caller: str, name: str) -> tuple[BinaryIO, int, str]:
-    field = find_entry(services, caller, name).field
-    key = f"fields/{field.sha256}/field.safetensors"
+    field = (await in_thread(find_entry, services, caller, name)).field
     if field.state != "ready":
         raise Problem("FIELD_VALIDATING")
+    headers = {"Content-Disposition": f'attachment; filename="{sha256_of(field.sha256)}.safetensors"'}
     try:
-        return services.blobs.open(key), services.blobs.size(key), sha256_of(field.sha256)
+        key = f"fields/{field.sha256}/field.safetensors"
+        return await file_answer(request, services.blobs, key, "application/octet-stream", headers, IfNoneMatch())
     except FileNotFoundError as error:
         raise Problem("LIBRARY_ENTRY_NOT_FOUND") from error
-
-
-async def _blocks(file: BinaryIO) -> AsyncIterator[bytes]:
-    """The file's bytes, a block at a time, each read in a thread."""
-    try:
-        while block := await in_thread(file.read, _BLOCK_BYTES):
-            yield block
-    finally:
-        file.close()
 
 
 def _plain(said: SaidSymmetry | None) -> dict[str, Any] | None:

@@ -154,9 +154,10 @@ def docs() -> FileResponse:
     return page("docs.html")
 
 
-async def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> str:
-    """What ``make`` writes, kept with the application. It takes as long as a hundred polls: not in the event loop."""
-    made: dict[str, asyncio.Future[str]] = request.app.state.__dict__.setdefault("made_once", {})
+async def _made_once(request: Request, make: Callable[[Any], str], source: Any) -> bytes:
+    """What ``make`` writes, kept with the application: made for the first request, in a thread, for it takes as long as
+    a hundred polls; all answers share it."""
+    made: dict[str, asyncio.Future[bytes]] = request.app.state.__dict__.setdefault("made_once", {})
     if make.__name__ not in made:
-        made[make.__name__] = asyncio.ensure_future(in_thread(make, source))
+        made[make.__name__] = asyncio.ensure_future(in_thread(lambda: make(source).encode()))
     return await asyncio.shield(made[make.__name__])

@@ -14,9 +14,8 @@ from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
 from regnf_service.fields.uploads import open_settings, open_upload, settings_limit
 from regnf_service.http import body
-from regnf_service.http.by_reference import asked_by_reference
+from regnf_service.http.by_reference import Library, asked_by_reference
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
-from regnf_service.http.library_selection import CallersLibrary
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
 from regnf_service.http.parsing import read_body
@@ -136,7 +135,7 @@ async def _by_reference(request: Request, services: Services, caller: str) -> Re
     settings = services.settings
     text = await body.read_small(request, settings)
     spec = await read_body(RegisterRequest, text)
-    asked, named = await in_thread(asked_by_reference, CallersLibrary(services, caller), spec)
+    asked, named = await in_thread(asked_by_reference, Library(services, caller), spec)
     await in_thread(check_fields, services, caller, asked, named)
     return asked
 

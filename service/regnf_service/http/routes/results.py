@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
-from regnf_service.concurrency import blocking, in_thread
+from regnf_service.concurrency import blocking
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.etags import IfNoneMatchDep
-from regnf_service.http.ranges import ByteRange, RangeDep
+from regnf_service.http.ranges import RangeDep, file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, NOT_MODIFIED, header, links, refusals
 from regnf_service.http.schemas.renderings import RenderResultDocument
 from regnf_service.http.schemas.results import ResultDocument
@@ -23,7 +22,6 @@ from regnf_service.services import Services
 from regnf_state.manifest import MEDIA_TYPES, Manifest
 
 router = APIRouter(tags=["results"])
-_BLOCK_BYTES = 256 * 1024
 _CACHE = "private, max-age=0, must-revalidate"
 _ARTIFACT_WAIT_S = 20
 ArtifactWaitQuery = Annotated[
@@ -128,37 +126,9 @@ async def get_artifact(
         raise Problem("ARTIFACT_NOT_FOUND")
     size, etag = artifact.bytes, f'"{artifact.sha256[:32]}"'
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Cache-Control": _CACHE}
-    if held.matches(etag):
-        return Response(status_code=304, headers=headers)
+    headers["Content-Disposition"] = f'attachment; filename="{name}"'
     part = range_.part(size, etag)
-    if part is not None:
-        headers["Content-Range"] = f"bytes {part.start}-{part.start + part.length - 1}/{size}"
-    chosen = part or ByteRange(0, size)
-    headers |= {"Content-Length": str(chosen.length), "Content-Disposition": f'attachment; filename="{name}"'}
-    status = 200 if part is None else 206
-    if request.method == "HEAD":
-        return Response(status_code=status, headers=headers, media_type=artifact.media_type)
-    file = await in_thread(_open, services, manifest, name)
-    return StreamingResponse(_blocks(file, chosen), status_code=status, headers=headers, media_type=artifact.media_type)
-
-
-def _open(services: Services, manifest: Manifest, name: str) -> BinaryIO:
     try:
-        return services.blobs.open(manifest.key(name))
+        return await file_answer(request, services.blobs, manifest.key(name), artifact.media_type, headers, held, part)
     except FileNotFoundError as error:
         raise Problem("ARTIFACT_NOT_FOUND") from error
-
-
-async def _blocks(file: BinaryIO, part: ByteRange) -> AsyncIterator[bytes]:
-    """The part's bytes, a block at a time, each read in a thread."""
-    left = part.length
-    try:
-        await in_thread(file.seek, part.start)
-        while left:
-            block = await in_thread(file.read, min(left, _BLOCK_BYTES))
-            if not block:
-                return
-            left -= len(block)
-            yield block
-    finally:
-        file.close()

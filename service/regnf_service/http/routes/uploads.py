@@ -20,6 +20,7 @@ from regnf_service.http import body
 from regnf_service.http.content_range import PATTERN, content_range
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.digests import announced_digest, is_sha256
+from regnf_service.http.etags import field_etag
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
 from regnf_service.http.piece_upload import Piece, receive_piece
@@ -38,7 +39,6 @@ from regnf_service.http.schemas.references import reference
 from regnf_service.http.turns import fair_key
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
-from regnf_state.records import FieldRecord
 
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
@@ -255,8 +255,3 @@ def _answer(taken: StoredUpload, prefix: str) -> JSONResponse:
     document = field_document(taken.record, prefix)
     headers = {"Location": document["links"]["self"], "ETag": field_etag(taken.record)}
     return JSONResponse(document, status_code=201 if taken.created else 200, headers=headers)
-
-
-def field_etag(record: FieldRecord) -> str:
-    """Changes with every change of the field's record."""
-    return f'"{record.sha256[:16]}.{record.version}"'

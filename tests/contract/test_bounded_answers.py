@@ -1,0 +1,285 @@
+"""No answer is made whole beyond a bound, none that waits to be read is held beyond one, and no call reads much."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+import pytest
+
+from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
+from regnf_service.http.connections import Connections
+from regnf_state.field_views import view_key
+from regnf_state.redis.documents import RedisDocuments
+from tests.contract.live import Live, eventually, live_service
+from tests.contract.world import World
+
+MIB = 1 << 20
+LARGE = bytes(9 * MIB)
+LONG = "x" * 2000
+
+
+# what is handed over at once
+
+
+def pieces(world: World, path: str, method: str = "GET") -> list[int]:
+    """The sizes of the messages in which the application answers, which must be 200."""
+    sizes: list[int] = []
+    scope = {
+        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": method, "scheme": "http",
+        "path": path.partition("?")[0], "raw_path": path.partition("?")[0].encode(), "root_path": "",
+        "query_string": path.partition("?")[2].encode(), "headers": [(b"host", b"localhost")],
+        "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 80),
+    }  # fmt: skip
+
+    async def receive() -> dict[str, Any]:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    async def send(message: Any) -> None:
+        assert message.get("status", 200) == 200, message
+        sizes.append(len(message.get("body", b"")))
+
+    asyncio.run(world.app(scope, receive, send))
+    return sizes
+
+
+@pytest.fixture
+def large(world: World) -> dict[str, str]:
+    """A world in which every file is large; the addresses of these."""
+    sha256 = world.ready_field("large")
+    world.client.post("/library", json={"name": "large", "field": sha256})
+    for name in (PICTURE_NAME, *MESH_NAMES):
+        world.blobs.put(view_key(sha256, name), LARGE)
+    world.blobs.put(f"fields/{sha256}/field.safetensors", LARGE)
+    job = world.submit()
+    world.succeed(job, {"aligned.glb": LARGE})
+    return {
+        "preview": f"/fields/{sha256}/preview.png",
+        "mesh": f"/fields/{sha256}/mesh.glb",
+        "coarse mesh": f"/fields/{sha256}/mesh.glb?detail=coarse",
+        "library file": "/library/large/file",
+        "artifact": f"/jobs/{job}/artifacts/aligned.glb",
+    }
+
+
+@pytest.mark.parametrize("name", ["preview", "mesh", "coarse mesh", "library file", "artifact"])
+def test_files_are_sent_a_block_at_a_time(world: World, large: dict[str, str], name: str) -> None:
+    sizes = pieces(world, large[name])
+    assert sum(sizes) == len(LARGE)
+    assert max(sizes) <= MIB
+    if name != "library file":
+        assert world.client.head(large[name]).headers["content-length"] == str(len(LARGE))
+        assert sum(pieces(world, large[name], "HEAD")) == 0, "nothing is read for a HEAD"
+
+
+def many_jobs(world: World, count: int) -> list[str]:
+    """Jobs whose records are large, newest first."""
+    ids = []
+    for seed in range(count):
+        ids.insert(0, world.submit(seed=seed))
+        job = world.run(ids[0])
+        world.records.update_job(ids[0], job.attempt, engine={str(place): LONG for place in range(40)})
+    return ids
+
+
+def many_fields(world: World, count: int) -> list[str]:
+    names = []
+    for number in range(count):
+        names.insert(0, world.ready_field(str(number)))
+        world.records.update_field(names[0], report={str(place): LONG for place in range(40)})
+    return names
+
+
+@pytest.mark.parametrize(
+    ("path", "member", "name", "make"),
+    [("/jobs", "jobs", "id", many_jobs), ("/fields", "fields", "sha256", many_fields)],
+)
+def test_pages_of_large_records_are_short(
+    world: World, path: str, member: str, name: str, make: Callable[[World, int], list[str]]
+) -> None:
+    """All 40 of them have 3.2 MB."""
+    if member == "jobs":
+        world.valid_request()
+    made = make(world, 40)
+    seen: list[str] = []
+    token: str | None = ""
+    while token is not None:
+        answer = world.client.get(path, params={"limit": 200} | ({"page_token": token} if token else {}))
+        assert len(answer.content) <= MIB
+        seen += [one[name] for one in answer.json()[member]]
+        token = answer.json()["next_page_token"]
+    assert seen[: len(made)] == made, "each exactly once"
+    assert len(seen) == len(set(seen))
+
+
+@pytest.mark.parametrize("path", ["/jobs?status=failed", "/jobs?limit=200", "/fields?label=nope", "/fields?limit=200"])
+def test_large_records_are_read_a_few_at_a_time(world: World, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    """Of each caller's records, however large, a few are in memory at once."""
+    many = many_jobs if "jobs" in path else many_fields
+    world.valid_request()
+    many(world, 40)
+    at_once = watched(monkeypatch)
+    assert world.client.get(path).status_code == 200
+    assert max(at_once) * 80_000 <= 1.5 * MIB
+
+
+def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many records each look into Redis has read, from now on."""
+    seen: list[int] = []
+    fetch = RedisDocuments._fetch
+
+    def counted(self: RedisDocuments, kind: Any, names: Any) -> Any:
+        seen.append(len(names))
+        return fetch(self, kind, names)
+
+    monkeypatch.setattr(RedisDocuments, "_fetch", counted)
+    return seen
+
+
+@pytest.mark.parametrize(
+    "path", ["/fields?label=nope", "/fields?label=nope&limit=1", "/library?tag=nope", "/library?name=n"]
+)
+def test_a_filter_looks_at_a_few_hundred_records_a_call(
+    world: World, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    first = world.ready_field("first")
+    for number in range(450):
+        world.redis.hset(f"regnf:field:{number:064x}", mapping=stored(world, first, f"{number:064x}"))
+        world.redis.zadd("regnf:fields:created:anonymous", {f"{number:064x}": number})
+        world.redis.zadd("regnf:owner:anonymous:library", {f"{number:064x}": number})
+    read = watched(monkeypatch)
+    pages = [world.client.get(path).json()]
+    assert sum(read) <= 256
+    while (token := pages[-1]["next_page_token"]) is not None:
+        pages.append(world.client.get(f"{path}&page_token={token}").json())
+    assert 2 <= len(pages) <= 5
+
+
+def stored(world: World, known: str, name: str) -> dict[str, str]:
+    """What is stored of a field, under another name."""
+    held = {key.decode(): value.decode() for key, value in world.redis.hgetall(f"regnf:field:{known}").items()}
+    return held | {"document": held["document"].replace(known, name)}
+
+
+def test_a_library_that_a_batch_names_in_every_line_is_read_once(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    fields = [world.ready_field(f"of the library {number}") for number in range(12)]
+    for number, name in enumerate(fields):
+        world.client.post("/library", json={"name": f"n{number}", "field": name, "tags": ["seat"]})
+    request = world.valid_request()
+    del request["object"]
+    lines = [
+        json.dumps(request | {"seed": seed, "candidates": {"library": wanted}})
+        for seed in range(40)
+        for wanted in ({}, {"tags": ["seat"]}, {"names": ["n1", "n2"]})
+    ]
+    looks: list[Any] = []
+    for name in ("list_entries", "entries_named"):
+        function = getattr(world.records, name)
+        monkeypatch.setattr(world.records, name, lambda *given, call=function: looks.append(given) or call(*given))
+    answer = world.client.post("/batches", content="\n".join(lines), headers={"Content-Type": "application/x-ndjson"})
+    assert answer.status_code in (200, 202), answer.text
+    assert 0 < len(looks) <= 4, "not once a line"
+
+
+# what waits to be read
+
+
+@dataclass(eq=False)
+class Reader:
+    """A connection whose client reads nothing since a moment."""
+
+    since: float
+    site: str = "127.0.0.1"
+    ended: bool = field(default=False)
+
+    def due(self) -> float:
+        return math.inf
+
+    def must_make_room_by(self) -> float:
+        return math.inf
+
+    def has_sent(self) -> bool:
+        return False
+
+    def stuck_since(self) -> float:
+        return self.since
+
+    def end(self, *, politely: bool) -> None:
+        assert not politely
+        self.ended = True
+
+
+def test_the_bytes_that_nobody_reads_have_a_bound_at_every_moment() -> None:
+    async def run() -> None:
+        held = Connections(100, 100, most_unread=400)
+        alice = [Reader(float(number)) for number in (5, 3, 9)]
+        for one in alice:
+            held.admit(one)
+            held.note_unread(one, "alice", 40)
+        assert [one.ended for one in alice] == [False, True, False], "a caller has a quarter: the longest goes"
+        held.note_unread(alice[0], "alice", 10)
+        held.note_unread(alice[2], "alice", 90)
+        assert not any(one.ended for one in (alice[0], alice[2]))
+        others = [Reader(1.0) for _ in range(4)]
+        for number, one in enumerate(others):
+            held.admit(one)
+            held.note_unread(one, f"caller {number}", 90)
+        assert [one.ended for one in (*alice, *others)] == [True] * 3 + [False] * 4, "all together have a bound too"
+        left = [one for one in (*alice, *others) if not one.ended]
+        for one in left:
+            held.note_unread(one, "whoever", 0)
+            held.remove(one)
+        assert len(held) == 0
+        assert held.ended["unread"] == 3
+
+    asyncio.run(run())
+
+
+@pytest.fixture(scope="module")
+def unread(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with live_service(tmp_path_factory.mktemp("unread"), with_worker=False, metrics_port=port) as started:
+        started.metrics_port = port  # type: ignore[attr-defined]
+        yield started
+
+
+def silent(live: Live, path: str) -> socket.socket:
+    """A client that asks and never reads. Its buffer is small, so that nearly all is left to the service."""
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.connect(("127.0.0.1", live.port))
+    connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+    return connection
+
+
+@pytest.mark.parametrize("path", ["/openapi.yaml", "/static/vendor/three.bundle.min.js", "/openapi.json"])
+def test_answers_that_nobody_reads_take_little_memory(unread: Live, path: str) -> None:
+    """Each time 400 of them, of up to half a megabyte: 100 MB and more if they were held whole."""
+    with unread.client() as client, ExitStack() as stack:
+        size = len(client.get(path).content)
+        before = unread.peak_memory()
+        ended = cut_off(unread)
+        for _ in range(400):
+            stack.enter_context(silent(unread, path))
+        assert eventually(lambda: cut_off(unread) > ended or 400 * size < 32 * MIB, "the first that is cut off", 20)
+        assert client.get("/healthz").status_code == 200
+        assert unread.peak_memory() - before <= 64 * MIB
+        assert len(client.get(path).content) == size, "whoever reads is served"
+
+
+def cut_off(live: Live) -> int:
+    """How many connections were closed because nobody read."""
+    text = httpx.get(f"http://127.0.0.1:{live.metrics_port}/metrics").text  # type: ignore[attr-defined]
+    found = [
+        line.split()[-1] for line in text.splitlines() if 'regnf_connections_refused_total{cause="unread"}' in line
+    ]
+    return int(float(found[0])) if found else 0
