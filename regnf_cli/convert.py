@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from regnf_cli.camera_options import CameraAxes, Cameras, Images, Intrinsics, with_cameras
+from regnf_cli.camera_options import Axes, CameraAxes, Cameras, Images, Intrinsics, with_cameras
 from regnf_cli.console import err, out
 from regnf_cli.extras import require
 from regnf_cli.field_options import choice_of, source_of
@@ -50,12 +50,12 @@ def convert(
     """
     require("engine")
     _check(output, images, cameras)
-    said = with_cameras(description, intrinsics, None if axes is None else axes.value)
-    if said is not description and cameras is None:
-        raise InvalidOptionsError("--intrinsics and --camera-axes go with --cameras")
+    said = with_cameras(description, intrinsics, None if axes is None or cameras is None else axes.value)
+    if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
+        raise InvalidOptionsError("--intrinsics goes with --cameras, --camera-axes with --cameras or --images")
     source = source_of(field, said, choice_of(config, no_config))
     if output.suffix.lower() == ".safetensors":
-        _to_safe_field(source, output, images, cameras)
+        _to_safe_field(source, output, images, cameras, opengl=axes == Axes.OPENGL)
     else:
         _evaluated(source, output, resolution)
 
@@ -73,7 +73,7 @@ def _check(output: Path, images: Path | None, cameras: Path | None) -> None:
         raise InvalidOptionsError("--images and --cameras: images tell more, give them alone")
 
 
-def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None) -> None:
+def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None, opengl: bool) -> None:
     from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
@@ -87,7 +87,7 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
             report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings, cameras=stood)
         if images is not None:
             with err.status("recording which parts the cameras observed"):
-                _keep_what_was_seen(Path(scratch) / FIELD_NAME, images)
+                _keep_what_was_seen(Path(scratch) / FIELD_NAME, images, opengl)
         os.replace(Path(scratch) / FIELD_NAME, output)
     _say(output, f"{report.family}, {report.parameters:,} parameters")
     for why in report.why:
@@ -103,11 +103,15 @@ def _packed(cameras: Path | None) -> AbstractContextManager[Path | None]:
     return nullcontext() if cameras is None else packed_cameras(cameras)
 
 
-def _keep_what_was_seen(field: Path, images: Path) -> None:
+def _keep_what_was_seen(field: Path, images: Path, opengl: bool) -> None:
     from regnf_data.sdfstudio import load_dataset
+    from regnf_fit.images.agreement import check_agreement
     from regnf_fit.images.observing import attach_observation
 
-    attach_observation(field, load_dataset(images))
+    given = load_dataset(images, opengl=opengl)
+    warning = check_agreement(given)
+    attach_observation(field, given)
+    _warn([] if warning is None else [warning])
 
 
 def _evaluated(source: FieldSource, output: Path, resolution: int) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn
 
-from regnf_cli.console import err, out
+from regnf_cli.camera_options import Axes, CameraAxes
+from regnf_cli.console import err
 from regnf_cli.extras import require
 from regnf_cli.fit_options import (
     Device,
@@ -28,11 +29,12 @@ from regnf_cli.fit_options import (
     StartChoice,
     TableLog2,
     check_field_to_write,
+    print_report,
 )
 from regnf_cli.options import Seed
 from regnf_core.errors import InvalidOptionsError
 
-_OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto)
+_OF_IMAGES_UNSAID = (None, None, False, StartChoice.auto, False, DeviceChoice.auto, None)
 
 
 def fit(
@@ -50,6 +52,7 @@ def fit(
     start: Start = StartChoice.auto,
     refine_poses: RefinePoses = False,
     device: Device = DeviceChoice.auto,
+    axes: CameraAxes = None,
 ) -> None:
     """Fit a neus-facto field to the exact distance of a mesh, or to posed images: minutes on two cores.
 
@@ -65,8 +68,8 @@ def fit(
     settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     rest = {"seed": seed, "label": label}
     if not source.is_dir():
-        if (snapshots, sdfstudio, pictures, start, refine_poses, device) != _OF_IMAGES_UNSAID:
-            named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses and --device"
+        if (snapshots, sdfstudio, pictures, start, refine_poses, device, axes) != _OF_IMAGES_UNSAID:
+            named = "--snapshots, --sdfstudio, --pictures, --start, --refine-poses, --device and --camera-axes"
             raise InvalidOptionsError(f"{named} are for images")
         _fit_mesh(source, output, settings, table_log2, extent, rest)
         return
@@ -75,7 +78,7 @@ def fit(
     from regnf_cli.fit_images import fit_images
 
     settings |= {"table_log2": table_log2, "start": start.value, "refine_poses": refine_poses}
-    files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures}
+    files = {"snapshots": snapshots, "sdfstudio": sdfstudio, "pictures": pictures, "opengl": axes == Axes.OPENGL}
     fit_images(source, output, settings, files, rest | {"device": device.value})
 
 
@@ -109,5 +112,4 @@ def _fit_with_bar(fit_field: Any, target: Any, output: Path, options: Any, rest:
             bar.update(task, completed=iteration, state=f"loss {loss:.5f}, {seconds_left:.0f} s left")
 
         figures = fit_field(target, output, options, progress=report, **rest)
-    for name, value in asdict(figures).items():
-        out.print(f"{name:<24} {value:.6g}")
+    print_report(asdict(figures))

@@ -9,7 +9,8 @@ from typing import Any
 
 from rich.progress import BarColumn, Progress, TextColumn
 
-from regnf_cli.console import err, out
+from regnf_cli.console import err
+from regnf_cli.fit_options import print_report
 from regnf_core.errors import InvalidOptionsError
 
 
@@ -19,7 +20,7 @@ def fit_images(
     """Fit to the images in ``dataset``.
 
     settings: of ReconstructionOptions · extra: ``snapshots``, percents between commas, and ``sdfstudio``, a path, or
-    None each; ``pictures``, whether to draw · rest: what ``reconstruct`` takes beside.
+    None each; ``pictures``, whether to draw; ``opengl``, the cameras' axes · rest: what ``reconstruct`` takes beside.
     """
     from regnf_data.sdfstudio import load_dataset
     from regnf_fit.images.fit import FitFiles, reconstruct
@@ -36,7 +37,7 @@ def fit_images(
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}")
     with Progress(*columns, console=err) as bar:
         task = bar.add_task("fitting", total=1.0, state="reading the images")
-        images = load_dataset(dataset)
+        images = load_dataset(dataset, opengl=extra["opengl"])
 
         def report(iteration: int, loss: float, seconds_left: float) -> None:
             elapsed = time.monotonic() - started
@@ -48,8 +49,7 @@ def fit_images(
         figures = reconstruct(
             images, files, options, progress=report, source={"dataset": dataset.resolve().name}, **rest
         )
-    for name, value in asdict(figures).items():
-        out.print(f"{name:<24} {'none' if value is None else format(value, '.6g')}")
+    print_report(asdict(figures))
 
 
 def shares(percents: str | None) -> tuple[float, ...]:

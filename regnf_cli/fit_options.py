@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from regnf_cli.console import err, out
 from regnf_core.errors import InvalidOptionsError
 
 _LONGEST_LABEL = 200  # of the safe format
@@ -86,3 +87,12 @@ def check_field_to_write(output: Path, label: str | None) -> None:
         raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
     if label is not None and len(label) > _LONGEST_LABEL:
         raise InvalidOptionsError(f"the label has more than {_LONGEST_LABEL} characters")
+
+
+def print_report(figures: dict[str, Any]) -> None:
+    """The figures of a fit or a fusion, a line each, and its warnings."""
+    warnings = figures.pop("warnings", ())
+    for name, value in figures.items():
+        out.print(f"{name:<24} {'none' if value is None else format(value, '.6g')}")
+    for warning in warnings:
+        err.print(f"warning: {warning}", markup=False, soft_wrap=True)

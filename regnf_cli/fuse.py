@@ -9,9 +9,10 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from regnf_cli.console import err, out
+from regnf_cli.camera_options import Axes, CameraAxes
+from regnf_cli.console import err
 from regnf_cli.extras import require
-from regnf_cli.fit_options import Label, SafeField, check_field_to_write
+from regnf_cli.fit_options import Label, SafeField, check_field_to_write, print_report
 from regnf_core.errors import InvalidOptionsError
 
 Images = Annotated[
@@ -30,7 +31,12 @@ Truncation = Annotated[
 
 
 def fuse(
-    images: Images, output: SafeField, voxel: Voxel = None, truncation: Truncation = None, label: Label = None
+    images: Images,
+    output: SafeField,
+    voxel: Voxel = None,
+    truncation: Truncation = None,
+    label: Label = None,
+    axes: CameraAxes = None,
 ) -> None:
     """Fuse posed depth images to a map, with what they have seen of it: seconds, where a fit takes minutes.
 
@@ -46,7 +52,7 @@ def fuse(
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
     with Progress(*columns, console=err) as bar:
         task = bar.add_task("reading the images", total=None)
-        given = load_dataset(images)
+        given = load_dataset(images, opengl=axes == Axes.OPENGL)
         bar.update(task, description="fusing", total=len(given))
         report = fuse_images(
             given,
@@ -57,5 +63,4 @@ def fuse(
             source={"dataset": images.resolve().name},
         )
         bar.update(task, completed=len(given))
-    for name, value in asdict(report).items():
-        out.print(f"{name:<24} {value:.6g}")
+    print_report(asdict(report))

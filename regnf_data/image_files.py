@@ -72,23 +72,27 @@ def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
 
 
 def read_depth(path: Path, size: Size, unit: float | None) -> NDArray[np.float32]:
-    """(H, W) float32 in world units, 0 where there is none: what is not finite and positive counts as none.
+    """(H, W) float32 in world units, 0 where there is none: what is not finite and positive counts as none, and so does
+    the largest number that a file's type has (65535 in many recordings).
 
     ``.npy`` holds world units; an image holds whole numbers of ``unit`` world units each.
     Raises DatasetError (DATASET_DEPTH_UNIT_MISSING, DATASET_SIZES_DIFFER, DATASET_IMAGE_INVALID).
     """
-    if path.suffix.lower() == ".npy":
-        values = _array_file(path, size)
-    elif unit is None:
+    stored = _array_file(path, size) if path.suffix.lower() == ".npy" else None
+    if stored is None and unit is None:
         raise DatasetError(
             f"{path.name}: a depth image needs depth_unit_scale_factor in the metadata",
             reason="DATASET_DEPTH_UNIT_MISSING",
         )
+    if stored is None:
+        stored, factor = _decoded(path, size, None), unit or 1.0
     else:
-        values = _decoded(path, size, None).astype(np.float64) * unit
+        factor = 1.0
+    largest = np.finfo(stored.dtype).max if stored.dtype.kind == "f" else np.iinfo(stored.dtype).max
     with np.errstate(over="ignore", invalid="ignore"):
-        depth = values.astype(np.float32)
-    return np.where(np.isfinite(depth) & (depth > 0.0), depth, np.float32(0.0))
+        depth = (stored.astype(np.float64) * factor).astype(np.float32)
+        measured = np.isfinite(depth) & (depth > 0.0) & (stored < largest)
+    return np.where(measured, depth, np.float32(0.0))
 
 
 def _array_file(path: Path, size: Size) -> NDArray[Any]:
@@ -110,11 +114,14 @@ def _decoded(path: Path, size: Size, mode: str | None) -> NDArray[Any]:
             # Told by the header: nothing of the wrong size is decoded.
             if (image.height, image.width) != size:
                 raise _differs(path, (image.height, image.width), size)
-            pixels = np.asarray(image.convert(mode) if mode else image)
+            kind, pixels = image.mode, np.asarray(image.convert(mode) if mode else image)
     except _FAULTS_OF_CONTENT as error:
         raise _invalid(path, error) from error
     if pixels.shape[:2] != size or (mode is None and pixels.ndim != 2):
         raise DatasetError(f"{path.name} has more than one channel", reason="DATASET_IMAGE_INVALID")
+    if mode is None and (kind == "P" or pixels.dtype.kind not in "fiu"):
+        what = "a palette of colors" if kind == "P" else "one bit a pixel, as masks have"
+        raise DatasetError(f"{path.name} holds no depths: it has {what}", reason="DATASET_IMAGE_INVALID")
     return pixels
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,3 +57,25 @@ class PosedImages:
 
     def __len__(self) -> int:
         return len(self.colors)
+
+    def moved(self, origin: NDArray[np.float64], scale: float) -> PosedImages:
+        """The same images in the world x' = scale (x - origin). origin: (3,), world frame."""
+        poses, T_world_local = self.T_world_camera.copy(), np.diag([1.0 / scale] * 3 + [1.0])
+        poses[:, :3, 3] = scale * (poses[:, :3, 3] - origin)
+        T_world_local[:3, 3] = origin
+
+        def box(one: OrientedBox) -> OrientedBox:
+            return replace(one, center=scale * (one.center - origin), size=scale * one.size)
+
+        def of_local(T: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            return None if T is None else T @ T_world_local
+
+        things = (replace(t, box=box(t.box), T_object_world=of_local(t.T_object_world)) for t in self.instances)
+        return replace(
+            self,
+            T_world_camera=poses,
+            bounds=scale * (self.bounds - origin),
+            depths=None if self.depths is None else (scale * self.depths).astype(np.float32),
+            instances=tuple(things),
+            T_metric_world=of_local(self.T_metric_world),
+        )

@@ -23,12 +23,13 @@ _CAMERAS = ("OPENCV", "PINHOLE")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MAX_BYTES = 64 << 20
 _MAX_PIXELS = 1 << 30
-_USUAL_BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+USUAL_BOUNDS = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 """sdfstudio's own: scenes are scaled into this cube."""
 
 
-def load_dataset(folder: str | os.PathLike[str]) -> PosedImages:
-    """The images of a folder with ``meta_data.json``, in the folder's world frame.
+def load_dataset(folder: str | os.PathLike[str], opengl: bool = False) -> PosedImages:
+    """The images of a folder with ``meta_data.json``, in the folder's world frame. Frames whose pose is not finite, of
+    a camera that was lost, are left out. opengl: its cameras look against z, y is up.
 
     Frames need ``rgb_path``, ``camtoworld`` and ``intrinsics`` (their own, or one for all beside ``frames``);
     everything else may be absent, see docs/datasets.md.
@@ -49,7 +50,7 @@ def load_dataset(folder: str | os.PathLike[str]) -> PosedImages:
     return PosedImages(
         colors=_colors(root, frames, size),
         intrinsics=intrinsics,
-        T_world_camera=np.stack(poses),
+        T_world_camera=np.stack(poses) * np.array((1.0, -1.0, -1.0, 1.0) if opengl else 1.0),
         bounds=bounds,
         depths=_depths(root, metadata, frames, size),
         masks=_masks(root, metadata, frames, size),
@@ -89,7 +90,19 @@ def _frames(metadata: dict[str, Any]) -> list[dict[str, Any]]:
         raise DatasetError("the metadata lists no frames", reason="DATASET_NO_FRAMES")
     if not all(isinstance(frame, dict) for frame in frames):
         raise DatasetError("a frame is not a JSON object", reason=_INVALID)
-    return frames
+    found = [frame for frame in frames if not _lost(frame.get("camtoworld"))]
+    if not found:
+        raise DatasetError("no frame has a pose of finite numbers", reason="DATASET_POSE_NOT_RIGID")
+    return found
+
+
+def _lost(pose: Any) -> bool:
+    """Whether a pose has the right shape, and numbers that are not finite."""
+    try:
+        numbers = np.array(pose, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return numbers.shape in ((4, 4), (3, 4)) and not np.isfinite(numbers).all()
 
 
 def _size(metadata: dict[str, Any], folder: Path, frames: list[dict[str, Any]]) -> Size:
@@ -124,7 +137,7 @@ def _bounds(metadata: dict[str, Any]) -> NDArray[np.float64]:
     scene_box = metadata.get("scene_box") or {}
     if not isinstance(scene_box, dict):
         raise DatasetError("scene_box is not a JSON object", reason=_INVALID)
-    bounds = array(scene_box.get("aabb", _USUAL_BOUNDS), ((2, 3),), "aabb of scene_box", _INVALID)
+    bounds = array(scene_box.get("aabb", USUAL_BOUNDS), ((2, 3),), "aabb of scene_box", _INVALID)
     if not (bounds[0] < bounds[1]).all():
         raise DatasetError("aabb of scene_box: the lowest corner is not below the highest", reason=_INVALID)
     return bounds

@@ -20,7 +20,6 @@ from benchmarks.worlds.recipe import FROM_IMAGES, RENDERED, Scene, Seen, see
 from regnf_core.errors import RegnfError
 from regnf_core.geometry.pinhole import PinholeCameras
 from regnf_core.schema.observation_grid import ObservationGrid
-from regnf_data.posed_images import PosedImages
 from regnf_data.worlds.detections import draw_box
 from regnf_data.worlds.fusing import fuse
 from regnf_data.worlds.mesh import Array, Mesh, together
@@ -168,7 +167,7 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
         if scene == "under-trained":
             options = replace(options, iterations=int(rng.uniform(*_TRAINED)))
         units = min(1.0, _REACH / float(np.abs(seen.bounds).max()))
-        images = in_units(seen.taken.images(seen.bounds), units)
+        images = seen.taken.images(seen.bounds).moved(np.zeros(3), units)
         report = reconstruct(images, FitFiles(home / SCENE), options, world.seed)
         return {"kind": scene, "iterations": report.iterations, "units_per_meter": units}
     mesh = together(*(placed.mesh for placed in world.all))
@@ -181,14 +180,6 @@ def _write_scene(scene: Scene, world: World, seen: Seen, home: Path, rng: np.ran
         "wavelength": float(rng.uniform(0.1, 0.6)),
         "bend_seed": int(rng.integers(2**31)),
     }
-
-
-def in_units(images: PosedImages, units_per_meter: float) -> PosedImages:
-    """The same images, in a world of another unit."""
-    poses = images.T_world_camera.copy()
-    poses[:, :3, 3] *= units_per_meter
-    depths = None if images.depths is None else (images.depths * units_per_meter).astype(np.float32)
-    return replace(images, T_world_camera=poses, depths=depths, bounds=images.bounds * units_per_meter)
 
 
 def _write_observation(seen: Seen, home: Path) -> None:

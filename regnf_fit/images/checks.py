@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
+from regnf_data.sdfstudio_reader import USUAL_BOUNDS
 
-GRID_RADIUS = 2.0
+Floats = NDArray[np.float64]
+
 _MIN_PIXELS = 100
 _MIN_DEPTH_SHARE = 1e-4
 _MIN_SPREAD = 2.0
 """Standard deviation of the colors, of 255."""
+_SAMPLED = 20_000
+_EXPLAINED = 0.5
+"""Of the depths; a unit that puts fewer within the bounds explains nothing."""
+UNITS = (
+    (0.3048, "feet"), (0.2, "steps of 1/5000 that were read as 1/1000"), (5.0, "steps of 1/1000 read as 1/5000"),
+    (0.0254, "inches"), (0.01, "centimeters"), (100.0, "units that were divided by 100 too often"),
+    (0.001, "millimeters"), (1000.0, "units that were divided by 1000 too often"), (0.0002, "steps of 1/5000"),
+)  # fmt: skip
+"""Factors that bring lengths of another unit into the world's, nearest to 1 first, and what the unit then is."""
 
 
 def check_images(images: PosedImages) -> None:
@@ -23,7 +35,7 @@ def check_images(images: PosedImages) -> None:
     if len(images) == 0 or images.colors[0].size == 0:
         raise DatasetError("the dataset holds no pixels", reason="DATASET_NO_FRAMES")
     _check_cameras(images)
-    _check_bounds(images.bounds)
+    check_bounds(images.bounds)
     if images.depths is not None:
         if not np.isfinite(images.depths).all() or (images.depths > 0).mean() < _MIN_DEPTH_SHARE:
             raise DatasetError("no image has depths worth the name", reason="DATASET_DEPTH_MISSING")
@@ -31,10 +43,61 @@ def check_images(images: PosedImages) -> None:
         raise DatasetError("the images have no depths and are all of one color", reason="DATASET_NO_COLOR_VARIETY")
 
 
-def check_seen(pixels: int) -> None:
-    """Raise DatasetError (DATASET_NOTHING_IN_BOUNDS) when too few pixels show anything within the bounds."""
-    if pixels < _MIN_PIXELS:
-        raise DatasetError(f"only {pixels} pixels show anything within the bounds", reason="DATASET_NOTHING_IN_BOUNDS")
+def check_seen(images: PosedImages, shown: int) -> None:
+    """Raise DatasetError (DATASET_NOTHING_IN_BOUNDS) when too few pixels show anything within the bounds.
+
+    shown: how many do. The message says where depths end, and in which unit they would end within.
+    """
+    if shown >= _MIN_PIXELS:
+        return
+    text = f"only {shown} pixels show anything within the bounds, {_box(images.bounds)}"
+    if np.array_equal(images.bounds, USUAL_BOUNDS):
+        text += " (what is taken where meta_data.json has no scene_box)"
+    origins, rays, depths = sampled_rays(images)
+    if len(depths) == 0:
+        hint = None if images.masks is None else "Masks are true on the thing: are these the other way round?"
+        raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
+    ends = np.quantile(origins + depths[:, None] * rays, [0.05, 0.95], axis=0)
+    text += f"; depths are {np.median(depths):.4g} in the median and end within {_box(ends)}"
+    hint = _unit_hint(images.bounds, origins, rays, depths)
+    raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
+
+
+def sampled_rays(images: PosedImages) -> tuple[Floats, Floats, Floats]:
+    """Origins (R, 3), directions (R, 3) and depths (R,) of some of the pixels that have a depth, world frame; a
+    direction's part along the camera's axis is 1. None without depths."""
+    if images.depths is None:
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    measured = images.depths > 0.0 if images.masks is None else (images.depths > 0.0) & images.masks
+    chosen = np.flatnonzero(measured)[:: max(1, int(measured.sum()) // _SAMPLED)]
+    image, row, column = np.unravel_index(chosen, images.depths.shape)
+    pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(chosen))], axis=-1)
+    T_world_pixel = images.T_world_camera[:, :3, :3] @ np.linalg.inv(images.intrinsics)
+    rays = np.einsum("rij,rj->ri", T_world_pixel[image], pixels)
+    return images.T_world_camera[image, :3, 3], rays, images.depths[image, row, column].astype(np.float64)
+
+
+def _unit_hint(bounds: Floats, origins: Floats, rays: Floats, depths: Floats) -> str | None:
+    """The mistaken unit that most depths would end within the bounds without; None where there is none."""
+    found: list[tuple[float, str]] = []
+    for factor, unit in UNITS:
+        for name, ends in (
+            ("the depths", origins + factor * depths[:, None] * rays),
+            ("the poses", factor * origins + depths[:, None] * rays),
+            ("depths and poses", factor * (origins + depths[:, None] * rays)),
+        ):
+            within = float(((ends >= bounds[0]) & (ends <= bounds[1])).all(axis=1).mean())
+            told = f"divided by {1 / factor:.4g}" if factor < 1.0 else f"times {factor:.4g}"
+            text = f"Are {name} in {unit}? {told[0].upper()}{told[1:]}, {100 * within:.0f} % of the depths end within."
+            found.append((within, text))
+    most = max(within for within, _ in found)
+    # of those that explain as much the first, which changes least
+    return next(text for within, text in found if within > 0.95 * most) if most >= _EXPLAINED else None
+
+
+def _box(corners: Floats) -> str:
+    """Lowest and highest corner (2, 3) in words."""
+    return " to ".join("(" + ", ".join(f"{number:.4g}" for number in corner) + ")" for corner in corners)
 
 
 def _check_cameras(images: PosedImages) -> None:
@@ -48,14 +111,7 @@ def _check_cameras(images: PosedImages) -> None:
         raise DatasetError("a camera's focal length is not positive", reason="DATASET_INTRINSICS_INVALID")
 
 
-def _check_bounds(bounds: np.typing.NDArray[np.float64]) -> None:
+def check_bounds(bounds: Floats) -> None:
+    """Raise DatasetError (DATASET_BOUNDS_EMPTY) for bounds (2, 3) without volume."""
     if not (np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all()):
         raise DatasetError("the dataset's bounds are empty", reason="DATASET_BOUNDS_EMPTY")
-
-
-def check_within_grid(bounds: np.typing.NDArray[np.float64]) -> None:
-    """Raise DatasetError (DATASET_OUTSIDE_GRID) for bounds (2, 3) beyond the hash grid of a fit."""
-    if np.abs(bounds).max() > GRID_RADIUS:
-        raise DatasetError(
-            "the dataset's bounds reach beyond [-2, 2]: scale its poses and depths down", reason="DATASET_OUTSIDE_GRID"
-        )

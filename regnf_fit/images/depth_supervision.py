@@ -17,7 +17,7 @@ from regnf_fit.images.detail import in_boxes, uneven
 from regnf_fit.images.map_distances import MapDistances
 from regnf_fit.images.options import ReconstructionOptions
 from regnf_fit.images.preparation import PreparedImages
-from regnf_fit.images.rays import PixelRays
+from regnf_fit.images.rays import PixelRays, measured_within
 
 _FREE_POOL = 400_000
 _CANDIDATES = 3
@@ -87,7 +87,7 @@ def supervise(prepared: PreparedImages, options: ReconstructionOptions, rng: np.
     before = before.maximum(options.band_spreads * spreads)
     behind = behind.maximum(0.5 * options.band_spreads * spreads)
     seen = (rays.depths > 0.0) & ~rays.background
-    inside = seen & (rays.depths >= rays.near) & (rays.depths <= rays.far)
+    inside = measured_within(rays)
     surface = rays.take(inside)
     ends = surface.at(surface.depths[:, None])[:, 0]
     usual = float(before[inside].median()) if len(surface) else options.band * size

@@ -23,11 +23,12 @@ from regnf_core.viewing.field_picture import field_picture
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.capacity import suited
 from regnf_fit.images.checkpoint import read_checkpoint, write_checkpoint
-from regnf_fit.images.checks import check_within_grid
+from regnf_fit.images.checks import check_bounds
 from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
 from regnf_fit.images.held_out_images import held_out_images, likeness
+from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.map_distances import MapDistances, map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
@@ -35,6 +36,7 @@ from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
 from regnf_fit.images.preparation import PreparedImages, prepare
 from regnf_fit.images.sdfstudio_export import write_sdfstudio
 from regnf_fit.images.trainer import Trainer
+from regnf_fit.network import GRID_RADIUS
 from regnf_fit.options import FitProgress
 
 _REPORT_EVERY = 25
@@ -68,19 +70,23 @@ def reconstruct(
 ) -> ReconstructionReport:
     """Fit a field to ``images``, write it in the safe format, and say how well it agrees with pixels held out.
 
-    The field's frame is the images' world frame, its bounds are theirs. Deterministic for ``seed`` on one machine's
+    The field's frame is the images' world frame, its bounds are theirs; bounds beyond the hash grid are fitted in a
+    frame of their own, and placed in the world. Deterministic for ``seed`` on one machine's
     CPU, interrupted or not. Raises DatasetError, FitDivergedError and InvalidInputError (CHECKPOINT_...).
     """
     options = options or ReconstructionOptions()
     started = time.monotonic()
     torch_device = pick_device(device)
     rng = np.random.default_rng(seed)
-    check_within_grid(images.bounds)
-    prepared = prepare(images, options.start, rng)
+    key = _key(images, options, seed)
+    check_bounds(images.bounds)
+    frame = LocalFrame.in_grid(images, GRID_RADIUS)
+    given, images = images, frame.enter(images)
+    prepared = prepare(images, options.start, rng, given)
     options = suited(options, prepared)
     trainer = Trainer(prepared, options, seed, torch_device, rng, _near(images, prepared, options, rng))
-    write = _Writer(prepared.bounds, label, source or {}, observe(images, options.observation_voxels, prepared.spread))
-    key = _key(images, options, seed)
+    observation = observe(images, options.observation_voxels, prepared.spread)
+    write = _Writer(prepared.bounds, label, source or {}, observation, frame)
     if files.checkpoint is not None and files.checkpoint.exists():
         trainer.resume(read_checkpoint(files.checkpoint, key))
     loss = _train(trainer, files, key, write, progress)
@@ -99,10 +105,13 @@ def reconstruct(
         loss=loss,
         psnr=None if alike is None else alike.psnr,
         ssim=None if alike is None else alike.ssim,
-        pose_shift=None if trainer.poses is None else trainer.poses.median_shift(),
+        pose_shift=None if trainer.poses is None else trainer.poses.median_shift() / frame.scale,
         iterations=options.iterations,
         seconds=time.monotonic() - started,
-        **asdict(errors),
+        depth_error=None if errors.depth_error is None else errors.depth_error / frame.scale,
+        depth_error_median=None if errors.depth_error_median is None else errors.depth_error_median / frame.scale,
+        eikonal_error=errors.eikonal_error,
+        warnings=prepared.warnings,
     )
 
 
@@ -112,7 +121,8 @@ def _write_all(trainer: Trainer, files: FitFiles, write: _Writer, color: Surface
     if files.pictures:
         _draw(trainer.averaged, write.bounds, files.output.with_suffix(".png"))
     if files.sdfstudio is not None:
-        write_sdfstudio(trainer.averaged, write.bounds, float(trainer.sharpness().detach()), files.sdfstudio)
+        sharpness = float(trainer.sharpness().detach())
+        write_sdfstudio(trainer.averaged, write.bounds, sharpness, files.sdfstudio, write.frame)
     if files.checkpoint is not None:
         files.checkpoint.unlink(missing_ok=True)
 
@@ -203,6 +213,7 @@ class _Writer:
     label: str | None
     source: dict[str, Any]
     observation: Observation | None
+    frame: LocalFrame
 
     def __call__(self, trainer: Trainer, path: Path, color: SurfaceColor | None = None) -> None:
         """The moving average of what ``trainer`` has learned. color: the geometry's, where it is finished."""
@@ -217,7 +228,7 @@ class _Writer:
         if self.observation is not None:
             grid, tensors[OBSERVATION] = self.observation.stored()
             description[OBSERVATION] = asdict(grid)
-        write_safe_field(path, description, tensors)
+        write_safe_field(path, self.frame.leave(description), tensors)
 
 
 def _key(images: PosedImages, options: ReconstructionOptions, seed: int) -> str:

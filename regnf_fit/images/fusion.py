@@ -19,6 +19,8 @@ from regnf_core.fields.build import open_field
 from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.fusing import Progress
 from regnf_data.posed_images import PosedImages
+from regnf_fit.images.checks import check_bounds
+from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.measured import ends_of, measured_rays
 from regnf_fit.images.measured_map import MapSize, map_grid, write_map
 from regnf_fit.images.observing import attach_observation
@@ -38,13 +40,14 @@ class FusionOptions(MapSize):
 @dataclass(frozen=True)
 class FusionReport:
     """What was made. voxel, truncation: field units · depth_error_median: of the map's distance at measured points,
-    field units."""
+    field units · warnings: each begins with a stable word."""
 
     images: int
     voxel: float
     truncation: float
     depth_error_median: float
     seconds: float
+    warnings: tuple[str, ...]
 
 
 def fuse_images(
@@ -64,15 +67,19 @@ def fuse_images(
     started = time.monotonic()
     if images.depths is None:
         raise DatasetError("images without depths cannot be fused", reason="DATASET_DEPTH_MISSING")
-    prepared = prepare(images, "auto", np.random.default_rng(0))
+    check_bounds(images.bounds)
+    frame = LocalFrame.near_origin(images)
+    given, images = images, frame.enter(images)
+    prepared = prepare(images, "auto", np.random.default_rng(0), given)
     rays = measured_rays(prepared)
     grid = map_grid(prepared, rays, options)
     rough = output.with_name(f"{output.stem}.part.safetensors")
     try:
         fused = write_map(images, grid, rough, progress)
         attach_observation(rough, fused, options.observation_voxels, prepared.spread)  # ``fused`` is too little of them
-        _describe(rough, label, source or {})
         error = _error(rough, rays)
+        description = frame.leave({**read_description(rough), "label": label, "source": source or {}})
+        write_safe_field(rough, description, load_file(rough))
         rough.replace(output)
     finally:
         rough.unlink(missing_ok=True)
@@ -82,12 +89,8 @@ def fuse_images(
         truncation=grid.voxel * grid.truncation,
         depth_error_median=error,
         seconds=time.monotonic() - started,
+        warnings=prepared.warnings,
     )
-
-
-def _describe(path: Path, label: str | None, source: dict[str, Any]) -> None:
-    description = read_description(path)
-    write_safe_field(path, {**description, "label": label, "source": source}, load_file(path))
 
 
 def _error(path: Path, rays: PixelRays) -> float:

@@ -13,7 +13,7 @@ from regnf_data.posed_images import PosedImages
 from regnf_fit.images.coloring import SurfaceColor, appearance_of
 from regnf_fit.images.held_out import first_hits
 from regnf_fit.images.network import RadianceField
-from regnf_fit.images.rays import PixelRays, pixel_axes, rays_of_pixels
+from regnf_fit.images.rays import PixelRays, measured_within, pixel_axes, rays_of_pixels
 
 _ONE_OF = 15
 _MOST_IMAGES = 4
@@ -85,9 +85,7 @@ def _picture(
     height, width = images.colors.shape[1:3]
     pixels = number * height * width + np.arange(height * width)
     rays = rays_of_pixels(images, pixels, None).to(device)
-    shown = ~rays.background & (rays.far > rays.near)
-    if images.depths is not None:
-        shown &= (rays.depths >= rays.near) & (rays.depths <= rays.far)
+    shown = ~rays.background & (rays.far > rays.near) if images.depths is None else measured_within(rays)
     index = shown.nonzero()[:, 0]
     drawn, seen = torch.zeros(len(rays), 3, device=device), torch.zeros(len(rays), 3, device=device)
     if len(index):

@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from regnf_fit.images.preparation import PreparedImages
-from regnf_fit.images.rays import PixelRays
+from regnf_fit.images.rays import PixelRays, measured_within
 
 _SHARP = 0.25
 """The share of the pixels that are no wider at their surface than :func:`sharp_width`."""
@@ -14,9 +14,7 @@ _SHARP = 0.25
 
 def measured_rays(prepared: PreparedImages) -> PixelRays:
     """The training rays whose depth lies within the bounds."""
-    rays = prepared.training
-    within = (rays.depths >= rays.near) & (rays.depths <= rays.far)
-    return rays.take(within & (rays.depths > 0.0) & ~rays.background)
+    return prepared.training.take(measured_within(prepared.training))
 
 
 def ends_of(rays: PixelRays) -> Tensor:

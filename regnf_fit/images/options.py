@@ -128,3 +128,5 @@ class ReconstructionReport:
     """Median shift of the corrected cameras, field units; None: poses were not corrected."""
     iterations: int
     seconds: float
+    warnings: tuple[str, ...]
+    """Each begins with a stable word."""

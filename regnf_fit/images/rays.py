@@ -52,6 +52,12 @@ class PixelRays:
         return self.origins[:, None] + depths[..., None] * self.directions[:, None]
 
 
+def measured_within(rays: PixelRays) -> Tensor:
+    """(R,) bool: which rays have a depth, and it ends within the bounds."""
+    # near is 0 where a camera stands within the bounds, and so is a depth that was not measured
+    return (rays.depths > 0.0) & (rays.depths >= rays.near) & (rays.depths <= rays.far) & ~rays.background
+
+
 def rays_of_pixels(images: PosedImages, pixels: NDArray[np.int64], planes: LocalPlanes | None) -> PixelRays:
     """The rays of ``pixels`` (R,), indices into the images' (N, H, W) taken as one row.
 

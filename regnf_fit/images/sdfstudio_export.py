@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 from torch import Tensor
 
 from regnf_core.files import atomic_path
+from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.network import RadianceField
 from regnf_fit.network import POSITION_DEGREE
 
@@ -18,8 +21,9 @@ _EMBEDDING = 32
 """Columns of the color's network for an image's appearance, which our fields do not have: zeros."""
 
 
-def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path) -> None:
-    """Write a checkpoint {step, pipeline} to ``path`` atomically. bounds: (2, 3), the field's frame.
+def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path: Path, frame: LocalFrame) -> None:
+    """Write a checkpoint {step, pipeline} to ``path`` atomically. bounds: (2, 3), the field's frame · frame: that one;
+    where it is not the images' own, dataparser_transforms.json beside the checkpoint says how it lies in theirs.
 
     The distances are those of the field before its table is rounded to half precision. What the tensors do not say
     stands in ``config.yml`` beside it, as sdfstudio names it; a file of that name that is there already stays.
@@ -44,6 +48,10 @@ def write_sdfstudio(field: RadianceField, bounds: Tensor, sharpness: float, path
     pipeline = {f"_model.field.{name}": value.detach().cpu().clone() for name, value in entries.items()}
     with atomic_path(path) as temporary:
         torch.save({"step": field.options.iterations, "pipeline": pipeline}, temporary)
+    if not frame.same:
+        turn = [[*row, -float(shift)] for row, shift in zip(np.eye(3).tolist(), frame.origin, strict=True)]
+        with atomic_path(path.with_name("dataparser_transforms.json")) as temporary:
+            temporary.write_text(json.dumps({"transform": turn, "scale": frame.scale}), encoding="utf-8")
     settings = path.with_name("config.yml")
     if not settings.exists():
         with atomic_path(settings) as temporary:

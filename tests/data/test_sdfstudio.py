@@ -268,3 +268,34 @@ def test_refused_metadata(content: bytes | None, reason: str, tmp_path: Path) ->
     with pytest.raises(DatasetError) as refused:
         load_dataset(tmp_path)
     assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_the_largest_number_of_a_type_is_no_depth(folder: Path, kind: type[np.unsignedinteger]) -> None:  # type: ignore[type-arg]
+    steps = np.full((4, 6), 100, kind)
+    steps[0, 0], steps[0, 1] = np.iinfo(kind).max, 0
+    Image.fromarray(steps).save(folder / "depth.png")
+    np.save(folder / "000001_depth.npy", np.where(steps == 0, 65504.0, 0.1).astype(np.float16))
+
+    def use(metadata: dict[str, Any]) -> None:
+        metadata["depth_unit_scale_factor"] = 0.001
+        metadata["frames"][0]["sensor_depth_path"] = "depth.png"
+
+    change(folder, use)
+    read = load_dataset(folder)
+    assert read.depths is not None
+    np.testing.assert_allclose(read.depths[0, 0], [0.0, 0.0, 0.1, 0.1, 0.1, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(read.depths[1, 0], [0.1, 0.0, 0.1, 0.1, 0.1, 0.1], rtol=1e-3)
+
+
+def test_a_mask_or_a_colored_picture_is_no_depth(folder: Path) -> None:
+    for mode, said in (("1", "one bit a pixel"), ("P", "a palette of colors")):
+        Image.fromarray(np.eye(4, 6, dtype=np.uint8) * 255).convert(mode).save(folder / "depth.png")
+
+        def use(metadata: dict[str, Any]) -> None:
+            metadata["depth_unit_scale_factor"] = 0.001
+            metadata["frames"][0]["sensor_depth_path"] = "depth.png"
+
+        change(folder, use)
+        with pytest.raises(DatasetError, match=said):
+            load_dataset(folder)

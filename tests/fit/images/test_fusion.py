@@ -174,3 +174,14 @@ def test_images_without_surface_within_reach_have_a_reason(tmp_path: Path) -> No
         fuse_blocks(depths, BlockGrid(0.02, 4.0, 1e-3), tmp_path / "map.safetensors")
     assert raised.value.reason == "DATASET_NOTHING_IN_BOUNDS"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_map_in_geodetic_coordinates_is_as_good_as_one_at_the_origin(tmp_path: Path) -> None:
+    """Half a million meters from the origin, numbers of single precision are 3 cm apart."""
+    origin = np.array([448_262.3, 5_413_920.7, 112.4])
+    report = fuse_images(IMAGES.moved(-origin, 1.0), tmp_path / "far.safetensors")
+    near = fuse_images(IMAGES, tmp_path / "near.safetensors")
+    assert report.depth_error_median == pytest.approx(near.depth_error_median, rel=0.2)
+    description = read_description(tmp_path / "far.safetensors")
+    np.testing.assert_allclose(description["bounds"], scenes.BOUNDS + origin, atol=0.1)
+    assert np.array(description["placement"]["transform"])[:3, 3].tolist() == [448262.0, 5413921.0, 112.0]

@@ -1,3 +1,4 @@
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import torch
 from regnf_core.errors import DatasetError, FitDivergedError, InvalidInputError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.color import has_color
+from regnf_core.fields.observation import observation_of
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.images import fit
@@ -127,6 +129,26 @@ def test_a_fit_that_diverges_says_so_and_writes_no_field(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(("origin", "scale"), [((3.0, 5.0, 0.0), 1.0), ((0.0, 0.0, 0.0), 5.0)])
+def test_a_world_beyond_the_grid_is_fitted_in_a_frame_of_its_own(tmp_path, origin, scale):
+    """A room in a robot's map: the field, its exports and the report are in the robot's frame."""
+    images, path, exported = scenes.images(count=6), tmp_path / "field.safetensors", tmp_path / "step.ckpt"
+    world = images.moved(-np.array(origin) / scale, scale)
+    options = replace(SMALL, iterations=120, half_table=False)
+    report = reconstruct(world, FitFiles(path, sdfstudio=exported), options, device="cpu")
+    field = open_field(path)
+    np.testing.assert_allclose(field.bounds.numpy(), world.bounds, atol=1e-5)
+    points = np.random.default_rng(0).uniform(*scenes.BOUNDS, size=(2000, 3))
+    told = field.signed_distance(torch.from_numpy(scale * points + origin).float()).numpy()
+    assert np.median(np.abs(told / scale - scenes.distance(points))) < 0.03
+    assert report.depth_error_median < 0.1 * scale
+    assert observation_of(field) is not None
+    placed = json.loads((tmp_path / "dataparser_transforms.json").read_text())
+    corner = placed["scale"] * (np.array(placed["transform"]) @ [*world.bounds[0], 1.0])
+    low = torch.load(exported, weights_only=True)["pipeline"]["_model.field.aabb"][0]
+    np.testing.assert_allclose(corner, low, atol=1e-5)
+
+
 def test_the_exported_layout_reads_back(tmp_path):
     path, exported = tmp_path / "field.safetensors", tmp_path / "step.ckpt"
     options = replace(SMALL, iterations=40, half_table=False)
@@ -148,7 +170,6 @@ def test_the_exported_layout_reads_back(tmp_path):
         ({"T_world_camera": np.full((4, 4, 4), np.nan)}, "DATASET_POSE_NOT_RIGID"),
         ({"intrinsics": np.zeros((4, 3, 3))}, "DATASET_INTRINSICS_INVALID"),
         ({"bounds": np.zeros((2, 3))}, "DATASET_BOUNDS_EMPTY"),
-        ({"bounds": np.array([[-3.0] * 3, [3.0] * 3])}, "DATASET_OUTSIDE_GRID"),
         ({"depths": np.zeros((4, 36, 48), np.float32)}, "DATASET_DEPTH_MISSING"),
         ({"depths": None, "colors": np.full((4, 36, 48, 3), 9, np.uint8)}, "DATASET_NO_COLOR_VARIETY"),
         ({"bounds": np.array([[1.0, 1.0, 1.0], [1.1, 1.1, 1.1]])}, "DATASET_NOTHING_IN_BOUNDS"),
