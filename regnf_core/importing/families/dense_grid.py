@@ -14,8 +14,9 @@ from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surfa
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.voxel_maps import filled_nodes, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import entries_at, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import local_origin
 
 FAMILY = "dense_sdf_grid"
 _VALUES = ("sdf", "values")
@@ -45,10 +46,12 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
         tensors["weights"] = stored_weights(weights)
     origin, spacing, told = _placement(arrays, np.array(values.shape))
     far = origin + spacing * (np.array(values.shape) - 1)
+    box = [origin.tolist(), far.tolist()]
+    shift = local_origin(box)
     description = {
         "kind": "voxel_grid",
-        **shared_entries(overrides, [origin.tolist(), far.tolist()]),
-        "origin": origin.tolist(),
+        **entries_at(shared_entries(overrides, box), shift),
+        "origin": (origin if shift is None else origin - np.array(shift)).tolist(),
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},
     }

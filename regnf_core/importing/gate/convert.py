@@ -78,7 +78,8 @@ def convert_file(
     target = out_dir / FIELD_NAME
     stored = _stored(read, target, limits, beside.cameras is not None)
     drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, stored.up_axis)
-    measured, more = _evaluated(target, drawing, None if read.description.accept_implausible else stored.guess)
+    judged = None if read.description.accept_implausible else stored.guess
+    measured, more = _evaluated(target, drawing, judged, stored.reported["kind"] == "mesh")
     if stored.sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     warned = list(kept_warnings(_latest([*stored.warnings, *more])))
@@ -179,7 +180,9 @@ class _Drawing:
                 _draw(field, self.up_axis, self.path)
 
 
-def _evaluated(path: Path, drawing: _Drawing, judged: _Guess | None) -> tuple[dict[str, float], list[str]]:
+def _evaluated(
+    path: Path, drawing: _Drawing, judged: _Guess | None, is_mesh: bool
+) -> tuple[dict[str, float], list[str]]:
     """What was measured of the field in the file ``path``, and warnings; it is drawn if that is quick.
 
     judged: None takes it even if it does not behave like a signed distance. Raises FieldFormatError.
@@ -189,7 +192,7 @@ def _evaluated(path: Path, drawing: _Drawing, judged: _Guess | None) -> tuple[di
     from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
 
     field, started = open_field(path), time.process_time()
-    measured, warnings = check_plausibility(field)
+    measured, warnings = check_plausibility(field, is_mesh=is_mesh)
     if judged is not None:
         require_plausible(measured, judged.sign)
     if time.process_time() - started < _QUICK_S:
