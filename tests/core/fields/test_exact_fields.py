@@ -109,7 +109,7 @@ def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
     assert caught.value.reason == "MESH_INVALID"
 
 
-@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.txt"])
+@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.stl"])
 def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("no mesh at all")
     with pytest.raises(FieldFormatError) as caught:
