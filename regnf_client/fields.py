@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import re
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +20,7 @@ from regnf_client.models import Entry, Field
 from regnf_client.patience import Patience
 from regnf_client.steps import Flow, call, work
 from regnf_client.worker_watch import WorkerWatch, look
+from regnf_core.errors import InvalidInputError
 from regnf_core.field_candidates import Said
 from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
 from regnf_core.importing.upload_description import UploadDescription
@@ -81,7 +83,13 @@ def source_of(
     role: Role | None = None,
 ) -> FieldSource:
     """What a path stands for. Raises what ``find_source`` does: InvalidInputError, FieldFormatError."""
-    return field if isinstance(field, FieldSource) else find_source(Path(field), description, settings, role)
+    if isinstance(field, FieldSource):
+        return field
+    if not isinstance(field, str | os.PathLike):
+        hint = "The service takes files: write a mesh as .ply, .glb, .obj or .stl, a grid by numpy.savez."
+        message = f"the field is of the type {type(field).__name__}, expected a path"
+        raise InvalidInputError(message, reason="NO_FIELD", hint=hint)
+    return find_source(Path(field), description, settings, role)
 
 
 def known_sha256(field: FieldLike) -> str | None:

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.loading import FieldWarning, open_field
+    from regnf_core.in_memory import FieldWarning, from_function, from_grid, from_mesh, from_points
+    from regnf_core.loading import open_field
     from regnf_core.options import RegistrationOptions
     from regnf_core.rendering.camera import Camera
     from regnf_core.rendering.options import RenderOptions
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BatchOutcome": "regnf_core.api.registering",
     "Camera": "regnf_core.rendering.camera",
-    "FieldWarning": "regnf_core.loading",
+    "FieldWarning": "regnf_core.in_memory",
     "Insertion": "regnf_core.editing.edits",
     "OrientedBox": "regnf_core.geometry.box",
     "Registered": "regnf_core.api.registered",
@@ -52,6 +53,7 @@ _HOMES = {
     "Substitution": "regnf_core.editing.edits",
     "WarmStart": "regnf_core.robust.pipeline",
     "compose": "regnf_core.api.picturing",
+    **dict.fromkeys(("from_function", "from_grid", "from_mesh", "from_points"), "regnf_core.in_memory"),
     "open_field": "regnf_core.loading",
     "register": "regnf_core.api.registering",
     "register_batch": "regnf_core.api.registering",
@@ -79,6 +81,10 @@ __all__ = [
     "WarmStart",
     "__version__",
     "compose",
+    "from_function",
+    "from_grid",
+    "from_mesh",
+    "from_points",
     "open_field",
     "register",
     "register_batch",

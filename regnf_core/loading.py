@@ -16,14 +16,11 @@ from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import FieldSource, SettingsChoice, find_source
 from regnf_core.files import atomic_path
+from regnf_core.in_memory import FieldWarning, field_of
 from regnf_core.version import __version__
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
-
-
-class FieldWarning(UserWarning):
-    """A field was opened, and its import has warned of something."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class LoadedField:
 
 
 def open_field(
-    path: str | Path,
+    path: str | os.PathLike[str] | object,
     description: Mapping[str, Any] | None = None,
     settings: SettingsChoice = None,
     device: str = "cpu",
@@ -52,13 +49,16 @@ def open_field(
     """The field in a file, a training run's folder or an archive of one, on ``device``.
 
     A safe field is opened as it is. Anything else goes through the import gate, whose outcome is kept in ``cache_dir``.
-    ``description`` says what the file does not carry, see UploadDescription. ``settings`` names the trainer's settings:
-    a file, or an archive of several; None takes those beside the checkpoint, False none. A warning of the import is
-    issued as a FieldWarning.
+    In place of a path, a mesh or a cloud of trimesh or Open3D is taken as a file of it would be. ``description`` says
+    what the file does not carry, see UploadDescription. ``settings`` names the trainer's settings: a file, or an
+    archive of several; None takes those beside the checkpoint, False none. A warning of the import is issued as a
+    FieldWarning.
 
     Raises FieldFormatError (with the gate's reason) and InvalidInputError (FILE_NOT_FOUND, FILE_IS_FOLDER), which name
-    the file.
+    the file, and InvalidInputError (NO_FIELD) for what is neither a path nor a mesh.
     """
+    if not isinstance(path, str | os.PathLike):
+        return field_of(path, description=description).to(device)
     loaded = load_field(find_source(Path(path), description, settings), device, cache_dir)
     for warning in loaded.notes.warnings:
         warnings.warn(f"{path}: {warning}", FieldWarning, stacklevel=2)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_mesh
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_fit.mesh.fit import fit_field
 from regnf_fit.mesh.options import FitOptions
@@ -94,7 +95,7 @@ def object_from_mesh(mesh: MeshField, units_per_meter: float = OBJECT_UNITS_PER_
 
 def load_instance(meshes: Path, instance: dict[str, Any]) -> MeshField:
     """An instance's mesh in its own frame, meters."""
-    return MeshField.load(meshes / Path(instance["mesh"]).name)
+    return load_mesh(meshes / Path(instance["mesh"]).name)
 
 
 def compose_room(meshes: Path, room: dict[str, Any]) -> UnionField:

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from benchmarks.simple_meshes import box, revolved, together
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_mesh
 
 GIVEN = (
     "painted_wooden_chair_01", "dining_chair_02", "modern_arm_chair_01", "modern_arm_chair_01_nopillow",
@@ -71,7 +72,7 @@ REMOVALS = (
 
 def library_meshes(meshes: Path) -> list[tuple[str, MeshField]]:
     """All 64, by name, in meters, z up; ``meshes`` is the folder of the given ones."""
-    given = {name: MeshField.load(meshes / f"{name}.glb") for name in GIVEN}
+    given = {name: load_mesh(meshes / f"{name}.glb") for name in GIVEN}
     stretched = {
         f"{one.of} stretched {one.factor:g} along {'xyz'[one.axis]}": stretch(given[one.of], one.axis, one.factor)
         for one in STRETCHES

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import Role, find_source
 from regnf_core.fields.base import SdfField
-from regnf_core.loading import FieldWarning, load_field
+from regnf_core.in_memory import FieldWarning, field_of
+from regnf_core.loading import load_field
 
-FieldLike = SdfField | str | Path
-"""An open field, or the path of a file, a training run's folder or an archive of one."""
-_HINT = 'Give a path such as "chair.glb", or what open_field returns.'
+FieldLike = SdfField | str | os.PathLike[str] | Any
+"""An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
+:func:`regnf_core.in_memory.field_of`."""
 
 
 @dataclass(frozen=True)
@@ -29,21 +32,17 @@ class Opened:
 
 def opened(field: FieldLike, role: Role | None = None) -> Opened:
     """The field that is meant; a path is opened, as what it will be used as. Raises what ``open_field`` does."""
-    if isinstance(field, str | Path):
+    if isinstance(field, str | os.PathLike):
         loaded = load_field(find_source(Path(field), role=role))
         for warning in loaded.notes.warnings:
             warnings.warn(f"{field}: {warning}", FieldWarning, stacklevel=4)
         return Opened(loaded.field, str(field), loaded.notes)
-    if isinstance(field, type) or not isinstance(field, SdfField):
-        what = "class" if isinstance(field, type) else type(field).__name__
-        named = f"the {role}" if role else "the field"
-        raise InvalidInputError(f"{named} is a {what}, expected a field or its path", reason="NO_FIELD", hint=_HINT)
-    return Opened(field)
+    return Opened(field_of(field, role))
 
 
 def opened_several(fields: Sequence[FieldLike], role: Role) -> list[Opened]:
     """The same for a list. Raises InvalidInputError (NO_FIELD) for what is no list."""
-    if isinstance(fields, str | Path | SdfField) or not isinstance(fields, Sequence):
+    if isinstance(fields, str | os.PathLike | SdfField) or not isinstance(fields, Sequence):
         message = f"the {role}s are a {type(fields).__name__}, expected a list"
         raise InvalidInputError(message, reason="NO_FIELD", hint=f"Write a list: [{role}].")
     return [opened(one, role) for one in fields]

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import regnf_core.batch as engine_batch
 import regnf_core.registration as engine
@@ -11,8 +15,10 @@ from regnf_core.api.fields import FieldLike, Opened, notes_of, opened, opened_se
 from regnf_core.api.registered import Registered
 from regnf_core.batch import ModeledObject
 from regnf_core.detections.objects import BoxLike, detection_of
-from regnf_core.errors import InvalidDetectionError, RegnfError
+from regnf_core.errors import InvalidDetectionError, InvalidInputError, RegnfError
+from regnf_core.field_files import require_file
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.json_faults import json_fault
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 from regnf_core.result import ProgressCallback
@@ -41,7 +47,8 @@ def register(
 ) -> Registered:
     """Find where a known object stands in a scanned scene: rotation, position and scale, with a verdict.
 
-    scene, obj: fields, or their paths · detection: a box of regnf or Open3D, two corners, or a detection's JSON ·
+    scene, obj: fields, their paths, or meshes of trimesh or Open3D · detection: a box of regnf or Open3D, two corners,
+    a detection's JSON, or the path of its file ·
     options: RegistrationOptions, or a dictionary of those that are not to have their defaults · progress: called with
     the phase and the overall share done, 0..1 · warm_start: a pose to try first, and the object's model · clouds: False
     saves time when nothing is drawn or saved.
@@ -80,12 +87,28 @@ def register_batch(
 
 
 def box_of(detection: BoxLike) -> OrientedBox:
-    """The box that is meant. Raises InvalidDetectionError."""
+    """The box that is meant. Raises InvalidDetectionError, and InvalidInputError (FILE_NOT_FOUND, MALFORMED_JSON)."""
+    if isinstance(detection, str | os.PathLike):
+        return OrientedBox.from_dict(_json_of(Path(detection)))
     return detection if isinstance(detection, OrientedBox) else OrientedBox.from_detection(detection_of(detection))
 
 
+def _json_of(path: Path) -> Any:
+    """What a detection's file says, in any of Unicode's encodings."""
+    require_file(path)
+    data = path.read_bytes()
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        return json.loads(data.decode(encoding))
+    except json.JSONDecodeError as error:
+        message, hint = json_fault(error)
+    except (UnicodeDecodeError, RecursionError):
+        message, hint = "no JSON", "Is it a field or a picture? A detection is expected here."
+    raise InvalidInputError(f"detection {path}: {message}", reason="MALFORMED_JSON", hint=hint)
+
+
 def _several(detections: Sequence[BoxLike]) -> Sequence[BoxLike]:
-    if isinstance(detections, OrientedBox | str) or not isinstance(detections, Sequence):
+    if isinstance(detections, OrientedBox | str | os.PathLike) or not isinstance(detections, Sequence):
         raise InvalidDetectionError("the detections are one box, expected a list", hint="Write a list: [box].")
     return detections
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -73,7 +74,7 @@ def search(
 
 def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:
     """The objects by their names. Raises InvalidInputError (LIBRARY_EMPTY, LIBRARY_TOO_LARGE, NO_FIELD)."""
-    if isinstance(objects, str | Path):
+    if isinstance(objects, str | os.PathLike):
         return {str(path): path for path in library_files([Path(objects)])}
     if isinstance(objects, Mapping):
         named: dict[str, FieldLike | LibraryObject] = dict(objects)
@@ -90,13 +91,13 @@ def _named(objects: Objects) -> dict[str, FieldLike | LibraryObject]:
 def _name(one: FieldLike | LibraryObject, number: int) -> str:
     if isinstance(one, LibraryObject):
         return one.name
-    return str(one) if isinstance(one, str | Path) else f"object {number}"
+    return str(one) if isinstance(one, str | os.PathLike) else f"object {number}"
 
 
 def _modeled(name: str, one: FieldLike | LibraryObject, options: RobustOptions) -> LibraryObject:
     if isinstance(one, LibraryObject):
         return one
-    if isinstance(one, str | Path):
+    if isinstance(one, str | os.PathLike):
         source = find_source(Path(one), role="object")
         return LibraryObject(name, partial(_field_of, source), object_model(source, options))
     field = opened(one, "object").field

@@ -11,8 +11,8 @@ from regnf_core.errors import InvalidDetectionError
 from regnf_core.rotations import Vector
 
 Place = tuple[str | int, ...]
-MAX_COORDINATE = 1e6
-"""Largest coordinate and edge length. Fields are evaluated in float32, which has seven digits."""
+MAX_COORDINATE = 1e9
+"""Largest coordinate and edge length: float64 keeps a ten-millionth there."""
 _MAX_SHOWN = 60
 _HINT = "docs/api.md shows every form of a detection."
 _PLAIN = re.compile(r"[A-Za-z0-9_.+-]{1,40}")
@@ -57,7 +57,7 @@ def number(value: Any, place: Place, limit: float = MAX_COORDINATE) -> float:
         raise fault(place, f"is {shown(value)}, expected a finite number", "Leave boxes out that have no place.")
     if abs(value) > limit:
         message = f"is {shown(value)}, expected at most {limit:g} either way"
-        raise fault(place, message, "Fields have seven digits: move the origin of scene and box nearer.")
+        raise fault(place, message, "Move the origin of scene and box nearer.")
     return float(value)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
@@ -39,8 +40,16 @@ class Open3DAlignedBox(Protocol):
     def max_bound(self) -> Any: ...
 
 
-BoxLike = HasDetection | Open3DOrientedBox | Open3DAlignedBox | Detection | Mapping[str, Any] | Sequence[Any]
-"""A box, an Open3D box, a detection's JSON in any of its forms, or a lowest and a highest corner."""
+BoxLike = (
+    HasDetection
+    | Open3DOrientedBox
+    | Open3DAlignedBox
+    | Detection
+    | Mapping[str, Any]
+    | Sequence[Any]
+    | os.PathLike[str]
+)
+"""A box, an Open3D box, a detection's JSON in any of its forms or its file's path, or a lowest and a highest corner."""
 
 
 def detection_of(box: Any) -> Detection:

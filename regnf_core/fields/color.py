@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Protocol, TypeGuard, runtime_checkable
 
-import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
@@ -59,7 +58,7 @@ def color_in_unit(field: ColoredField, scale: float) -> ColorFunction:
 
 
 def _color_in_frame(field: ColoredField, T_field_frame: Sim3, points: Tensor, directions: Tensor) -> Tensor:
-    moved = T_field_frame.apply(points.double()).to(torch.float32)
+    moved = T_field_frame.apply(points.double())
     return field.color(moved, directions @ T_field_frame.rotation.to(directions).T)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import struct
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -11,7 +9,6 @@ from typing import Any
 import igl
 import numpy as np
 import torch
-import trimesh
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
@@ -22,20 +19,6 @@ from regnf_core.schema.kinds.mesh import MeshDescription
 
 _INSIDE = 0.5
 _ON_SURFACE = 1e-9
-_FAULTS_OF_CONTENT = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    NameError,
-    NotImplementedError,
-    OSError,
-    TypeError,
-    ValueError,
-    struct.error,
-)
-"""What trimesh's readers are known to raise on malformed files; OSError is a part that the file names and lacks."""
 
 
 class MeshField:
@@ -73,26 +56,6 @@ class MeshField:
         if colors is not None:
             self.color = self._color
         self._bounds = None if bounds is None else torch.as_tensor(np.asarray(bounds, dtype=np.float64))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> MeshField:
-        """The mesh in a glb, ply, obj or stl file; the nodes of a scene graph are merged at their poses.
-
-        Raises FieldFormatError (MESH_INVALID) when the file is malformed or holds no triangles, and OSError.
-        """
-        with open(path, "rb"):  # what cannot be read is not a fault of its content
-            pass
-        try:
-            scene = trimesh.load_scene(os.fspath(path), process=False)
-            meshes = [mesh for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
-        except _FAULTS_OF_CONTENT as error:
-            raise FieldFormatError(f"{os.path.basename(path)}: {error}", reason="MESH_INVALID") from error
-        if not meshes:
-            raise FieldFormatError(f"{os.path.basename(path)} holds no triangle mesh", reason="MESH_INVALID")
-        counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        vertices = np.concatenate([mesh.vertices for mesh in meshes])
-        faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, counts, strict=False)])
-        return cls(vertices, faces)
 
     def transformed(self, matrix: ArrayLike) -> MeshField:
         """The field of the mesh carried by a (4, 4) affine matrix."""

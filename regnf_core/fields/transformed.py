@@ -9,6 +9,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import ColorFunction, color_in_frame, has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.geometry.sim3 import Sim3
+from regnf_core.schema.similarity import local_origin
 
 
 class TransformedField:
@@ -21,6 +22,8 @@ class TransformedField:
     """Only where the field has color."""
 
     def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:
+        if isinstance(field, TransformedField):  # one transform in float64: two would lose the digits between them
+            field, T_field_frame = field.field, field.T_field_frame @ T_field_frame
         self.field = field
         self.T_field_frame = T_field_frame
         if has_color(field):
@@ -66,4 +69,17 @@ class TransformedField:
         return distance / float(self.T_field_frame.scale), gradient @ self.T_field_frame.rotation.to(gradient)
 
     def _moved(self, points: Tensor) -> Tensor:
-        return self.T_field_frame.apply(points.double()).to(torch.float32)
+        return self.T_field_frame.apply(points.double())
+
+
+def near_origin(field: SdfField) -> tuple[SdfField, Tensor]:
+    """The field with its bounds near the origin, where float32 has digits enough, and what was subtracted.
+
+    The second is (3,) float64 on the CPU, zeros where the field lies near the origin already, and is then returned
+    itself.
+    """
+    origin = local_origin(field.bounds.tolist())
+    if origin is None:
+        return field, torch.zeros(3, dtype=torch.float64)
+    shift = torch.tensor(origin, dtype=torch.float64)
+    return TransformedField(field, Sim3.from_translation(shift)), shift

@@ -13,7 +13,8 @@ from regnf_core.geometry.sim3 import Sim3
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points on a field's zero level and the unit normals there. points, normals: (N, 3) float32, field frame."""
+    """Points on a field's zero level and the unit normals there. points, normals: (N, 3), field frame; points of a
+    result are float64: a field may lie far from the origin."""
 
     points: Tensor
     normals: Tensor

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.counting import CountingField
+from regnf_core.fields.transformed import near_origin
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.points import diameter
 from regnf_core.geometry.sim3 import Sim3
@@ -50,6 +51,10 @@ def register_paper(
 
     Raises InvalidDetectionError, NoSurfaceError, InitializationError, InvalidInputError (FIELD_NOT_FINITE).
     """
+    # Rays and samples are float32: fields far from the origin are moved there, and the result back.
+    scene_field, scene_origin = near_origin(scene_field)
+    object_field, object_origin = near_origin(object_field)
+    detection = replace(detection, center=detection.center - scene_origin)
     scene, obj = CountingField(scene_field), CountingField(object_field)
     generator = torch.Generator().manual_seed(seed)
 
@@ -73,7 +78,27 @@ def register_paper(
         verification = _verify(scene, obj, detection, surfaces, refined.T_object_scene, options)
 
     evaluations = scene.evaluations + obj.evaluations
-    return _result(surfaces, T_initial, refined, verification, options, seed, evaluations)
+    found = _result(surfaces, T_initial, refined, verification, options, seed, evaluations)
+    return _moved_back(found, scene_origin, object_origin)
+
+
+def _moved_back(result: RegistrationResult, scene_origin: Tensor, object_origin: Tensor) -> RegistrationResult:
+    """The result in the frames from whose places these were subtracted."""
+    if not (bool(scene_origin.any()) or bool(object_origin.any())):
+        return result
+
+    def back(T: Sim3) -> Sim3:
+        return Sim3.from_translation(object_origin) @ T @ Sim3.from_translation(-scene_origin)
+
+    scene, obj = result.scene_samples, result.object_samples
+    return replace(
+        result,
+        T_object_scene=back(result.T_object_scene),
+        T_object_scene_initial=back(result.T_object_scene_initial),
+        scene_samples=SurfaceSamples(scene.points.double().cpu() + scene_origin, scene.normals),
+        object_samples=SurfaceSamples(obj.points.double().cpu() + object_origin, obj.normals),
+        trace=[replace(one, T_object_scene=back(one.T_object_scene)) for one in result.trace],
+    )
 
 
 def cloud_region(detection: OrientedBox, options: RegistrationOptions) -> Callable[[Tensor], Tensor]:

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
-from trimesh.exchange.gltf import export_glb
 
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.transformed import near_origin
 from regnf_core.files import atomic_path
 from regnf_core.rendering.options import RenderOptions
 from regnf_core.rendering.shading import Painter
+from regnf_core.surface.exporting import glb_of
 from regnf_core.surface.isosurface import extract_surface
 
 _AT_ONCE = 1 << 16
@@ -32,6 +32,7 @@ def write_colored_mesh(
     A vertex has its part's own color, seen from before the surface, or its tint, or one plain color: no shading.
     Raises NoSurfaceError and InvalidInputError (FIELD_NOT_FINITE, COLORS_MISSING).
     """
+    field, origin = near_origin(field)
     surface = extract_surface(field, resolution, progress)
     painter = Painter.of(field, torch.tensor([0.0, 0.0, 1.0]), options)
     points, normals = (torch.from_numpy(part).float() for part in (surface.vertices, surface.normals))
@@ -42,7 +43,6 @@ def write_colored_mesh(
     mesh = trimesh.Trimesh(
         surface.vertices, surface.faces, vertex_normals=surface.normals, vertex_colors=shown, process=False
     )
-    export: Callable[..., bytes] = partial(export_glb, include_normals=True)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(export(mesh))
+        temporary.write_bytes(glb_of(mesh, origin.numpy()))
     return len(surface.faces)

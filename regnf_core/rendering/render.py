@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 
 from regnf_core.errors import CancelledError, InvalidInputError, NoSurfaceError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.transformed import near_origin
 from regnf_core.processes import can_fork, in_processes
 from regnf_core.rendering.beams import free_start
 from regnf_core.rendering.camera import Camera
@@ -75,17 +76,19 @@ def render_frames(
     """
     chosen = options or RenderOptions()
     check_extent(len(cameras), max((camera.width * camera.height for camera in cameras), default=0))
+    field, origin = near_origin(field)  # rays are float32
+    near = [replace(camera, position=camera.position - origin) for camera in cameras]
     renderer = Renderer.of(field, chosen)
-    for camera in cameras:  # before the work, which would be lost
-        renderer.check(camera)
+    for camera, moved in zip(cameras, near, strict=True):  # before the work, which would be lost
+        renderer.check(moved, camera.position)
     if field.device.type != "cpu" or not can_fork():
         processes = 1
-    tiles = [renderer.tiles(camera, processes) for camera in cameras]
+    tiles = [renderer.tiles(camera, processes) for camera in near]
     tasks = [(number, tile) for number, of_frame in enumerate(tiles) for tile in range(len(of_frame))]
 
     def work(task: tuple[int, int]) -> list[Part]:
         number, tile = task
-        return [part.numpy() for part in renderer.tile(cameras[number], tiles[number][tile])]
+        return [part.numpy() for part in renderer.tile(near[number], tiles[number][tile])]
 
     def check() -> None:
         if cancelled is not None and cancelled():
@@ -137,14 +140,17 @@ class Renderer:
             raise NoSurfaceError("the field has no surface within its bounds", reason="NO_SURFACE_IN_SCENE")
         return cls(field, grid, painter, options)
 
-    def check(self, camera: Camera) -> None:
-        """Raises InvalidInputError (CAMERA_IN_MATTER): the camera stands within the bounds and in matter."""
+    def check(self, camera: Camera, position: Tensor) -> None:
+        """Raises InvalidInputError (CAMERA_IN_MATTER): the camera stands within the bounds and in matter.
+
+        position: where it is, as its user says it.
+        """
         low, high = self.field.bounds
         within = bool(((camera.position >= low) & (camera.position <= high)).all())
         if not within or self.options.cut_away:
             return
         if float(finite_distance(self.field, camera.position[None].float().to(self.field.device))[0]) <= 0.0:
-            place = ", ".join(f"{value:.4g}" for value in camera.position.tolist())
+            place = ", ".join(f"{value:.4g}" for value in position.tolist())
             hint = "Move it into free space, or let what is before it be cut away: option cut_away."
             raise InvalidInputError(f"the camera at ({place}) is in matter", reason="CAMERA_IN_MATTER", hint=hint)
 

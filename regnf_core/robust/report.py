@@ -43,7 +43,7 @@ def result_of(
 
 
 def _surface(samples: Samples, frame: WorkingFrame) -> SurfaceSamples:
-    return SurfaceSamples(frame.out_of(samples.on_surface()).float(), samples.normals.cpu())
+    return SurfaceSamples(frame.out_of(samples.on_surface()), samples.normals.cpu())
 
 
 def _record(problem: RegistrationProblem, iteration: int, step: Step, winner: int) -> IterationRecord:

@@ -75,7 +75,7 @@ class WorkingField:
         center = self._centers.get(points.device)
         if center is None:
             center = self._centers[points.device] = self.frame.center.to(points.device)
-        return (points.double() * self.frame.length + center).float().to(self.field.device)
+        return (points.double() * self.frame.length + center).to(self.field.device)
 
     def _finite(self, values: Tensor) -> Tensor:
         faulty = ~torch.isfinite(values).all()

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 import trimesh
 from trimesh.exchange.gltf import export_glb
-from trimesh.exchange.ply import export_ply
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.transformed import near_origin
 from regnf_core.files import atomic_path
-from regnf_core.surface.isosurface import Lattice, extract_surface
+from regnf_core.surface.isosurface import Floats, Lattice, Surface, extract_surface
 
 MESH_FORMATS = ("glb", "ply")
 _SLAB_POINTS = 1 << 18
@@ -34,15 +34,43 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     kind = path.suffix.lower().removeprefix(".")
     if kind not in MESH_FORMATS:
         raise InvalidInputError(f"no format for meshes: {path.suffix}", reason="INVALID_OPTIONS")
+    field, origin = near_origin(field)
     surface = extract_surface(field, resolution, progress)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_normals=surface.normals, process=False)
-    export: Callable[..., bytes] = partial(export_glb, include_normals=True)
-    if kind == "ply":
-        export = partial(export_ply, vertex_normal=True)
-    data = export(mesh)
+    data = glb_of(mesh, origin.numpy()) if kind == "glb" else _ply_of(surface, origin.numpy())
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
     return len(surface.faces)
+
+
+def glb_of(mesh: trimesh.Trimesh, origin: Floats) -> bytes:
+    """The mesh as .glb, ``origin`` (3,) added to its places by its node: vertices have single precision alone."""
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(origin))
+    export: Callable[..., bytes] = partial(export_glb, include_normals=True)
+    return export(scene)
+
+
+def _ply_of(surface: Surface, origin: Floats) -> bytes:
+    """The surface as .ply, in double precision where it lies far from the origin."""
+    places = "<f8" if origin.any() else "<f4"
+    names = ("x", "y", "z", "nx", "ny", "nz")
+    vertices = np.empty(len(surface.vertices), [(name, places if len(name) == 1 else "<f4") for name in names])
+    for name, values in zip(names, np.hstack([surface.vertices + origin, surface.normals]).T, strict=True):
+        vertices[name] = values
+    faces = np.empty(len(surface.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, surface.faces
+    words = {"<f8": "double", "<f4": "float"}
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property {words[places if len(name) == 1 else '<f4']} {name}" for name in names),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
 
 
 def write_grid(field: SdfField, path: Path, resolution: int = 128, progress: Progress | None = None) -> tuple[int, ...]:
@@ -60,7 +88,7 @@ def write_grid(field: SdfField, path: Path, resolution: int = 128, progress: Pro
     for start in range(0, shape[0], slab):
         rows = np.arange(start, min(start + slab, shape[0]))
         nodes = np.stack(np.meshgrid(rows, *map(np.arange, shape[1:]), indexing="ij"), axis=-1).reshape(-1, 3)
-        distance = field.signed_distance(torch.from_numpy(lattice.points_of(nodes)).float())
+        distance = field.signed_distance(torch.from_numpy(lattice.points_of(nodes)))
         values[rows] = distance.cpu().numpy().reshape(len(rows), *shape[1:])
         if progress is not None:
             progress(values[: rows[-1] + 1].size)

@@ -97,7 +97,7 @@ class _Evaluator:
         """(N,) signed distances at points (N, 3). Raises InvalidInputError (FIELD_NOT_FINITE)."""
         found = [np.zeros(0)]
         for start in range(0, len(points), _CHUNK):
-            chunk = torch.from_numpy(points[start : start + _CHUNK]).float()
+            chunk = torch.from_numpy(points[start : start + _CHUNK])
             found.append(self._field.signed_distance(chunk).double().cpu().numpy())
             self._count(len(chunk))
         values: Floats = np.concatenate(found)
@@ -107,7 +107,7 @@ class _Evaluator:
 
     def normals(self, points: Floats) -> Floats:
         """(N, 3) unit gradients at points (N, 3)."""
-        gradient = self._field.signed_distance_and_gradient(torch.from_numpy(points).float())[1].double().cpu().numpy()
+        gradient = self._field.signed_distance_and_gradient(torch.from_numpy(points))[1].double().cpu().numpy()
         self._count(len(points))
         normals: Floats = gradient / np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-12)
         return normals
@@ -115,7 +115,7 @@ class _Evaluator:
     def steepness(self, lattice: Lattice) -> float:
         """How much faster than a distance the field may change, from the gradient at random places; at least 1."""
         nodes = np.random.default_rng(0).random((_PROBES, 3)) * (lattice.counts - 1)
-        points = torch.from_numpy(lattice.points_of(nodes)).float()
+        points = torch.from_numpy(lattice.points_of(nodes))
         gradient = self._field.signed_distance_and_gradient(points)[1]
         self._count(_PROBES)
         return max(1.0, float(gradient.norm(dim=1).max()))

@@ -24,7 +24,7 @@ def sample_surroundings(
     Random points of the bounds are projected onto the surface. Those that do not arrive are dropped, and the gaps
     between the others are filled. This is far cheaper than rays from many views.
     """
-    low, high = (corner.float() for corner in scene.bounds)
+    low, high = scene.bounds
 
     def in_surroundings(points: Tensor) -> Tensor:
         within: Tensor = ((points >= low.to(points)) & (points <= high.to(points))).all(-1)

@@ -27,7 +27,7 @@ def surface_bounds(field: SdfField) -> OrientedBox:
         low[k] + (torch.arange(count, dtype=torch.float64) + 0.5) * (high[k] - low[k]) / count
         for k, count in enumerate(counts)
     ]
-    centers = torch.cartesian_prod(*axes).float().to(field.device)
+    centers = torch.cartesian_prod(*axes).to(field.device)
     near = finite_distance(field, centers).abs() <= 0.5 * 3**0.5 * cell
     if not near.any():
         raise NoSurfaceError("the object's field has no surface within its bounds", reason="NO_SURFACE_IN_OBJECT")

@@ -15,6 +15,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.surface_samples import SurfaceSamples
 from regnf_core.geometry.symmetry import Symmetries
 from regnf_core.result import Considered, RegistrationResult
+from regnf_core.schema.similarity import local_origin
 from regnf_core.viewing.document import result_document, trace_document
 from regnf_core.viewing.ply import write_ply
 from regnf_core.viewing.registration_picture import OBJECT_COLOR, SCENE_COLOR, registration_picture
@@ -79,7 +80,7 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
     if result.surroundings is not None and len(result.surroundings.points):
         _write_cloud(directory / _CONTEXT, (result.surroundings, CONTEXT_COLOR))
         names.append(_CONTEXT)
-    arrays: dict[str, Any] = {name: _float32(value) for name, value in result.residuals.items()}
+    arrays: dict[str, Any] = {name: _numbers(value) for name, value in result.residuals.items()}
     np.savez(directory / "residuals.npz", **arrays)
     registration_picture(result).save(directory / _PICTURE)
     return [*names, _PICTURE]
@@ -87,15 +88,15 @@ def write_pictures(result: RegistrationResult, directory: Path) -> list[str]:
 
 def _write_considered(path: Path, considered: Considered) -> None:
     """The held-out samples, and what they say of each pose that was judged."""
-    points = {name: _float32(getattr(considered, name)) for name in ("scene_points", "object_points")}
+    points = {name: _numbers(getattr(considered, name)) for name in ("scene_points", "object_points")}
     signs = {name: getattr(considered, name).cpu().numpy() for name in ("scene_signs", "object_signs")}
     arrays: dict[str, Any] = points | signs
     np.savez(path, **arrays)
 
 
 def _write_cloud(path: Path, *parts: tuple[SurfaceSamples, tuple[float, float, float]]) -> None:
-    points = np.concatenate([_float32(samples.points) for samples, _ in parts])
-    normals = np.concatenate([_float32(samples.normals) for samples, _ in parts])
+    points = np.concatenate([_numbers(samples.points) for samples, _ in parts])
+    normals = np.concatenate([_numbers(samples.normals) for samples, _ in parts])
     colors = np.concatenate(
         [
             np.tile((255 * np.array(color)).round().astype(np.uint8), (len(samples.points), 1))
@@ -109,6 +110,9 @@ def _write_json(path: Path, values: Any) -> None:
     path.write_text(json.dumps(values, allow_nan=False, separators=(",", ":")), encoding="utf-8")
 
 
-def _float32(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
-    array: np.ndarray[Any, np.dtype[np.float32]] = values.detach().float().cpu().numpy()
-    return array
+def _numbers(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32 | np.float64]]:
+    """In single precision, unless they are places too far from the origin for it."""
+    array = values.detach().cpu()
+    far = array.ndim == 2 and len(array) > 0 and local_origin([array.amin(0).tolist(), array.amax(0).tolist()])
+    found: np.ndarray[Any, np.dtype[np.float32 | np.float64]] = (array.double() if far else array.float()).numpy()
+    return found

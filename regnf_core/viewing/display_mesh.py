@@ -102,7 +102,7 @@ def _colors(field: SdfField, vertices: Floats, normals: Floats) -> Floats | None
     """(V, 3) in [0, 1], seen from before the surface."""
     if not has_color(field):
         return None
-    points, towards = torch.from_numpy(vertices).float(), torch.from_numpy(-normals).float()
+    points, towards = torch.from_numpy(vertices), torch.from_numpy(-normals)
     parts = zip(torch.split(points, _AT_ONCE), torch.split(towards, _AT_ONCE), strict=True)
     found = torch.cat([field.color(some, along).cpu() for some, along in parts])
     colors: Floats = found.clamp(0.0, 1.0).double().numpy()

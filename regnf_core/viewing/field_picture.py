@@ -80,7 +80,7 @@ def _section(field: SdfField, surface: Surface, pixels: int) -> Image.Image:
     places[..., across] = np.median(surface.vertices[:, across])
     within = ((places >= low) & (places <= high)).all(axis=-1)
     distance = np.zeros((pixels, pixels))
-    distance[within] = field.signed_distance(torch.from_numpy(places[within]).float()).double().cpu().numpy()
+    distance[within] = field.signed_distance(torch.from_numpy(places[within])).double().cpu().numpy()
     picture = np.broadcast_to(_BACKGROUND, (pixels, pixels, 3)).copy()
     picture[within] = _shades(
         distance[within] / float(np.linalg.norm(high - low)), pixel / float(np.linalg.norm(high - low))

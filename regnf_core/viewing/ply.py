@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-_VERTEX = np.dtype(
-    [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in ("red", "green", "blue")]
-)
+_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
-def write_ply(path: Path, points: NDArray[np.float32], normals: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-    """Write points (N, 3), unit normals (N, 3) and colors (N, 3), 0 to 255."""
-    vertices = np.empty(points.shape[0], dtype=_VERTEX)
-    for names, values in (
-        (("x", "y", "z"), points),
-        (("nx", "ny", "nz"), normals),
-        (("red", "green", "blue"), colors),
-    ):
-        for column, name in enumerate(names):
-            vertices[name] = values[:, column]
-    properties = [
-        f"property {'uchar' if _VERTEX[name].itemsize == 1 else 'float'} {name}" for name in _VERTEX.names or ()
-    ]
+def write_ply(
+    path: Path, points: NDArray[np.float32 | np.float64], normals: NDArray[Any], colors: NDArray[np.uint8]
+) -> None:
+    """Write points (N, 3) in their own precision, unit normals (N, 3) and colors (N, 3), 0 to 255."""
+    columns = {
+        **dict.fromkeys(("x", "y", "z"), "f8" if points.dtype == np.float64 else "f4"),
+        **dict.fromkeys(("nx", "ny", "nz"), "f4"),
+        **dict.fromkeys(("red", "green", "blue"), "u1"),
+    }
+    vertices = np.empty(points.shape[0], dtype=[(name, f"<{code}") for name, code in columns.items()])
+    for name, values in zip(columns, np.hstack([points.astype(np.float64), normals, colors]).T, strict=True):
+        vertices[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
         f"element vertex {vertices.size}",
-        *properties,
+        *(f"property {_TYPES[code]} {name}" for name, code in columns.items()),
         "end_header",
         "",
     ]

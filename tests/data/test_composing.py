@@ -12,7 +12,7 @@ import torch
 
 from benchmarks.make_fields import UNITS_PER_METER
 from regnf_core.errors import DatasetError
-from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_mesh
 from regnf_data.composing import RenderOptions, render_object, render_room
 from regnf_data.layouts import read_layout
 from regnf_data.posed_images import PosedImages
@@ -36,7 +36,7 @@ def points_of(images: PosedImages) -> torch.Tensor:
 
 
 def test_an_objects_depths_lie_on_it_in_the_librarys_frame(tmp_path: Path) -> None:
-    mesh = MeshField.load(write_chest(tmp_path / "chest.ply"))
+    mesh = load_mesh(write_chest(tmp_path / "chest.ply"))
     images = render_object(tmp_path / "chest.ply", RenderOptions(frames=8, **SMALL), units_per_meter=0.8)
     assert len(images) == 8
     assert images.size == (48, 64)

@@ -14,8 +14,9 @@ from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surfa
 from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.voxel_maps import filled_nodes, stored_weights
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import entries_at, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import local_origin
 
 FAMILY = "dense_sdf_grid"
 _VALUES = ("sdf", "values")
@@ -40,20 +41,37 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     if min(values.shape) < 2:
         raise tensor_error(f"{name} has shape {values.shape}, expected two nodes an axis at least", "TENSOR_SHAPE")
     weights = _weights(arrays, values.shape)
+    origin, spacing, told = _placement(arrays, np.array(values.shape))
+    why = (f"array {name}, {' x '.join(map(str, values.shape))} nodes", f"placed by {told}; the first axis is x")
+    return grid_field(values, origin, spacing, why, overrides, weights)
+
+
+def grid_field(
+    values: Float32Array,
+    origin: _Vector,
+    spacing: _Vector,
+    why: tuple[str, ...],
+    overrides: UploadDescription,
+    weights: Float32Array | None = None,
+) -> ConvertedField:
+    """The field of values (X, Y, Z) at ``origin`` (3,) + ``spacing`` (3,) * (i, j, k). weights: 0 where none was seen.
+
+    Raises FieldFormatError (BOUNDS_INVALID).
+    """
+    if not (np.isfinite(origin).all() and np.isfinite(spacing).all() and (spacing > 0.0).all()):
+        raise _invalid("the grid's spacing is not above zero along every axis, or its origin is no place")
     tensors: dict[str, StoredArray] = {"values": values}
     if weights is not None:
         tensors["weights"] = stored_weights(weights)
-    origin, spacing, told = _placement(arrays, np.array(values.shape))
-    far = origin + spacing * (np.array(values.shape) - 1)
+    box = [origin.tolist(), (origin + spacing * (np.array(values.shape) - 1)).tolist()]
+    shift = local_origin(box)
     description = {
         "kind": "voxel_grid",
-        **shared_entries(overrides, [origin.tolist(), far.tolist()]),
-        "origin": origin.tolist(),
+        **entries_at(shared_entries(overrides, box), shift),
+        "origin": (origin if shift is None else origin - np.array(shift)).tolist(),
         "spacing": spacing.tolist(),
         "source": {"family": FAMILY},
     }
-    nodes = " x ".join(map(str, values.shape))
-    why: tuple[str, ...] = (f"array {name}, {nodes} nodes", f"placed by {told}; the first axis is x")
     if weights is not None:
         tensors["values"] = bounded = np.array(values, np.float32)
         if bound_by_surface(bounded[None], weights[None] > 0, np.zeros((1, 3), np.int64), spacing):
@@ -87,8 +105,6 @@ def _placement(arrays: ArraySource, nodes: npt.NDArray[np.int64]) -> tuple[_Vect
     else:
         name = next((name for name in _SPACINGS if name in arrays), _SPACINGS[0])
         low, spacing, told = _vector(arrays, "origin", (3,)), _steps(arrays, name), f"origin and {name}"
-    if not (spacing > 0.0).all():
-        raise _invalid("the grid's spacing is not above zero along every axis")
     return low, spacing, told
 
 

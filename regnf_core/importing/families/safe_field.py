@@ -54,14 +54,22 @@ def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dic
         overrides, f"a field file of the kind {description['kind']}", sorted(_OVERRULED & description.keys())
     )
     said = overrides.non_default()
-    if description.get("placement") is not None and {"world_scale", "bounds", "frame"} & said.keys():
-        message = "a field in its dataset's frame stays there, with its bounds and its unit"
-        raise FieldFormatError(f"description: {message}", reason="INVALID_DESCRIPTION")
+    placement = description.get("placement")
     changed = description | {name: value for name, value in said.items() if name not in _OF_THE_IMPORT}
+    ratio = changed["world_scale"] / description["world_scale"]
     if overrides.bounds is None:
-        ratio = changed["world_scale"] / description["world_scale"]
-        changed["bounds"] = [[ratio * value for value in corner] for corner in description["bounds"]]
-    return changed
+        changed["bounds"] = _times(ratio, description["bounds"])
+    if placement is None:
+        return changed
+    if {"bounds", "frame"} & said.keys():
+        message = "a field that was placed, in its dataset's frame or far from the origin, stays there, with its bounds"
+        raise FieldFormatError(f"description: {message}", reason="INVALID_DESCRIPTION")
+    rows = [[*row[:3], ratio * row[3]] for row in placement["transform"][:3]] + [placement["transform"][3]]
+    return changed | {"placement": {"transform": rows, "bounds": _times(ratio, placement["bounds"])}}
+
+
+def _times(ratio: float, corners: list[list[float]]) -> list[list[float]]:
+    return [[ratio * value for value in corner] for corner in corners]
 
 
 def _array(name: str, tensor: StoredTensor, data: memoryview) -> StoredArray:

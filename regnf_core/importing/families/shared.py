@@ -7,6 +7,7 @@ from typing import Any
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import shift_rows
 
 UNIT_CUBE = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 _SHARED = frozenset(
@@ -48,6 +49,18 @@ def shared_entries(
         "up_axis": overrides.up_axis,
         "label": overrides.label,
     }
+
+
+def entries_at(entries: dict[str, Any], origin: Sequence[float] | None) -> dict[str, Any]:
+    """The shared entries of a function whose coordinates begin at ``origin``, a place in those of the file.
+
+    The field stays in the file's frame: its placement adds the origin again, in float64. None: nothing was subtracted.
+    """
+    if origin is None:
+        return entries
+    shift = [entries["world_scale"] * value for value in origin]
+    own = [[value - by for value, by in zip(corner, shift, strict=True)] for corner in entries["bounds"]]
+    return entries | {"placement": {"transform": shift_rows(shift), "bounds": own}}
 
 
 def assumed_bounds(overrides: UploadDescription) -> tuple[str, ...]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
@@ -15,14 +17,44 @@ from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.facing import SAMPLES, Asked, Facing, facing_of
 from regnf_core.importing.families.inverted_parts import PLACES, facing_outward
 from regnf_core.importing.families.orientation import agreeing
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import entries_at, refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.winding import areas
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array, malformed
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.schema.similarity import local_origin
 
 _MARGIN = 0.05
 """How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""
-_FAR = 1e4
-"""Coordinates beyond this many diagonals leave float32 too few digits."""
+_LARGEST = 1e30
+_BLUNT = 1e-6
+"""Of the diagonal: steps between single-precision numbers that are longer are said."""
+_DOUBLED = 0.5
+"""Share of the faces that are there twice, once turned: beyond this the file is a double-sided mesh."""
+_MANY_PARTS = 1000
+_STRAY = 4.0
+"""Diagonals of the rest: parts beyond so wide a gap are said."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Triangles near the origin of their own frame, faces towards free space.
+
+    vertices: (V, 3) float32 · origin: what was subtracted from the file's places in float64, None: nothing · kept: (V,)
+    the vertices' numbers in the file · facing: (F, 3) faces and the level of matter · ignored: what was dropped, with
+    counts.
+    """
+
+    vertices: npt.NDArray[np.float32]
+    origin: tuple[float, float, float] | None
+    kept: Int64Array
+    facing: Facing
+    ignored: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def places(self) -> Float64Array:
+        """(V, 3) float64, the file's frame."""
+        return self.vertices.astype(np.float64) + np.array(self.origin or (0.0, 0.0, 0.0))
 
 
 def mesh_field(
@@ -31,23 +63,20 @@ def mesh_field(
     """The exact distance to triangles. ``origin``: what they come from, for the report. Raises as ``convert_mesh``."""
     require_family(overrides, family)
     refuse_other_entries(overrides, family)
-    _check(geometry)
-    vertices, faces, kept = welded(geometry.vertices, geometry.faces)
-    require_within(mesh_seconds(vertices, faces, 3 * SAMPLES + PLACES), work_s)
     asked = "object" if overrides.sign == -1 else overrides.as_  # who turns the sign round means the turned faces
-    facing = oriented(vertices.astype(np.float64), faces, asked)
-    faces = facing.faces
-    low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+    solid = solid_of(geometry, asked, work_s)
+    faces, places = solid.facing.faces, solid.places
+    low, high = places.min(axis=0), places.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
     bounds = [(low - _MARGIN * diagonal).tolist(), (high + _MARGIN * diagonal).tolist()]
-    loose = _open_edge_share(faces, len(vertices))
+    loose = _open_edge_share(faces, len(places))
     why = (
-        f"{origin}: {len(faces)} triangles, {len(vertices)} vertices",
+        f"{origin}: {len(faces)} triangles, {len(places)} vertices",
         "watertight"
         if loose == 0.0
         else f"not watertight, {100 * loose:.2g} % of its edges are open: the winding number decides what is inside",
-        *facing.why,
-        *(f"ignored: {what}" for what in geometry.left_out),
+        *solid.facing.why,
+        *(f"ignored: {what}" for what in (*geometry.left_out, *solid.ignored)),
     )
     converted = ConvertedField(
         family,
@@ -55,17 +84,35 @@ def mesh_field(
         {
             "kind": "mesh",
             "source": {"family": family},
-            "inside_above": facing.level,
-            **shared_entries(overrides, bounds),
+            "inside_above": solid.facing.level,
+            **entries_at(shared_entries(overrides, bounds), solid.origin),
         },
-        {"vertices": vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
-        (*facing.warnings, *_warnings(max(np.abs(low).max(), np.abs(high).max()) / diagonal)),
+        {"vertices": solid.vertices, "faces": np.ascontiguousarray(faces, dtype=np.int32)},
+        solid.warnings,
     )
     colors = None if overrides.color.keep is False else geometry.colors
-    return with_values(converted, lambda: None if colors is None else colors[kept].astype(np.float16))
+    return with_values(converted, lambda: None if colors is None else colors[solid.kept].astype(np.float16))
 
 
-def oriented(vertices: Float64Array, faces: Int64Array, asked: Asked = None) -> Facing:
+def solid_of(geometry: Geometry, asked: Asked = None, work_s: float = math.inf) -> Solid:
+    """The triangles of a file, cleaned: the one way for files that are imported and for those that are fitted.
+
+    asked: what the mesh is, where that is known. Raises FieldFormatError: MESH_INVALID, IMPORT_TOO_COSTLY.
+    """
+    given, ignored = _sound_faces(geometry)
+    corners = geometry.vertices[np.unique(given)]
+    box = [corners.min(axis=0).tolist(), corners.max(axis=0).tolist()]
+    origin = local_origin(box)
+    near = geometry.vertices if origin is None else geometry.vertices - np.array(origin)
+    vertices, faces, kept, dropped = _welded(near, given)
+    require_within(mesh_seconds(vertices, faces, 3 * SAMPLES + PLACES), work_s)
+    facing = _oriented(vertices.astype(np.float64), faces, asked)
+    lost = [f"GEOMETRY_IGNORED: not read: {', '.join(geometry.not_applied)}"] if geometry.not_applied else []
+    warnings = (*facing.warnings, *lost, *_blunt(corners, box), *_scattered(vertices, facing.faces))
+    return Solid(vertices, origin, kept, facing, (*ignored, *dropped), warnings)
+
+
+def _oriented(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing:
     """The faces (F, 3) of welded triangles turned towards free space, as far as their places tell. vertices: (V, 3)."""
     faces, agreed = agreeing(vertices, faces)
     facing = facing_of(vertices, faces, asked)
@@ -73,19 +120,30 @@ def oriented(vertices: Float64Array, faces: Int64Array, asked: Asked = None) -> 
     return replace(facing, faces=faces, why=(*agreed, *facing.why, *parts))
 
 
-def _check(geometry: Geometry) -> None:
-    if not np.isfinite(geometry.vertices).all() or np.abs(geometry.vertices).max(initial=0.0) > 1e30:
-        raise malformed("the mesh has a vertex that is not a finite number")
-    if geometry.faces.min() < 0 or geometry.faces.max() >= len(geometry.vertices):
+def _sound_faces(geometry: Geometry) -> tuple[Int64Array, tuple[str, ...]]:
+    """The faces (F, 3) whose corners are places, and what was left out. Raises FieldFormatError (MESH_INVALID)."""
+    faces = geometry.faces
+    if faces.min() < 0 or faces.max() >= len(geometry.vertices):
         raise malformed("a face names a vertex that does not exist")
+    with np.errstate(invalid="ignore"):
+        sound = (np.abs(geometry.vertices) <= _LARGEST).all(axis=1)
+    if sound.all():
+        return faces, ()
+    kept = faces[sound[faces].all(axis=1)]
+    if len(kept) == 0:
+        raise malformed("no triangle of the mesh has corners that are finite numbers")
+    ignored = [f"{int((~sound).sum())} vertices that are no finite numbers"]
+    if len(kept) < len(faces):
+        ignored.append(f"{len(faces) - len(kept)} triangles with such a corner")
+    return kept, tuple(ignored)
 
 
-def welded(
+def _welded(
     vertices: Float64Array, faces: Int64Array
-) -> tuple[npt.NDArray[np.float32], Int64Array, npt.NDArray[np.int64]]:
-    """Vertices at one place are one, those of no face and triangles without area are dropped.
+) -> tuple[npt.NDArray[np.float32], Int64Array, Int64Array, tuple[str, ...]]:
+    """Vertices at one place are one; those of no face, triangles without area and repeated ones are dropped.
 
-    Also the number, in the file, of each vertex that is left.
+    Also the number, in the file, of each vertex that is left, and what was dropped.
     """
     used, faces = np.unique(faces, return_inverse=True)
     places = vertices[used].astype(np.float32) + np.float32(0.0)  # adding zero makes -0.0 plain
@@ -93,12 +151,82 @@ def welded(
     _, first, number = np.unique(rows, return_index=True, return_inverse=True)
     corners = number.reshape(-1)[faces.reshape(-1, 3)]
     a, b, c = (places[first][corners[:, i]].astype(np.float64) for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    corners = corners[area > 0.0]
+    flat = ~(np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0.0)
+    ignored = [f"{int(flat.sum())} triangles without an area"] if flat.any() else []
+    corners = corners[~flat]
     if len(corners) == 0:
         raise malformed("no triangle of the mesh has an area")
+    corners, repeated = _once(corners)
     kept, corners = np.unique(corners, return_inverse=True)
-    return places[first][kept], corners.reshape(-1, 3), used[first][kept]
+    return places[first][kept], corners.reshape(-1, 3), used[first][kept], (*ignored, *repeated)
+
+
+def _once(corners: Int64Array) -> tuple[Int64Array, tuple[str, ...]]:
+    """The triangles (F, 3) without those that are there again, and of a double-sided mesh one side, the first."""
+    turns = (np.argmin(corners, axis=1)[:, None] + np.arange(3)) % 3
+    begun = np.take_along_axis(corners, turns, axis=1)  # the least corner first: one row for a triangle, however told
+    ignored: list[str] = []
+    found = _first_of(begun)
+    if len(found) < len(corners):
+        ignored.append(f"{len(corners) - len(found)} triangles that are there twice")
+        corners, begun = corners[found], begun[found]
+    sides = _first_of(np.sort(begun, axis=1))
+    twice = len(corners) - len(sides)
+    if 2 * twice > _DOUBLED * len(corners):
+        ignored.append(f"the other side of {twice} triangles: the mesh is double-sided")
+        corners = corners[sides]
+    return corners, tuple(ignored)
+
+
+def _first_of(rows: Int64Array) -> Int64Array:
+    """The numbers, ascending, of the first of each kind of row (N, 3)."""
+    order = np.lexsort(rows.T)  # stable
+    ordered = rows[order]
+    new = np.ones(len(rows), bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    first: Int64Array = np.sort(order[new])
+    return first
+
+
+def _blunt(corners: Float64Array, box: list[list[float]]) -> tuple[str, ...]:
+    """A warning where places far from the origin have the digits of single precision alone. corners: (V, 3)."""
+    reach, diagonal = float(np.abs(corners).max()), math.dist(*box)
+    step = float(np.spacing(np.float32(reach)))
+    if step <= _BLUNT * diagonal or not (corners == corners.astype(np.float32)).all():
+        return ()
+    share = 100.0 * step / diagonal
+    text = (
+        f"its places lie {reach:.6g} from the origin in single precision, in steps of {step:.2g}, {share:.2g} % of its"
+        " diagonal: finer parts are lost; write it with double precision, or move it to the origin before writing"
+    )
+    return (f"FAR_FROM_ORIGIN: {text}",)
+
+
+def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[str, ...]:
+    """Warnings of very many parts, and of a few faces far from all others."""
+    found = []
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices), len(vertices)))
+    parts = int(connected_components(graph, directed=False)[0])
+    if parts > _MANY_PARTS:
+        text = f"it has {parts} parts that do not touch: what is inside is decided for all together, which takes long"
+        found.append(f"MANY_PARTS: {text}")
+    corners = vertices.astype(np.float64)[faces]  # (F, 3, 3)
+    area = areas(vertices.astype(np.float64), faces)
+    for axis in range(3):
+        low, high = corners[..., axis].min(axis=1), corners[..., axis].max(axis=1)
+        order = np.argsort(low)
+        gaps = low[order][1:] - np.maximum.accumulate(high[order])[:-1]
+        if not len(gaps) or not gaps.max() > 0.0:
+            continue
+        at = int(gaps.argmax()) + 1
+        stray, rest = sorted((order[:at], order[at:]), key=lambda side: float(area[side].sum()))
+        size = float(np.linalg.norm(np.ptp(corners[rest].reshape(-1, 3), axis=0)))
+        if gaps.max() > _STRAY * size:
+            text = f"{len(stray)} of its triangles lie {gaps.max():.3g} from the rest, which is {size:.3g} across"
+            found.append(f"STRAY_PARTS: {text}: remove them if they do not belong to it")
+            break
+    return tuple(found)
 
 
 def _open_edge_share(faces: Int64Array, vertices: int) -> float:
@@ -108,10 +236,3 @@ def _open_edge_share(faces: Int64Array, vertices: int) -> float:
     single = forward[count == 1]
     matched = np.isin(single // vertices + (single % vertices) * vertices, single, assume_unique=True)
     return float(1.0 - matched.sum() / len(start))
-
-
-def _warnings(reach: float) -> tuple[str, ...]:
-    if reach <= _FAR:
-        return ()
-    text = f"its coordinates reach {reach:.0f} diagonals from the origin, which costs digits: move it there"
-    return (f"FAR_FROM_ORIGIN: {text}",)

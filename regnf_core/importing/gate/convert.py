@@ -78,7 +78,8 @@ def convert_file(
     target = out_dir / FIELD_NAME
     stored = _stored(read, target, limits, beside.cameras is not None)
     drawing = _Drawing(out_dir / PICTURE_NAME if picture else None, stored.up_axis)
-    measured, more, surface = _evaluated(target, drawing, None if read.description.accept_implausible else stored.guess)
+    judged = None if read.description.accept_implausible else stored.guess
+    measured, more, surface = _evaluated(target, drawing, judged, stored.reported["kind"] == "mesh")
     if stored.sign_is_open and measured["share_inside_at_bounds"] > _ALL_ROUND:
         more.append(f"SIGN_UNCERTAIN: {_SIGN_UNCERTAIN}")
     warned = list(kept_warnings(_latest([*stored.warnings, *more])))
@@ -181,7 +182,7 @@ class _Drawing:
 
 
 def _evaluated(
-    path: Path, drawing: _Drawing, judged: _Guess | None
+    path: Path, drawing: _Drawing, judged: _Guess | None, is_mesh: bool
 ) -> tuple[dict[str, float], list[str], list[list[float]]]:
     """What ``check_plausibility`` tells of the field in the file ``path``; it is drawn if that is quick.
 
@@ -192,7 +193,7 @@ def _evaluated(
     from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
 
     field, started = open_field(path), time.process_time()
-    measured, warnings, surface = check_plausibility(field)
+    measured, warnings, surface = check_plausibility(field, is_mesh=is_mesh)
     if judged is not None:
         require_plausible(measured, judged.sign)
     if time.process_time() - started < _QUICK_S:

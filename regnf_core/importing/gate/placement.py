@@ -7,7 +7,7 @@ from dataclasses import replace
 from regnf_core.errors import FieldFormatError
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.upload_description import UploadDescription
-from regnf_core.schema.similarity import moved_box
+from regnf_core.schema.similarity import moved_box, product, shift_rows
 
 
 def placed(converted: ConvertedField, description: UploadDescription) -> ConvertedField:
@@ -34,7 +34,8 @@ def placed(converted: ConvertedField, description: UploadDescription) -> Convert
     scale = description.world_scale or 1.0
     transform = [[*row[:3], scale * row[3]] for row in rows[:3]] + [rows[3]]
     bounds = converted.description["bounds"]
-    placement = {"transform": transform, "bounds": bounds}
+    before = converted.description.get("placement") or {"transform": shift_rows((0.0, 0.0, 0.0)), "bounds": bounds}
+    placement = {"transform": product(transform, before["transform"]), "bounds": before["bounds"]}
     changed = converted.description | {"bounds": moved_box(transform, bounds), "placement": placement}
     why = f"in the dataset's frame: one unit of the network's coordinates is {unit:g} of the dataset's"
     return replace(converted, description=changed, why=(*converted.why, why))

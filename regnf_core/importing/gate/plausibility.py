@@ -10,6 +10,7 @@ from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
+from regnf_core.fields.transformed import near_origin
 from regnf_core.importing.cost.calls import ASKED_AGAIN, FACE_SHARE, FACES, NEAREST_SHARE, SAMPLES, STEPS
 from regnf_core.importing.gate.enclosure import INSIST, Box, measured_enclosure, require_sound_enclosure
 from regnf_core.surface.projection import newton_step
@@ -36,18 +37,20 @@ def without_new_code() -> Iterator[None]:
 
 @without_new_code()
 def check_plausibility(
-    field: SdfField, samples: int = SAMPLES, seed: int = 0
+    field: SdfField, samples: int = SAMPLES, seed: int = 0, is_mesh: bool = False
 ) -> tuple[dict[str, float], list[str], list[list[float]]]:
     """Measurements of the field, warnings, and the lowest and the highest corner of the surface, as points on it show.
 
     Measured: share_inside and share_inside_at_bounds (of the bounds' volume, of their faces), surface_points,
     gradient_p10, gradient_median and gradient_p90 (the gradient's norm there), and what ``measured_enclosure`` does.
 
+    is_mesh: whether it was made from faces, which is for the words of an error alone.
     ``samples`` points are drawn uniformly in the bounds; the sixteenth of least |distance| walks down to the surface
     along the gradient.
     Raises FieldFormatError: FIELD_NOT_FINITE, FIELD_NOT_A_FUNCTION when a point's distance depends on which others are
     evaluated, or NO_ZERO_LEVEL when no point of the bounds lies on a surface.
     """
+    field, _ = near_origin(field)
     lower, upper = field.bounds[0].float(), field.bounds[1].float()
     generator = torch.Generator().manual_seed(seed)
     points = lower + (upper - lower) * torch.rand(samples, 3, generator=generator)  # (N, 3)
@@ -59,7 +62,7 @@ def check_plausibility(
     inside = distance < 0
     both_sides = bool(inside.any() or (signs < 0).any()) and bool((~inside).any() or (signs > 0).any())
     if not both_sides or norms.numel() == 0:
-        raise _no_surface(distance)
+        raise _no_surface(distance, is_mesh)
     low, median, high = torch.quantile(norms, torch.tensor([0.1, 0.5, 0.9])).tolist()
     measured = {
         "share_inside": float(inside.float().mean()),
@@ -73,8 +76,14 @@ def check_plausibility(
     return measured, _warnings(measured), torch.stack([surface.amin(0), surface.amax(0)]).tolist()
 
 
-def _no_surface(distance: Tensor) -> FieldFormatError:
+def _no_surface(distance: Tensor, is_mesh: bool) -> FieldFormatError:
     low, high = float(distance.min()), float(distance.max())
+    if is_mesh:
+        message = (
+            f"the mesh encloses nothing: all {len(distance)} places asked for in its bounds are free. Is it flat, do"
+            " its faces look both ways, or is it very small beside something far off? Close it, or give it a thickness"
+        )
+        return FieldFormatError(message, reason="NO_ZERO_LEVEL")
     where = "free" if low > 0 else "inside matter" if high < 0 else "without a sound gradient"
     message = (
         f"the field has no surface within its bounds: all is {where}, with values from {low:.3g} to {high:.3g}; say the"

@@ -34,7 +34,9 @@ class Geometry:
     colors: Float64Array | None = None
     """(V, 3) in [0, 1], R, G, B, where the file has one a vertex."""
     left_out: tuple[str, ...] = ()
-    """What the file holds or names that was not read, a few words each."""
+    """What the file holds or names that was not read, a few words each: the shape is the same without."""
+    not_applied: tuple[str, ...] = ()
+    """The same of what changes the shape: it is warned of."""
 
 
 def malformed(message: str) -> FieldFormatError:

@@ -21,9 +21,9 @@ from regnf_core.importing.meshes.geometry import (
 )
 
 _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _MAX_ITEMS = 3 * MAX_TRIANGLES
-_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 class Accessors:
@@ -46,22 +46,40 @@ class Accessors:
         component = _COMPONENTS.get(accessor["componentType"])
         if component is None or _WIDTHS.get(accessor["type"]) != width:
             raise malformed("a glTF accessor of an unexpected type")
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise unsupported("the glTF file has a sparse accessor, which is not supported")
-        count, item = _whole(accessor["count"]), np.dtype(component).itemsize * width
+        count = _whole(accessor["count"])
         if count > _MAX_ITEMS:
             raise malformed(f"a glTF accessor of {count} items")
-        view = self._views[_whole(accessor["bufferView"])]
+        items = np.zeros((count, width))
+        if "bufferView" in accessor:
+            items = self._items(accessor, component, count, width)
+        if "sparse" in accessor:
+            said = accessor["sparse"]
+            changed, type_ = _whole(said["count"]), _COMPONENTS.get(said["indices"]["componentType"])
+            if type_ is None or type_[1] != "u" or changed > count:
+                raise malformed("a glTF sparse accessor of more items than there are")
+            at = self._items(said["indices"], type_, changed, 1).reshape(-1).astype(np.int64)
+            if len(at) and at.max() >= count:
+                raise malformed("a glTF sparse accessor of an item that does not exist")
+            items[at] = self._items(said["values"], component, changed, width)
+        return _scaled(items, component, bool(accessor.get("normalized", False)))
+
+    def is_stored(self, number: object) -> bool:
+        """Whether accessor ``number`` has numbers of its own."""
+        accessor = self._accessors[_whole(number)]
+        return "bufferView" in accessor or "sparse" in accessor
+
+    def _items(self, said: dict[str, Any], component: str, count: int, width: int) -> Float64Array:
+        """(count, width) numbers of a buffer view, from a byte offset on."""
+        view, item = self._views[_whole(said["bufferView"])], np.dtype(component).itemsize * width
         data = self._view(view)
-        stride = _whole(view.get("byteStride", item))
-        start = _whole(accessor.get("byteOffset", 0))
+        stride, start = _whole(view.get("byteStride", item)), _whole(said.get("byteOffset", 0))
         if stride < item or start + stride * max(count - 1, 0) + item * min(count, 1) > len(data):
             raise malformed("a glTF accessor reaches beyond its buffer view")
         items = np.ndarray((count, width), component, data, start, (stride, np.dtype(component).itemsize))
-        return _scaled(items.astype(np.float64), component, bool(accessor.get("normalized", False)))
+        return items.astype(np.float64)
 
     def _view(self, view: dict[str, Any]) -> memoryview:
-        if any(name in view.get("extensions", {}) for name in _COMPRESSED):
+        if any(name in view.get("extensions", {}) for name in COMPRESSED):
             raise unsupported("the glTF file's buffers are compressed: export it without mesh compression")
         data = self._buffer(_whole(view["buffer"]))
         start, size = _whole(view.get("byteOffset", 0)), _whole(view["byteLength"])

@@ -119,7 +119,7 @@ class _FieldsOfPoses:
     def value_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         poses = len(self._lengths)
         places = points.reshape(poses, -1, 3).double() * self._lengths + self._centers
-        own = torch.split(places.float(), [count for _, count in self._runs])
+        own = torch.split(places, [count for _, count in self._runs])
         block = -(-len(points) // _BLOCKS)
         found = [in_blocks(field, some.reshape(-1, 3), block) for (field, _), some in zip(self._runs, own, strict=True)]
         value = torch.cat([one for one, _ in found]).reshape(poses, -1)

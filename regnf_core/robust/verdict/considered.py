@@ -42,8 +42,8 @@ def considered_poses(
     scene, obj = problem.held_out.scene_samples, problem.held_out.object_samples
     return Considered(
         poses,
-        problem.view.frame.out_of(scene.points).float(),
-        problem.model.frame.out_of(obj.points).float(),
+        problem.view.frame.out_of(scene.points),
+        problem.model.frame.out_of(obj.points),
         evidence.scene_signs[chosen],
         evidence.object_signs[chosen],
     )

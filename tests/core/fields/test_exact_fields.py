@@ -14,6 +14,7 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import BoxField, SurfaceSource, UnionField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.importing.mesh_file import load_mesh
 
 BOX = BoxField((-0.3, -0.2, -0.1), (0.3, 0.2, 0.5))
 
@@ -77,7 +78,7 @@ def test_mesh_loads_a_scene_graph(tmp_path: Path) -> None:
         pose[0, 3] = x
         scene.add_geometry(trimesh.creation.box((0.2, 0.2, 0.2)), transform=pose)
     (tmp_path / "pair.glb").write_bytes(trimesh.exchange.gltf.export_glb(scene))  # type: ignore[no-untyped-call]
-    field = MeshField.load(tmp_path / "pair.glb")
+    field = load_mesh(tmp_path / "pair.glb")
     torch.testing.assert_close(field.bounds, torch.tensor([[-1.1, -0.1, -0.1], [1.1, 0.1, 0.1]], dtype=torch.float64))
     points = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.3]])
     torch.testing.assert_close(field.signed_distance(points), torch.tensor([-0.1, 0.9, 0.2]))
@@ -108,14 +109,14 @@ def test_what_is_no_mesh_is_refused(vertices: object, faces: object) -> None:
     assert caught.value.reason == "MESH_INVALID"
 
 
-@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.txt"])
+@pytest.mark.parametrize("name", ["words.glb", "words.obj", "words.ply", "words.stl"])
 def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("no mesh at all")
     with pytest.raises(FieldFormatError) as caught:
-        MeshField.load(tmp_path / name)
+        load_mesh(tmp_path / name)
     assert caught.value.reason == "MESH_INVALID"
     with pytest.raises(FileNotFoundError):
-        MeshField.load(tmp_path / "absent.glb")
+        load_mesh(tmp_path / "absent.glb")
 
 
 @pytest.mark.parametrize(
@@ -129,13 +130,13 @@ def test_files_that_hold_no_mesh_are_refused(name: str, tmp_path: Path) -> None:
 def test_malformed_meshes_are_refused(name: str, content: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(content)
     with pytest.raises(FieldFormatError) as caught:
-        MeshField.load(tmp_path / name)
+        load_mesh(tmp_path / name)
     assert caught.value.reason == "MESH_INVALID"
 
 
 def test_a_folder_is_no_mesh_file(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
-        MeshField.load(tmp_path)
+        load_mesh(tmp_path)
 
 
 def test_surface_samples_lie_on_the_surface() -> None:

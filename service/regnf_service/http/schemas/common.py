@@ -10,7 +10,7 @@ from regnf_core.labels import LABEL_PATTERN
 from regnf_state.problems import whole_problem
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
-Coordinate = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Moment = Annotated[str, WithJsonSchema({"type": "string", "format": "date-time"})]
 """A time as ``rfc3339`` writes it."""
 Address = Annotated[str, WithJsonSchema({"type": "string", "format": "uri-reference"})]

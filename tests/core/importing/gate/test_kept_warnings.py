@@ -14,7 +14,8 @@ from regnf_core.field_notes import kept_warnings
 from regnf_core.field_source import find_source
 from regnf_core.fields.build import open_field as open_safe_field
 from regnf_core.importing.gate.gate import FIELD_NAME, import_field
-from regnf_core.loading import FieldWarning, open_field, safe_field
+from regnf_core.in_memory import FieldWarning
+from regnf_core.loading import open_field, safe_field
 from regnf_core.schema.safe_format import add_to_source, read_description, write_safe_field
 from tests.core.importing.gate.test_candidates import reading
 

@@ -57,7 +57,8 @@ def test_every_format_gives_the_mesh_that_trimesh_wrote(data: bytes) -> None:
 @pytest.mark.parametrize("name", ["outdoor_folding_chair", "vintage_electric_kettle", "ycb_004_sugar_box"])
 def test_real_glb_files_agree_with_trimesh(name: str) -> None:
     path = dev_data("furniture", f"{name}.glb")
-    assert_same_distance(converted(path.read_bytes()), MeshField.load(path))
+    mesh = trimesh.load_scene(path, process=False).to_mesh()
+    assert_same_distance(converted(path.read_bytes()), MeshField(mesh.vertices, mesh.faces))
 
 
 def test_a_scene_graph_is_merged_at_its_poses() -> None:
