@@ -60,7 +60,9 @@ class JobQueue(Protocol):
     Callers take turns by the time that their work has cost the workers.
     """
 
-    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS) -> None: ...
+    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
+        """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
+        ...
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
         """Its owner is named in the field's reference."""

@@ -119,6 +119,11 @@ class JobRecord:
         """The caller whose job it is: the owner of the scene."""
         return owner_of(self.request["scene"]) if "scene" in self.request else ANONYMOUS
 
+    @property
+    def is_of_batch(self) -> bool:
+        """Whether a batch has started it."""
+        return "batch" in self.inputs
+
 
 ORIGINAL_UNTIL = "original_until"
 """In a rejected field's error or a ready field's report: until when the upload itself is kept."""

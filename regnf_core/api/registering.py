@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import regnf_core.batch as engine_batch
 import regnf_core.registration as engine
@@ -15,14 +13,14 @@ from regnf_core.api.fields import FieldLike, Opened, notes_of, opened, opened_se
 from regnf_core.api.registered import Registered
 from regnf_core.batch import ModeledObject
 from regnf_core.detections.objects import BoxLike, detection_of
-from regnf_core.errors import InvalidDetectionError, InvalidInputError, RegnfError
+from regnf_core.errors import InvalidDetectionError, RegnfError
 from regnf_core.field_files import require_file
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.json_faults import json_fault
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 from regnf_core.result import ProgressCallback
 from regnf_core.robust.pipeline import WarmStart
+from regnf_core.texts import json_value
 
 
 @dataclass(frozen=True)
@@ -89,22 +87,9 @@ def register_batch(
 def box_of(detection: BoxLike) -> OrientedBox:
     """The box that is meant. Raises InvalidDetectionError, and InvalidInputError (FILE_NOT_FOUND, MALFORMED_JSON)."""
     if isinstance(detection, str | os.PathLike):
-        return OrientedBox.from_dict(_json_of(Path(detection)))
+        require_file(Path(detection))
+        return OrientedBox.from_dict(json_value(Path(detection).read_bytes(), f"detection {detection}: "))
     return detection if isinstance(detection, OrientedBox) else OrientedBox.from_detection(detection_of(detection))
-
-
-def _json_of(path: Path) -> Any:
-    """What a detection's file says, in any of Unicode's encodings."""
-    require_file(path)
-    data = path.read_bytes()
-    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        return json.loads(data.decode(encoding))
-    except json.JSONDecodeError as error:
-        message, hint = json_fault(error)
-    except (UnicodeDecodeError, RecursionError):
-        message, hint = "no JSON", "Is it a field or a picture? A detection is expected here."
-    raise InvalidInputError(f"detection {path}: {message}", reason="MALFORMED_JSON", hint=hint)
 
 
 def _several(detections: Sequence[BoxLike]) -> Sequence[BoxLike]:

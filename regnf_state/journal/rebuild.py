@@ -56,7 +56,7 @@ class Rebuilder:
         found = [job for job in jobs if isinstance(job, JobRecord)]
         for job in sorted(found, key=lambda one: (one.updated, one.id)):
             if job.status == "accepted":
-                self._queue.enqueue_registration(job.id, job.attempt, job.owner)
+                self._queue.enqueue_registration(job.id, job.attempt, job.owner, job.is_of_batch)
         return Rebuilt(
             tuple(job.id for job in found), tuple(field.sha256 for field in fields), dropped=len(jobs) - len(found)
         )

@@ -90,10 +90,12 @@ class FairQueue:
         if held:
             self._redis.delete(*held)
 
-    def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any]) -> bool:
-        """Put work at the end of its owner's line; False when it waits or runs already."""
+    def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any], of_batch: bool = False) -> bool:
+        """Put work at the end of its owner's line, or before the jobs of batches there; False when it waits or runs
+        already."""
         fields = [part for pair in payload.items() for part in pair]
-        return bool(self._step("enqueue", work.name, owner, work.kind, self._weights.get(owner, 1.0), *fields))
+        given = owner, work.kind, self._weights.get(owner, 1.0), int(of_batch)
+        return bool(self._step("enqueue", work.name, *given, *fields))
 
     def turn(self) -> None:
         """See to it that the next in turn lies where workers take from."""

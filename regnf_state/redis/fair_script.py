@@ -1,6 +1,7 @@
 """The script of the fair queue, in Lua: one step of it is one call, and Redis runs each call whole or not at all.
 
-A caller's waiting work is a line, first come first served. The callers with a line are sorted by their tags: a tag is
+A caller's waiting work is a line, first come first served; but jobs of batches stand behind all that was posted by
+itself, and its imports. The callers with a line are sorted by their tags: a tag is
 the time, in worker seconds by weight, up to which the caller has been served. The first of the line with the least tag
 lies in RQ's list, where the workers block; nothing else of ours does. Every call begins with ``settle``: what lay in
 RQ's list and does not any more was taken by a worker, and its caller's tag rises by the estimate; what still lies there
@@ -15,7 +16,7 @@ Keys, below the prefix:  line:{owner}   list of names        owners        sorte
                          parked:{ref}   list of names        parkings      set: fields that something waits for
                          spent:{owner}  hash: worker seconds by minute     clock   hash: now; ready, owner
                          taken          set: names that workers have       asked   sorted set: callers, by last request
-An entry: owner, kind, since; once taken: cost, taken; while it waits for a field: parked.
+An entry: owner, kind, since, batch (of one); once taken: cost, taken; while it waits for a field: parked.
 """
 
 from regnf_state.redis.mended_script import MENDED
@@ -78,10 +79,23 @@ end
 
 -- a caller who had no line gains the credit at most for the time without: its first work goes before that of those
 -- who have been served all the while, and not more than that
-local function join(owner, id, push)
+local function join(owner, id, push, before)
   local idle = redis.call('EXISTS', line_of(owner)) == 0
-  redis.call(push, line_of(owner), id)
+  if before then
+    redis.call('LINSERT', line_of(owner), 'BEFORE', before, id)
+  else
+    redis.call(push, line_of(owner), id)
+  end
   set_tag(owner, idle and math.max(clock() - CREDIT, tag_of(owner)) or tag_of(owner))
+end
+
+-- the first job of a batch in the line: all before it was posted by itself, and is seldom much
+local function first_of_batch(owner)
+  for start = 0, redis.call('LLEN', line_of(owner)) - 1, 64 do
+    for _, id in ipairs(redis.call('LRANGE', line_of(owner), start, start + 63)) do
+      if redis.call('HEXISTS', entry_of(id), 'batch') == 1 then return id end
+    end
+  end
 end
 
 local function settle()
@@ -202,7 +216,7 @@ end
 local steps = {}
 
 -- what has been waiting already stays where it is; a leftover of a worker's death is replaced
-function steps.enqueue(owner, kind, weight, ...)
+function steps.enqueue(owner, kind, weight, batch, ...)
   if waits(name) or runs(name) then return 0 end
   remove(name)
   redis.call('DEL', 'rq:job:' .. name)
@@ -210,7 +224,8 @@ function steps.enqueue(owner, kind, weight, ...)
   redis.call('HSET', entry_of(name), 'owner', owner, 'kind', kind, 'since', text(now))
   redis.call('HSET', P .. 'weights', owner, weight)
   note_asked(owner)
-  join(owner, name, 'RPUSH')
+  if batch == '1' then redis.call('HSET', entry_of(name), 'batch', 1) end
+  join(owner, name, 'RPUSH', batch ~= '1' and first_of_batch(owner))
   return 1
 end
 

@@ -32,14 +32,14 @@ class RqJobQueue:
         self._key = key
         self.fair = FairQueue(redis, weights, reserve_s)
 
-    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS) -> None:
-        self._enqueue(Work("registration", job_id, attempt), owner)
+    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
+        self._enqueue(Work("registration", job_id, attempt), owner, of_batch)
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
         self._enqueue(Work("import", sha256, attempt), owner_of(sha256))
 
-    def _enqueue(self, work: Work, owner: str) -> None:
-        self.fair.enqueue(work, owner, payload.written(work, self._redis, self._key))
+    def _enqueue(self, work: Work, owner: str, of_batch: bool = False) -> None:
+        self.fair.enqueue(work, owner, payload.written(work, self._redis, self._key), of_batch)
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
         return self.fair.holds(Work("registration", job_id, attempt).name)

@@ -255,3 +255,18 @@ def test_nothing_is_lost_or_doubled_whatever_happens_in_whatever_order(any_redis
     left = [shop.take() for _ in range(len(waiting) + 1)]
     assert set(left) == waiting | {None}
     assert shop.fair.lines() == []
+
+
+def test_what_is_posted_by_itself_goes_before_batches(any_redis: Redis) -> None:
+    fair, shop = FairQueue(any_redis), Shop(any_redis)
+    for number in range(100):
+        assert fair.enqueue(job_of("a", number), "a", {"owner": "a"}, of_batch=True)
+    first = shop.take()
+    for number in (200, 201):
+        shop.enqueue(job_of("a", number), "a")
+    shop.enqueue(import_of("a", 1), "a")
+    assert fair.enqueue(job_of("a", 300), "a", {"owner": "a"}, of_batch=True)
+    assert fair.position(job_of("a", 201)) == 2
+    order = [first, *(shop.take() for _ in range(103))]
+    itself = [job_of("a", 200).name, job_of("a", 201).name, import_of("a", 1).name]
+    assert order == ["a-0-1", *itself, *(f"a-{number}-1" for number in [*range(1, 100), 300])]

@@ -136,7 +136,7 @@ def _give_back(context: Context, job_id: str, attempt: int) -> None:
         again = retry_until_available(
             f"the record of job {job_id}", lambda: context.records.requeue_job(job_id, attempt, lost=False)
         )
-        context.queue.enqueue_registration(job_id, again.attempt, again.owner)
+        context.queue.enqueue_registration(job_id, again.attempt, again.owner, again.is_of_batch)
         logger.info("job %s attempt %d given back: its fields are still being imported", job_id, attempt)
 
 

@@ -101,7 +101,7 @@ def _settle(context: Context, record: JobRecord, end: ChildExit) -> None:
         changes = {"status": "dismissed"}
     elif end.given_back or (end.worth_another_try and record.requeues == 0):
         again = context.records.requeue_job(job_id, attempt, lost=not end.given_back)
-        context.queue.enqueue_registration(job_id, again.attempt, again.owner)
+        context.queue.enqueue_registration(job_id, again.attempt, again.owner, again.is_of_batch)
         logger.warning("job %s attempt %d is to be run again", job_id, attempt)
         return
     else:

@@ -129,7 +129,7 @@ def start(services: Services, caller: str, asked: JobRequest, job_id: str, batch
     )
     if record.status == "accepted":
         # also for a job known before: mends one that was recorded but never queued
-        services.queue.enqueue_registration(record.id, record.attempt, record.owner)
+        services.queue.enqueue_registration(record.id, record.attempt, record.owner, record.is_of_batch)
     return record
 
 

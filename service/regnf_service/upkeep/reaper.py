@@ -135,7 +135,7 @@ class Reaper:
         if job.status == "accepted":
             if self._queue.holds_registration(job.id, job.attempt) or not self._is_unheld(job.id, job.attempt):
                 return None
-            self._queue.enqueue_registration(job.id, job.attempt, job.owner)
+            self._queue.enqueue_registration(job.id, job.attempt, job.owner, job.is_of_batch)
             return "enqueued"
         if not self._is_lost(job, now):
             return None
@@ -144,7 +144,7 @@ class Reaper:
             return "dismissed"
         if job.requeues == 0:
             again = self._records.requeue_job(job.id, job.attempt)
-            self._queue.enqueue_registration(again.id, again.attempt, again.owner)
+            self._queue.enqueue_registration(again.id, again.attempt, again.owner, again.is_of_batch)
             return "requeued"
         self._records.update_job(job.id, job.attempt, status="failed", error=problem_document("WORKER_LOST"))
         return "failed"

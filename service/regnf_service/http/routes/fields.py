@@ -12,12 +12,12 @@ from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import redescribe
-from regnf_service.fields.views import view_answer
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.description_change import described_anew
 from regnf_service.http.digests import is_sha256
 from regnf_service.http.etags import IfNoneMatchDep, field_etag
+from regnf_service.http.field_answers import view_answer
 from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.parsing import read_body
