@@ -29,7 +29,7 @@ def test_a_rejected_pose_is_shown_with_what_speaks_against_it(visit: Visit) -> N
     red = red_share(page)
     poses.nth(1).locator("input").check()
     expect(page.locator("#considered-facts")).to_contain_text("40.0 %")
-    expect(page.locator("#transform-note")).to_have_text("A pose that was judged")
+    expect(page.locator("#transform-note")).to_have_text("A candidate pose")
     expect(page.locator("#considered-key")).to_be_visible()
     assert page.locator("#matrix").inner_text() != before
     assert red_share(page) > red + 0.002

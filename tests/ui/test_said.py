@@ -253,8 +253,10 @@ def test_a_comparison_opens_at_its_top_in_the_words_of_a_jobs_page(
     page.get_by_label("Seed").fill("7")
     page.click("#again-start")
     page.wait_for_url("**/view")
+    expect(page.locator("#verdict-word")).to_have_text("Registered")
     page.set_viewport_size({"width": 600, "height": 320})
     page.goto(f"{service}/jobs")
+    expect(page.get_by_role("checkbox", name=re.compile("^Compare"))).to_have_count(2)
     for mark in page.get_by_role("checkbox", name=re.compile("^Compare")).all():
         mark.check()
     page.click("#compare")
