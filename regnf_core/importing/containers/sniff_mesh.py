@@ -8,19 +8,27 @@ import struct
 
 MESH_FORMATS = ("dae", "glb", "gltf", "obj", "off", "pcd", "ply", "stl", "xyz")
 
-_HEAD = 512
+HEAD_BYTES = 4096
+"""How many first bytes are enough to name every format: licences and names may come first."""
+_MARK = b"\xef\xbb\xbf"
+"""Of UTF-8, as Windows writes it before a text."""
 _BLANK = b"\xef\xbb\xbf \t\r\n"
 _OFF = re.compile(rb"(ST)?C?N?4?n?OFF(?![A-Za-z])")
 _GLTF_WORDS = (b'"asset"', b'"accessors"', b'"bufferViews"')
 _STL_FACETS_AT, _STL_FACET_BYTES = 84, 50
 _MAX_STL_FACETS = 1 << 26
 _OBJ_NUMBERS = {b"v": 3, b"vn": 3, b"vt": 1}
-_OBJ_WORDS = (b"o", b"g", b"mtllib", b"usemtl", b"s")
+_OBJ_WORDS = frozenset(
+    b"o g s mtllib usemtl usemap maplib mg vp cstype deg bmat step curv curv2 surf parm lod bevel c_interp d_interp"
+    b" shadow_obj trace_obj".split()
+)
+"""Statements that may stand before the first vertex, with or without a name behind them."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
 
 
 def sniff_mesh(head: bytes) -> str | None:
-    """One of MESH_FORMATS, or None. ``head``: the file's first 512 bytes, or all of it."""
+    """One of MESH_FORMATS, or None. ``head``: the file's first HEAD_BYTES, or all of it."""
+    head = head.removeprefix(_MARK)
     if head.startswith((b"ply\n", b"ply\r")):
         return "ply"
     if head.startswith(b"glTF"):
@@ -33,7 +41,7 @@ def sniff_mesh(head: bytes) -> str | None:
         return "gltf"
     if _is_pcd(head):
         return "pcd"
-    if head.startswith(b"solid") and b"facet" in head:
+    if _is_stl_text(head):
         return "stl"
     if _is_obj(head):
         return "obj"
@@ -54,7 +62,7 @@ def _is_xyz(head: bytes) -> bool:
     if _CONTROL & set(head):
         return False
     lines = head.splitlines()
-    if len(head) >= _HEAD and not head.endswith(b"\n"):
+    if len(head) >= HEAD_BYTES and not head.endswith(b"\n"):
         lines = lines[:-1]
     said = [line.replace(b",", b" ").replace(b";", b" ").split() for line in lines]
     said = [words for words in said if words and not words[0].startswith((b"#", b"//"))]
@@ -63,18 +71,28 @@ def _is_xyz(head: bytes) -> bool:
     return bool(said) and len(said[0]) >= 3 and all(len(w) == len(said[0]) and all(map(_is_number, w)) for w in said)
 
 
+def _is_stl_text(head: bytes) -> bool:
+    """A solid, whatever it is called, and then its facets, or its end."""
+    text = head.lstrip().lower()
+    if not text.startswith(b"solid") or _CONTROL & set(head):
+        return False
+    return b"facet" in text or b"endsolid" in text or (len(head) >= HEAD_BYTES and b"\n" not in text.strip())
+
+
 def _is_obj(head: bytes) -> bool:
-    """Text whose first line that is not a comment says what a line of an OBJ file may say."""
+    """Text whose lines, up to the first vertex, say what a line of an OBJ file may say."""
     if _CONTROL & set(head):
         return False
     lines = [line.split() for line in head.splitlines() if line.strip()]
     said = [words for words in lines if not words[0].startswith(b"#")]
     if not said:
         return b"obj" in head.lower() and head.startswith(b"#")
-    first, *rest = said[0]
-    if first in _OBJ_NUMBERS:
-        return len(rest) >= _OBJ_NUMBERS[first] and all(map(_is_number, rest))
-    return first in _OBJ_WORDS and len(rest) >= 1
+    for first, *rest in said:
+        if first in _OBJ_NUMBERS:
+            return len(rest) >= _OBJ_NUMBERS[first] and all(map(_is_number, rest))
+        if first not in _OBJ_WORDS:
+            return False
+    return True
 
 
 def _is_number(word: bytes) -> bool:

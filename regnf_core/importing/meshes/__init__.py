@@ -36,6 +36,8 @@ def read_mesh(format_: str, data: memoryview, siblings: Siblings | None = None) 
 
     Raises FieldFormatError: MESH_INVALID, MESH_TOO_LARGE, MESH_EXTERNAL_REFERENCE, FORMAT_NOT_SUPPORTED.
     """
+    if bytes(data[:3]) == b"\xef\xbb\xbf":  # a mark that Windows writes before a text
+        data = data[3:]
     if format_ in _IN_PARTS:
         return _IN_PARTS[format_](data, siblings or {})
     return _WHOLE[format_](data)

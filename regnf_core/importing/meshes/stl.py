@@ -16,9 +16,10 @@ def read_stl(data: memoryview) -> Geometry:
     if len(data) >= _FACETS_AT and len(data) == _FACETS_AT + _FACET_BYTES * count:
         require_room(3 * count, count)
         return _loose(np.frombuffer(data[_FACETS_AT:], dtype=_FACET)["corners"].reshape(-1, 3).astype(np.float64))
-    if bytes(data[:5]) != b"solid":
+    text = bytes(data).lstrip()
+    if text[:5].lower() != b"solid":
         raise malformed(f"an STL file of {count} facets has another length")
-    return _loose(_corners_of_text(bytes(data)))
+    return _loose(_corners_of_text(text.partition(b"\n")[2] if b"\n" in text else text))
 
 
 def _corners_of_text(text: bytes) -> Float64Array:

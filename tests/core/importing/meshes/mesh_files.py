@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from regnf_core.importing.containers.sniff import sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import MESH_READERS
@@ -24,7 +24,7 @@ PLY_TRIANGLE = (
 
 
 def converted(data: bytes, **said: Any) -> ConvertedField:
-    format_ = sniff_format(data[:512])
+    format_ = sniff_format(data[:HEAD_BYTES])
     assert format_ in MESH_READERS
     return convert_mesh(format_, memoryview(data), UploadDescription.from_dict(said))
 

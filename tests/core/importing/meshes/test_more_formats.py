@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from regnf_core.importing.containers.sniff import sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import read_mesh
@@ -55,7 +55,7 @@ AROUND = directions(400)
 
 def volume(data: bytes, **options: Any) -> tuple[float, np.ndarray[Any, Any]]:
     """Of the mesh in a file: its volume and its center."""
-    format_ = sniff_format(data[:512])
+    format_ = sniff_format(data[:HEAD_BYTES])
     found = read_mesh(str(format_), memoryview(data), **options)
     mesh = trimesh.Trimesh(found.vertices, found.faces, process=True)
     assert mesh.is_watertight
@@ -114,7 +114,7 @@ def test_strips_are_turned_one_by_one(binary: bool) -> None:
 
 def test_gltf_in_parts_needs_its_parts() -> None:
     document, parts = glb_parts()
-    assert sniff_format(document[:512]) == "gltf"
+    assert sniff_format(document[:HEAD_BYTES]) == "gltf"
     assert volume(document, siblings=parts)[0] == pytest.approx(BALL.volume, rel=1e-5)
     assert_refused(lambda: converted(document), "MESH_EXTERNAL_REFERENCE")
     whole = json.loads(document)
@@ -223,7 +223,7 @@ def points_text(normals: bool, count: bool = False, separator: str = " ") -> byt
     ids=["ascii", "binary", "compressed", "xyz", "pts", "commas"],
 )
 def test_clouds_give_the_points_and_normals_they_were_written_from(data: bytes) -> None:
-    format_ = sniff_format(data[:512])
+    format_ = sniff_format(data[:HEAD_BYTES])
     assert format_ in ("pcd", "xyz")
     found = read_mesh(format_, memoryview(data))
     np.testing.assert_allclose(found.vertices, 0.5 * AROUND, atol=1e-6)
