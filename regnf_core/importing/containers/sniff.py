@@ -18,6 +18,7 @@ _ONNX_VERSIONS, _ONNX_NEXT = (
     tuple(bytes([n]) for n in range(3, 32)),
     (b"\x12", b"\x1a", b"\x22", b"\x28", b"\x32", b"\x3a", b"\x42"),
 )
+_PACKAGES = ((b"[Content_Types].xml", "a 3MF model, or an office document"), (b"3D/", "a 3MF model"))
 _KERAS_MEMBERS = (b"metadata.json", b"config.json", b"model.weights.h5")
 _LEGACY_MAGIC = b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19."
 RUN_ARCHIVES = frozenset({"zip", "tar", "gzip", "bzip2", "xz"})
@@ -40,6 +41,18 @@ _OTHER_FILES = (
     (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
 )
 """Files that people give by mistake: their first bytes, and what they are."""
+_SHAPE_WITHIN = 512
+_SHAPES = (
+    *((b"LASF", "a LAS or LAZ cloud of points"), (b"ASTM-E57", "an E57 cloud of points")),
+    *((b"PXR-USDC", "a USD scene"), (b"#usda", "a USD scene"), (b"Kaydara FBX", "an FBX scene")),
+    *((b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file"), (b"3D Geometry File Format", "a Rhino file")),
+    *((b"ISO-10303-21", "a STEP model of CAD"), (b"SECTION\n  2\nHEADER", "a DXF drawing")),
+    *((b"# vtk DataFile", "a VTK file"), (b"<VTKFile", "a VTK file"), (b"#VRML", "a VRML scene")),
+    *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model"), (b"<robot", "a URDF robot, which names its meshes")),
+    *((b"<sdf ", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
+    *((b"# Octomap", "an OctoMap"), (b"#binvox", "a binvox grid"), (b"NRRD000", "an NRRD volume")),
+)
+"""Shapes in formats that are not read: what stands near their beginning, and what they are."""
 
 
 def sniff_format(head: bytes) -> str | None:
@@ -55,7 +68,9 @@ def sniff_format(head: bytes) -> str | None:
         return "torch-legacy"
     if head.startswith(_ZIP_LOCAL_HEADER):
         first = _first_name(head)
-        return "npz" if first.endswith(b".npy") else None if first in _KERAS_MEMBERS else "zip"
+        if first.endswith(b".npy"):
+            return "npz"
+        return None if first in _KERAS_MEMBERS or _package(first) else "zip"
     if head[_TAR_MAGIC_AT:].startswith(_TAR_MAGIC):
         return None if head.startswith(_OLD_TORCH_TAR) else "tar"
     for magic, packing in _PACKED:
@@ -80,6 +95,14 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
         return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
+    for magic, what in _SHAPES:
+        if magic.lower() in head[:_SHAPE_WITHIN].lower():
+            return "FORMAT_NOT_SUPPORTED", f"{what}; export it as .glb, .ply, .obj or .stl"
+    if head.startswith(_ZIP_LOCAL_HEADER) and (package := _package(_first_name(head))):
+        return "FORMAT_NOT_SUPPORTED", f"{package}; export it as .glb, .ply, .obj or .stl"
+    if head.startswith(b"\x93NUMPY"):
+        message = "a single numpy array; a grid needs its place: numpy.savez(file, sdf=array, origin=..., spacing=...)"
+        return "FORMAT_NOT_SUPPORTED", message
     if head[4:8] == b"TFL3":
         return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
     for magic, what in _OTHER_FILES:
@@ -94,6 +117,13 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
 def _may_be_onnx(head: bytes) -> bool:
     """A protocol buffer whose first field is the version of ONNX's format, and whose second is one of a model's."""
     return head[:1] == b"\x08" and head[1:2] in _ONNX_VERSIONS and head[2:3] in _ONNX_NEXT
+
+
+def _package(first: bytes) -> str | None:
+    """What a zip with this first member is that is no run: a model of one file."""
+    if first.lower().endswith((b".usd", b".usda", b".usdc")):
+        return "a USDZ scene"
+    return next((what for name, what in _PACKAGES if first.startswith(name)), None)
 
 
 def _first_name(head: bytes) -> bytes:

@@ -54,7 +54,8 @@ class Solid:
     @property
     def places(self) -> Float64Array:
         """(V, 3) float64, the file's frame."""
-        return self.vertices.astype(np.float64) + np.array(self.origin or (0.0, 0.0, 0.0))
+        places: Float64Array = self.vertices.astype(np.float64) + np.array(self.origin or (0.0, 0.0, 0.0))
+        return places
 
 
 def mesh_field(
@@ -126,7 +127,7 @@ def _sound_faces(geometry: Geometry) -> tuple[Int64Array, tuple[str, ...]]:
     if faces.min() < 0 or faces.max() >= len(geometry.vertices):
         raise malformed("a face names a vertex that does not exist")
     with np.errstate(invalid="ignore"):
-        sound = (np.abs(geometry.vertices) <= _LARGEST).all(axis=1)
+        sound = np.asarray((np.abs(geometry.vertices) <= _LARGEST).all(axis=1))
     if sound.all():
         return faces, ()
     kept = faces[sound[faces].all(axis=1)]

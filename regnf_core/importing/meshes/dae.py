@@ -1,4 +1,4 @@
-"""COLLADA (.dae): the polygons of the scene's geometries at their nodes' poses. Materials and skins are ignored."""
+"""COLLADA (.dae): the polygons of the scene's geometries at their nodes' poses, skins at their bind shape."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from regnf_core.importing.meshes.number_text import numbers_of
 from regnf_core.importing.meshes.xml_tree import Element, read_xml
 
 _FACES = ("triangles", "polylist", "polygons", "trifans", "tristrips")
-_IGNORED = {"library_controllers": "skins", "library_animations": "animations", "library_images": "textures"}
+_IGNORED = {"library_animations": "animations", "library_images": "textures"}
 _USUAL_UNIT = 1.0
 
 
@@ -46,14 +46,16 @@ def read_dae(data: memoryview) -> Geometry:
         faces.append((corners[:, ::-1] if turned else corners) + so_far)
         so_far, triangles = so_far + len(places), triangles + len(corners)
         require_room(so_far, triangles)
-    return Geometry(np.concatenate(vertices), np.concatenate(faces), left_out=_left_out(collada))
+    return Geometry(
+        np.concatenate(vertices), np.concatenate(faces), left_out=_left_out(collada), not_applied=_not_applied(collada)
+    )
 
 
 def _mesh(geometry: Element) -> tuple[Float64Array, Int64Array]:
-    """Places (V, 3) and triangles (F, 3) of one geometry."""
+    """Places (V, 3) and triangles (F, 3) of one geometry; none of one that is no mesh, for instance a spline."""
     mesh = geometry.first("mesh")
     if mesh is None:
-        raise malformed("a COLLADA geometry that is not a mesh")
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     places: dict[int, Float64Array] = {}
     starts: dict[int, int] = {}
     found: list[Int64Array] = [np.zeros((0, 3), np.int64)]
@@ -171,3 +173,17 @@ def _left_out(collada: Element) -> tuple[str, ...]:
     except ValueError:
         parts.append("a unit that is not a number")
     return tuple(parts)
+
+
+def _not_applied(collada: Element) -> tuple[str, ...]:
+    controllers = [each for library in collada.all("library_controllers") for each in library.all("controller")]
+    geometries = [each for library in collada.all("library_geometries") for each in library.all("geometry")]
+    meshes = [mesh for each in geometries for mesh in each.all("mesh")]
+    holed = sum(1 for mesh in meshes for part in mesh.all("polygons") for _ in part.all("ph"))
+    counts = {
+        "morphs": sum(1 for each in controllers for _ in each.all("morph")),
+        "poses of skins, which stand at their bind shape": sum(1 for each in controllers for _ in each.all("skin")),
+        "polygons' holes": holed,
+        "geometries that are no mesh": len(geometries) - len(meshes),
+    }
+    return tuple(f"{count} {what}" for what, count in counts.items() if count > 0)

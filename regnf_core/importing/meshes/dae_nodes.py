@@ -31,6 +31,7 @@ def placed_geometries(collada: Element) -> Iterator[tuple[str, Element, Float64A
     """
     geometries = [each for library in collada.all("library_geometries") for each in library.all("geometry")]
     by_name = {each.attributes.get("id", ""): each for each in geometries}
+    controllers = [each for library in collada.all("library_controllers") for each in library.all("controller")]
     shared = [node for library in collada.all("library_nodes") for node in library.all("node")]
     waiting = [(node, np.eye(4), 0) for node in reversed(_roots(collada))]
     if not waiting:  # geometries that no node places
@@ -47,9 +48,31 @@ def placed_geometries(collada: Element) -> Iterator[tuple[str, Element, Float64A
             url = instance.attributes.get("url", "")
             found = by_name.get(url[1:]) if url.startswith("#") else None
             yield url, found if found is not None else target(url, geometries), matrix
+        for instance in node.all("instance_controller"):
+            controller, placed = target(instance.attributes.get("url"), controllers), matrix
+            for _ in range(_MAX_DEPTH):  # a skin of a morph of a mesh
+                skin = controller.first("skin")
+                held = skin or controller.first("morph")
+                if held is None:
+                    raise malformed("a COLLADA controller that is neither a skin nor a morph")
+                placed = placed if skin is None else _bind_shape(skin)
+                url = held.attributes.get("source", "")
+                if (found := by_name.get(url.removeprefix("#"))) is not None:
+                    yield url, found, placed
+                    break
+                controller = target(url, controllers)
         waiting.extend((child, matrix, depth + 1) for child in node.all("node"))
         for instance in node.all("instance_node"):
             waiting.append((target(instance.attributes.get("url"), shared), matrix, depth + 1))
+
+
+def _bind_shape(held: Element) -> Float64Array:
+    """From a mesh's frame to that of the skeleton at rest; a skin's mesh is not moved by its node."""
+    said = held.first("bind_shape_matrix")
+    numbers = np.eye(4).reshape(-1) if said is None else numbers_of(said.text.encode("ascii", "replace"), "COLLADA")
+    if len(numbers) != 16:
+        raise malformed("a COLLADA bind shape matrix has another number of values")
+    return numbers.reshape(4, 4)
 
 
 def _roots(collada: Element) -> list[Element]:

@@ -7,7 +7,8 @@ import numpy as np
 from regnf_core.importing.meshes.geometry import Float64Array, Geometry, elsewhere, malformed, require_room, within_unit
 
 _COMMANDS = (b"call", b"csh")
-_NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"surf": "free-form surfaces", b"l": "lines"}
+_NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"l": "lines", b"p": "points"}
+_SURFACE = b"surf"
 
 
 def read_obj(data: memoryview) -> Geometry:
@@ -18,6 +19,7 @@ def read_obj(data: memoryview) -> Geometry:
     colors: list[list[float]] = []
     triangles: list[tuple[int, int, int]] = []
     left_out: set[str] = set()
+    flat = surfaces = 0
     for line in bytes(data).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
         words = line.split()
         if not words:
@@ -27,12 +29,13 @@ def read_obj(data: memoryview) -> Geometry:
             colors.extend(_color(words))
         elif words[0] == b"f":
             corners = [_index(word, len(vertices)) for word in words[1:]]
-            if len(corners) < 3:
-                raise malformed("an OBJ face with fewer than three corners")
+            flat += len(corners) < 3
             triangles.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
             require_room(len(vertices), len(triangles))
         elif words[0] in _COMMANDS:
             raise elsewhere("the OBJ file refers to another file or to a command")
+        elif words[0] == _SURFACE:
+            surfaces += 1
         elif words[0] in _NOTED:
             left_out.add(_NOTED[words[0]])
     require_room(len(vertices), len(triangles))
@@ -40,7 +43,8 @@ def read_obj(data: memoryview) -> Geometry:
         np.array(vertices, dtype=np.float64).reshape(-1, 3),
         np.array(triangles, dtype=np.int64).reshape(-1, 3),
         colors=_shares(np.array(colors)) if vertices and len(colors) == len(vertices) else None,
-        left_out=tuple(sorted(left_out)),
+        left_out=(*sorted(left_out), *([f"{flat} faces of fewer than three corners"] if flat else [])),
+        not_applied=(f"{surfaces} free-form surfaces",) if surfaces else (),
     )
 
 

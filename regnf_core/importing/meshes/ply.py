@@ -54,6 +54,10 @@ def read_ply(data: memoryview) -> Geometry:
         else:
             body.skip(element)
             left_out.append(f"elements {element.name[:40]}")
+    if body.flat_faces and len(faces) == 0:
+        raise malformed("no face of the PLY file has three corners")
+    if body.flat_faces:
+        left_out.append(f"{body.flat_faces} faces of fewer than three corners")
     return Geometry(vertices, faces, normals, colors, tuple(left_out))
 
 

@@ -8,20 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import Float64Array, Int64Array, fans, malformed, require_room
+from regnf_core.importing.meshes.geometry import Float64Array, Int64Array, fan, fans, malformed, require_room
 from regnf_core.importing.meshes.number_text import numbers_of
 from regnf_core.importing.meshes.ply_header import ByteOrder, Element
 
 _USUAL_CORNERS = (3, 4)
-_MAX_CORNERS = 255
 
 
 class Body(ABC):
     """Hands out one element after the other, in the header's order."""
 
+    flat_faces: int = 0
+    """Faces of fewer than three corners, which were left out."""
+
     @abstractmethod
     def scalars(self, element: Element) -> dict[str, Float64Array]:
-        """The columns (count,) of an element without lists."""
+        """The columns (count,) of an element's single values; lists beside them are passed over."""
 
     @abstractmethod
     def _regular(self, element: Element, corners: int) -> Any | None:
@@ -30,6 +32,12 @@ class Body(ABC):
     @abstractmethod
     def _rows(self, element: Element) -> Iterator[dict[str, Any]]:
         """The rows one by one; lists as arrays."""
+
+    def _scalars_beside_lists(self, element: Element) -> dict[str, Float64Array]:
+        names = [p.name for p in element.properties if p.count_type is None]
+        table = [[float(row[name][0]) for name in names] for row in self._rows(element)]
+        columns = np.array(table, dtype=np.float64).reshape(-1, len(names)).T
+        return dict(zip(names, columns, strict=True))
 
     def skip(self, element: Element) -> None:
         """Pass over an element."""
@@ -55,11 +63,10 @@ class Body(ABC):
         triangles = 0
         for row in self._rows(element):
             polygon = np.asarray(row[name], dtype=np.int64)
-            if not 3 <= len(polygon) <= _MAX_CORNERS:
-                raise malformed(f"a PLY face of {len(polygon)} corners")
-            triangles += len(polygon) - 2
+            self.flat_faces += len(polygon) < 3
+            triangles += max(len(polygon) - 2, 0)
             require_room(0, triangles)
-            found.append(fans(polygon[None]))
+            found.append(fan(polygon))
         return np.concatenate(found) if found else np.zeros((0, 3), np.int64)
 
 
@@ -71,6 +78,8 @@ class BinaryBody(Body):
         self._order = byte_order
 
     def scalars(self, element: Element) -> dict[str, Float64Array]:
+        if any(p.count_type is not None for p in element.properties):
+            return self._scalars_beside_lists(element)
         rows = self._table(element, 0)
         if rows is None:
             raise malformed(f"the PLY file ends within its {element.name[:40]} rows")
@@ -91,11 +100,9 @@ class BinaryBody(Body):
         for p in element.properties:
             if p.count_type is None:
                 fields.append((p.name, self._order + p.type))
-            elif corners:
+            else:
                 fields.append((f"{p.name} length", self._order + p.count_type))
                 fields.append((p.name, self._order + p.type, (corners,)))
-            else:
-                raise malformed(f"PLY {element.name[:40]} rows with lists")
         row = np.dtype(fields)
         if element.count * row.itemsize > len(self._data):
             return None
@@ -130,7 +137,7 @@ class TextBody(Body):
 
     def scalars(self, element: Element) -> dict[str, Float64Array]:
         if any(p.count_type is not None for p in element.properties):
-            raise malformed(f"PLY {element.name[:40]} rows with lists")
+            return self._scalars_beside_lists(element)
         width = len(element.properties)
         rows = self._take(element, element.count * width).reshape(element.count, width)
         return {p.name: rows[:, i] for i, p in enumerate(element.properties)}

@@ -19,7 +19,7 @@ def read_stl(data: memoryview) -> Geometry:
     text = bytes(data).lstrip(b"\xef\xbb\xbf \t\r\n")
     if text[:5].lower() != b"solid":
         raise malformed(f"an STL file of {count} facets has another length")
-    return _loose(_corners_of_text(text))
+    return _loose(_corners_of_text(text.partition(b"\n")[2] if b"\n" in text else text))  # its name may say `vertex`
 
 
 def _corners_of_text(text: bytes) -> Float64Array:

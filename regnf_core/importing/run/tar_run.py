@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.run.byte_stream import ByteStream, MappedBytes, UnpackedBytes
-from regnf_core.importing.run.tar_headers import padding_of, tar_members
+from regnf_core.importing.run.tar_headers import TarMember, padding_of, tar_members
 from regnf_core.importing.run.unpacking import archive_error, kept, require_modest
 
 
@@ -18,7 +19,7 @@ class TarRun:
         self.sizes: dict[str, int] = {}
         """Each member's size in bytes."""
         stream = self._stream()
-        for member in tar_members(stream):
+        for member in _members(stream, packing):
             for _ in stream.pieces(member.size + padding_of(member.size)):
                 pass
             self.sizes[member.name] = member.size
@@ -44,6 +45,21 @@ class TarRun:
         if self._packing is None:
             return MappedBytes(self._data)
         return UnpackedBytes(self._data, self._packing, self._most)
+
+
+def _members(stream: ByteStream, packing: str | None) -> Iterator[TarMember]:
+    """The members; what is packed and no archive at all is said to be so."""
+    found = tar_members(stream)
+    try:
+        first = next(found, None)
+    except FieldFormatError as error:
+        if packing is None or error.reason != "ARCHIVE_MALFORMED":
+            raise
+        message = f"a single file packed by {packing}, or a damaged archive: unpack it, and give the file"
+        raise error.told(message) from error
+    if first is not None:
+        yield first
+        yield from found
 
 
 def _content(pieces: Iterator[bytes | memoryview], size: int, folder: Path) -> memoryview:

@@ -136,5 +136,5 @@ def in_blocks(field: SdfField, points: Tensor, block: int) -> tuple[Tensor, Tens
     count = len(points)
     filled = torch.cat([points, points[-1:].expand(-count % block, 3)])
     found = [field.signed_distance_and_gradient(part) for part in torch.split(filled, block)]
-    value, gradient = (torch.cat(parts)[:count].to(points) for parts in zip(*found, strict=True))
+    value, gradient = (torch.cat(parts)[:count].to(points.device, torch.float32) for parts in zip(*found, strict=True))
     return value, gradient

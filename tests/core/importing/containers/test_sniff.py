@@ -26,7 +26,9 @@ def test_names_meshes() -> None:
     assert sniff_format(b"ply\nformat binary_little_endian 1.0\n") == "ply"
     assert sniff_format(b"glTF\x02\0\0\0") == "glb"
     assert sniff_format(b"solid thing\n  facet normal 0 0 1\n") == "stl"
-    assert sniff_format((b"solid, says the header".ljust(80) + struct.pack("<I", 900) + 20 * facet)[:512]) == "stl"
+    assert (
+        sniff_format((b"solid, says the header".ljust(80) + struct.pack("<I", 900) + 20 * facet)[:HEAD_BYTES]) == "stl"
+    )
     assert sniff_format(b"# Blender v2.92\n# \xc3\xa9\nmtllib a.mtl\no Cube\n") == "obj"
     assert sniff_format(b"\r\nv 1.0 -2e-3 .5\r\n") == "obj"
     assert sniff_format(b"# exported by an OBJ writer of many words\n" * 20) == "obj"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from regnf_core.importing.containers.sniff import sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.meshes import geometry
 from regnf_core.importing.upload_description import UploadDescription
@@ -20,7 +20,7 @@ from tests.core.importing.meshes.mesh_files import PLY_TRIANGLE, converted, expo
 
 
 def refused(data: bytes, reason: str, format_: str | None = None) -> None:
-    kind = format_ or str(sniff_format(data[:512]))
+    kind = format_ or str(sniff_format(data[:HEAD_BYTES]))
     assert_refused(lambda: convert_mesh(kind, memoryview(data), UploadDescription()), reason)
 
 

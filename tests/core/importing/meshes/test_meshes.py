@@ -115,11 +115,6 @@ def test_holes_are_reported_and_have_an_inside_nonetheless() -> None:
     assert field_of(found).signed_distance(torch.zeros(1, 3)).item() < -0.4
 
 
-def test_coordinates_far_away_are_warned_of() -> None:
-    far = trimesh.Trimesh(BALL.vertices + np.array([5e5, 0.0, 0.0]), BALL.faces, process=False)
-    assert [warning.split(":")[0] for warning in converted(far.export(file_type="glb")).warnings] == ["FAR_FROM_ORIGIN"]
-
-
 def test_what_is_said_goes_before() -> None:
     found = converted(exported("stl"), world_scale=0.001, sign=-1, label="ball", up_axis="z")
     assert {name: found.description[name] for name in ("world_scale", "sign", "label", "up_axis")} == {

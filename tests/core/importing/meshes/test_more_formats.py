@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from regnf_core.importing.containers.sniff import HEAD_BYTES, sniff_format
+from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.meshes import read_mesh
@@ -25,6 +25,7 @@ from tests.core.importing.in_process import convert
 from tests.core.importing.meshes.mesh_files import (
     BALL,
     FACES,
+    PLY_TRIANGLE,
     converted,
     dae,
     exported,
@@ -299,3 +300,92 @@ def test_text_may_begin_with_a_mark_and_blank_lines(kind: str, before: bytes) ->
     plain = exported(kind, **({"encoding": "ascii"} if kind == "ply" else {}))
     marked = converted(before + plain)
     np.testing.assert_array_equal(marked.tensors["vertices"], converted(plain).tensors["vertices"])
+
+
+SHEET = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+STL = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "kind"),
+    [
+        ("# File exported by Houdini\ng\n" + SHEET, "obj"),
+        ("o\ns off\nusemtl\n" + SHEET, "obj"),
+        ("# licence\n" + "# words\n" * 200 + SHEET, "obj"),
+        ("\ufeff" + SHEET, "obj"),
+        ("\ufeff# begun\r\n" + SHEET.replace("\n", "\r\n"), "obj"),
+        ("solid " + "/" * 900 + " vertex 1 2 3\n" + STL, "stl"),
+        ("\n  SOLID THING\n" + STL.upper(), "stl"),
+        ("\ufeffsolid thing\n" + STL, "stl"),
+    ],
+)
+def test_unusual_beginnings_are_recognized(text: str, kind: str) -> None:
+    data = text.encode()
+    assert sniff_format(data[:HEAD_BYTES]) == kind
+    assert len(read_mesh(kind, memoryview(data)).faces) == (4 if kind == "obj" else 1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "ignored"),
+    [
+        ("f 1 3 2\n", "f 1 3 2\nf 1 2\n", "1 faces of fewer than three corners"),
+        ("f 1 3 2\n", "f 1 3 2\nf 1\nf 2 1\n", "2 faces of fewer than three corners"),
+        ("v 0 0 1\n", "v 0 0 1\nv nan nan nan\n", ""),
+        ("v 0 0 1\n", "v 0 0 1\nv 1 nan 2\nf 1 2 5\n", "1 triangles with such a corner"),
+        ("f 1 3 2\n", "f 1 3 2\nf 1 1 2\n", "1 triangles without an area"),
+        ("f 1 3 2\n", "f 1 3 2\nf 3 2 1\n", "1 triangles that are there twice"),
+        ("f 1 3 2\n", "f 1 3 2\nl 1 2\np 1\n", "lines"),
+    ],
+)
+def test_odd_rows_are_left_out_and_said(old: str, new: str, ignored: str) -> None:
+    found = converted(SHEET.replace(old, new).encode())
+    assert len(found.tensors["faces"]) == 4
+    assert found.why[1] == "watertight"
+    assert not ignored or f"ignored: {ignored}" in found.why
+
+
+def test_a_double_sided_mesh_has_one_side() -> None:
+    both = BALL.copy()
+    both.faces = np.concatenate([BALL.faces, BALL.faces[:, ::-1]])
+    found = converted(bytes(both.export(file_type="stl")))
+    assert len(found.tensors["faces"]) == len(BALL.faces)
+    assert found.why[1] == "watertight"
+    assert f"ignored: the other side of {len(BALL.faces)} triangles: the mesh is double-sided" in found.why
+
+
+def test_what_changes_the_shape_and_is_not_read_is_warned_of() -> None:
+    found = converted((SHEET + "cstype bezier\nsurf 0 1 0 1 1 2 3 4\nend\n").encode())
+    assert "GEOMETRY_IGNORED: not read: 1 free-form surfaces" in found.warnings
+    far = SHEET + "v 50 0 0\nv 51 0 0\nv 50 1 0\nf 5 6 7\n"
+    assert [warning.partition(":")[0] for warning in converted(far.encode()).warnings] == ["STRAY_PARTS"]
+
+
+def test_ply_vertices_with_lists_are_read() -> None:
+    header = PLY_TRIANGLE.replace("property float z\n", "property float z\nproperty list uchar int views\n")
+    data = header.replace("0 0 0\n1 0 0\n0 1 0\n", "0 0 0 2 7 8\n1 0 0 0\n0 1 0 1 9\n")
+    np.testing.assert_array_equal(read_mesh("ply", memoryview(data.encode())).vertices[1], [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("head", "named"),
+    [
+        (b"LASF\0\0", "LAS"),
+        (b"ASTM-E57", "E57"),
+        (b"PXR-USDC\0", "USD"),
+        (b"#usda 1.0\n", "USD"),
+        (b"Kaydara FBX Binary  \0", "FBX"),
+        (b"ISO-10303-21;\nHEADER;", "STEP"),
+        (b"# vtk DataFile Version 3.0\n", "VTK"),
+        (b'<?xml version="1.0"?>\n<VTKFile type="PolyData">', "VTK"),
+        (b'<?xml version="1.0"?>\n<robot name="r">', "URDF"),
+        (b"BLENDER-v300", "Blender"),
+        (b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"),
+        (b"# Octomap OcTree binary file\n", "OctoMap"),
+        (b"NRRD0004\n", "NRRD"),
+    ],
+)
+def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
+    assert sniff_format(head + bytes(500)) is None
+    reason, detail = explain_refusal(head)
+    assert reason == "FORMAT_NOT_SUPPORTED"
+    assert named in detail

@@ -140,7 +140,10 @@ def test_a_placed_field_is_taken_again_and_stays_where_it_is(tmp_path: Path) -> 
     points = torch.from_numpy(np.load(folder / "points_world.npy")).float()
     before, after = (open_field(path / FIELD_NAME).signed_distance(points) for path in (tmp_path, again))
     assert torch.equal(before, after)
-    for said in ({"world_scale": 2.0}, {"frame": "dataset"}):
+    convert_file(tmp_path / FIELD_NAME, again, {"world_scale": 2.0}, ImportLimits())
+    doubled = open_field(again / FIELD_NAME).signed_distance(2.0 * points)
+    torch.testing.assert_close(doubled, 2.0 * before, rtol=1e-4, atol=1e-5)
+    for said in ({"bounds": [[-1, -1, -1], [1, 1, 1]]}, {"frame": "dataset"}):
         assert_refused(
             lambda said=said: convert_file(tmp_path / FIELD_NAME, again, said, ImportLimits()), "INVALID_DESCRIPTION"
         )
