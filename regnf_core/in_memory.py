@@ -196,7 +196,7 @@ def _checked(field: SdfField, sign: int | None, is_mesh: bool = False, insists: 
     from regnf_core.importing.gate.plausibility import check_plausibility, require_plausible
 
     try:
-        measured, found = check_plausibility(field, is_mesh=is_mesh)
+        measured, found, _ = check_plausibility(field, is_mesh=is_mesh)
         if not insists:
             require_plausible(measured, sign)
     except FieldFormatError as error:

@@ -23,7 +23,7 @@ Pixels = NDArray[np.int64]
 _SAME = 0.05
 """Depths that differ by a larger share contradict each other: noise and drift of usual recordings are below."""
 _PAIRS, _PIXELS = 300, 300
-_ROUGH_PAIRS, _ROUGH_PIXELS = 80, 100
+_ROUGH_PAIRS, _ROUGH_PIXELS = 60, 50
 """Pairs of images and pixels of each: to judge a convention, and to search among all."""
 _SUSPECT = 0.25
 """Of the disagreement, from 0 to 1: below it nothing else is tried."""
@@ -35,11 +35,15 @@ _MOST_LEFT = 0.35
 """Of the disagreement, where a convention is said to be the right one."""
 _NO_DOUBT = 0.07
 """Of places that contradict: good recordings of random worlds, of two to sixty images, have up to so many."""
+_WARNED = 0.25
+"""Of places that contradict, where no other convention makes them agree: several times as many as noise leaves."""
 _TRIED = 6
+_MORE = 0.7
+"""A second change is made where it leaves at most this share of what the first one left."""
 _ROUNDS = 2
 """Conventions that are wrong at once, at most."""
 _STEP = 0.08
-_FACTORS = np.exp(np.arange(np.log(1e-4), np.log(1e4), _STEP))
+_FACTORS = np.exp(_STEP * np.array([step for step in range(-115, 116) if abs(step) > 1]))
 _UNITS = {0.001: "millimeters", 0.01: "centimeters", 0.0254: "inches", 0.3048: "feet", 0.0002: "steps of 1/5000"}
 _STEPS = {0.2: "steps of 1/5000 that were read as 1/1000", 5.0: "steps of 1/1000 that were read as 1/5000"}
 _NAMED = 0.04
@@ -100,6 +104,14 @@ class Agreement:
         return self.agreeing * (1.0 - self.apart) - self.contradicting
 
 
+def score_of_scale(images: PosedImages, factor: float) -> float:
+    """Larger where depths times ``factor`` agree better from image to image; 0 where images cannot tell."""
+    sample = None if images.depths is None else _Sample.of(images.depths, _ROUGH_PAIRS, _ROUGH_PIXELS)
+    if images.depths is None or sample is None:
+        return 0.0
+    return sample.agreement(_Views(images.depths, images.intrinsics, images.T_world_camera, factor)).score
+
+
 def check_agreement(images: PosedImages) -> str | None:
     """A warning where the images disagree by every convention; None where they agree, or cannot tell.
 
@@ -123,7 +135,7 @@ def check_agreement(images: PosedImages) -> str | None:
             reason="DATASET_FRAMES_DISAGREE",
             hint=mend,
         )
-    if found.places < _FEWEST or found.disagreement < 2.0 * _SUSPECT:
+    if found.places < _FEWEST or found.contradicting < _WARNED * found.places:
         return None
     return f"FRAMES_DISAGREE: {found.said()}: poses, intrinsics or depths are wrong, or things moved"
 
@@ -204,7 +216,9 @@ def _search(stated: _Views, sample: _Sample) -> tuple[_Views, Agreement]:
             if views.factor != best.factor:
                 near = [replace(views, factor=views.factor * float(np.exp(sign * step))) for sign in (-1, 0, 1)]
                 views, agreement = max(((each, sample.agreement(each)) for each in near), key=lambda one: one[1].score)
-        if agreement.score <= found.score:
+        if agreement.score <= found.score or (
+            best is not stated and agreement.disagreement > _MORE * found.disagreement
+        ):
             break
         best, found = views, agreement
         if found.disagreement < _SUSPECT:
@@ -289,15 +303,14 @@ def _other_depths(views: _Views) -> Iterator[_Views]:
 def _of_factor(factor: float) -> tuple[str, str]:
     """What is wrong where depths need a factor, and what mends it."""
 
-    def unit(wanted: float, names: dict[float, str]) -> str | None:
-        return next((name for known, name in names.items() if abs(wanted / known - 1.0) < _NAMED), None)
-
-    mend = f"multiply the depths, or depth_unit_scale_factor in meta_data.json, by {factor:.4g}; or divide the poses"
-    if (name := unit(factor, _UNITS | _STEPS)) is not None:
-        return f"depths in {name}", mend
-    if (name := unit(1.0 / factor, _UNITS)) is not None:
-        return f"poses in {name}", mend
-    return f"depths {factor:.3g} times as large", mend
+    wrong = f"depths {factor:.3g} times as large"
+    for known, name in (_UNITS | _STEPS).items():
+        if abs(factor / known - 1.0) < _NAMED:
+            factor, wrong = known, f"depths in {name}"
+        elif known in _UNITS and abs(factor * known - 1.0) < _NAMED:
+            factor, wrong = 1.0 / known, f"poses in {name}"
+    change = "multiply the depths, or depth_unit_scale_factor in meta_data.json"
+    return wrong, f"{change}, by {factor:.4g}; or divide the poses"
 
 
 def _other_intrinsics(views: _Views) -> Iterator[_Views]:

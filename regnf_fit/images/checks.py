@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
 from regnf_data.sdfstudio_reader import USUAL_BOUNDS
+from regnf_fit.images.agreement import score_of_scale
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def check_seen(images: PosedImages, shown: int) -> None:
         raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
     ends = np.quantile(origins + depths[:, None] * rays, [0.05, 0.95], axis=0)
     text += f"; depths are {np.median(depths):.4g} in the median and end within {_box(ends)}"
-    hint = _unit_hint(images.bounds, origins, rays, depths)
+    hint = _unit_hint(images, origins, rays, depths)
     raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
 
 
@@ -77,22 +78,24 @@ def sampled_rays(images: PosedImages) -> tuple[Floats, Floats, Floats]:
     return images.T_world_camera[image, :3, 3], rays, images.depths[image, row, column].astype(np.float64)
 
 
-def _unit_hint(bounds: Floats, origins: Floats, rays: Floats, depths: Floats) -> str | None:
-    """The mistaken unit that most depths would end within the bounds without; None where there is none."""
-    found: list[tuple[float, str]] = []
+def _unit_hint(images: PosedImages, origins: Floats, rays: Floats, depths: Floats) -> str | None:
+    """The mistaken unit that most depths would end within the bounds without, and by which the images agree best; None
+    where there is none."""
+    found: list[tuple[float, float, str]] = []
     for factor, unit in UNITS:
-        for name, ends in (
-            ("the depths", origins + factor * depths[:, None] * rays),
-            ("the poses", factor * origins + depths[:, None] * rays),
-            ("depths and poses", factor * (origins + depths[:, None] * rays)),
-        ):
-            within = float(((ends >= bounds[0]) & (ends <= bounds[1])).all(axis=1).mean())
+        for name, of_origins, of_depths in (
+            ("the depths", 1.0, factor), ("the poses", factor, 1.0), ("depths and poses", factor, factor)
+        ):  # fmt: skip
+            ends = of_origins * origins + of_depths * depths[:, None] * rays
+            within = float(((ends >= images.bounds[0]) & (ends <= images.bounds[1])).all(axis=1).mean())
             told = f"divided by {1 / factor:.4g}" if factor < 1.0 else f"times {factor:.4g}"
             text = f"Are {name} in {unit}? {told[0].upper()}{told[1:]}, {100 * within:.0f} % of the depths end within."
-            found.append((within, text))
-    most = max(within for within, _ in found)
-    # of those that explain as much the first, which changes least
-    return next(text for within, text in found if within > 0.95 * most) if most >= _EXPLAINED else None
+            found.append((within, of_depths / of_origins, text))
+    most = max(within for within, _, _ in found)
+    if most < _EXPLAINED:
+        return None
+    explaining = [(factor, text) for within, factor, text in found if within > 0.95 * most]
+    return max(explaining, key=lambda one: score_of_scale(images, one[0]))[1]  # the first of equals
 
 
 def _box(corners: Floats) -> str:

@@ -17,7 +17,8 @@ Array = npt.NDArray[np.float64]
 Axes = Literal["opencv", "opengl"]
 """opencv: x right, y down, z forward. opengl: x right, y up, z backward."""
 MOST_CAMERAS = 20_000
-_FARTHEST = 1e9
+_FARTHEST = 1e8
+"""Geodetic coordinates reach ten million meters; poses are kept in double precision."""
 _NOT_RIGID = 0.02
 """How far a pose's axes may be from unit length and from right angles."""
 _FIELD_OF_VIEW = (0.05, 50.0)
