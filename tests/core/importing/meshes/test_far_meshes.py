@@ -63,9 +63,9 @@ def distances(folder: Path, name: str, data: bytes, shift: tuple[float, float, f
     """At places round the shape, which is moved by ``shift``."""
     folder = folder / name
     folder.mkdir()
-    convert(saved(folder, data), folder)
+    convert(saved(folder, data), folder / "out")
     places = torch.from_numpy(np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3)))
-    field = open_field(folder / "field.safetensors")
+    field = open_field(folder / "out" / "field.safetensors")
     low, high = field.bounds
     assert (low < torch.tensor(shift)).all()
     assert (high > torch.tensor(shift)).all()
@@ -92,9 +92,9 @@ def test_a_cloud_in_doubles_keeps_its_digits(tmp_path: Path) -> None:
     normals = BALL.face_normals[face]
     for name, shift in (("here", (0.0, 0.0, 0.0)), ("there", ECEF)):
         (tmp_path / name).mkdir()
-        convert(saved(tmp_path / name, pcd(points + np.array(shift), normals, "ascii")), tmp_path / name)
+        convert(saved(tmp_path / name, pcd(points + np.array(shift), normals, "ascii")), tmp_path / name / "out")
     places = torch.from_numpy(np.random.default_rng(0).uniform(-0.6, 0.6, (100, 3)))
-    here, there = (open_field(tmp_path / name / "field.safetensors") for name in ("here", "there"))
+    here, there = (open_field(tmp_path / name / "out" / "field.safetensors") for name in ("here", "there"))
     moved = there.signed_distance(places + torch.tensor(ECEF, dtype=torch.float64))
     torch.testing.assert_close(moved, here.signed_distance(places), rtol=0, atol=2e-4)
 
