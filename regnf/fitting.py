@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -11,6 +12,7 @@ from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_files import require_file
 from regnf_core.fields.base import SdfField
 from regnf_core.hints import suggestion
+from regnf_core.in_memory import field_of
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
@@ -23,7 +25,7 @@ Progress = Callable[[int, float, float], None]
 
 
 def fit(
-    source: str | Path | SdfField,
+    source: str | os.PathLike[str] | SdfField | Any,
     output: str | Path,
     options: Mapping[str, Any] | None = None,
     extent: float | None = None,
@@ -33,14 +35,16 @@ def fit(
 ) -> FitReport | ReconstructionReport:
     """Fit a field, write it to ``output``, a .safetensors file, and say how well it agrees.
 
-    source: a mesh file, any field, or a folder of posed RGB-D images (docs/fitting.md) · options: entries of
-    FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its longest edge after it
-    has been moved to the origin.
+    source: a mesh file, any field, a mesh of trimesh or Open3D, or a folder of posed RGB-D images (docs/fitting.md) ·
+    options: entries of FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its
+    longest edge after it has been moved to the origin.
     Raises InvalidOptionsError, InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET ...).
     """
     path = _checked_output(Path(output))
     if isinstance(source, SdfField):
         return fit_field(source, path, _options(FitOptions, options), seed, progress, label)
+    if not isinstance(source, str | os.PathLike):
+        return fit_field(field_of(source, "object"), path, _options(FitOptions, options), seed, progress, label)
     given = Path(source)
     if given.is_dir():
         if extent is not None:

@@ -18,6 +18,7 @@ from regnf_cli.extras import require
 from regnf_cli.field_options import choice_of, source_of
 from regnf_cli.options import Config, Description, Field, NoConfig
 from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
+from regnf_core.labels import shown_number
 
 Picture = Annotated[Path | None, typer.Option(help="A PNG to write: two views and a section.", dir_okay=False)]
 Candidates = Annotated[
@@ -102,7 +103,7 @@ def _show(values: dict[str, Any], indent: int = 0) -> None:
 
 def _readable(value: Any) -> str:
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return shown_number(value)
     if isinstance(value, list | tuple):
         parts = [_readable(part) for part in value]
         return f"[{', '.join(parts)}]" if any(isinstance(part, float) for part in value) else "; ".join(parts) or "none"

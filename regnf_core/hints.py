@@ -33,7 +33,11 @@ HINTS: dict[str, str] = {
     "around more of the object.",
     "LARGE_RESIDUAL": "Most often it is another object. With the preset paper, try the preset robust or more "
     "iterations.",
-    "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote; docs/import-gate.md lists what is taken.",
+    "FORMAT_NOT_RECOGNIZED": "Give the checkpoint that the trainer wrote, or a mesh as .glb, .ply, .obj or .stl;"
+    " docs/import-gate.md lists what is taken.",
+    "POINT_CLOUD_WITHOUT_NORMALS": "In Open3D: cloud.estimate_normals(), then"
+    " orient_normals_consistent_tangent_plane(30); or give the mesh.",
+    "MESH_INVALID": "Open it in a viewer, and export it again as .glb, .ply, .obj or .stl.",
     "FORMAT_NOT_SUPPORTED": "docs/import-gate.md lists the files that are taken.",
     "FIELD_NOT_RECOGNIZED": "docs/import-gate.md lists the networks that are taken, and what a description may add.",
     "FILE_EMPTY": "Copy or download the file again.",

@@ -63,8 +63,7 @@ def from_points(points: Any, normals: Any, description: Said = None) -> SdfField
 
     places = _rows("points", points, "MESH_INVALID")
     if normals is None:
-        hint = "In Open3D: cloud.estimate_normals(), then orient_normals_consistent_tangent_plane(30)."
-        raise FieldFormatError("points without normals", reason="POINT_CLOUD_WITHOUT_NORMALS", hint=hint)
+        raise FieldFormatError("points without normals", reason="POINT_CLOUD_WITHOUT_NORMALS")
     along = _rows("normals", normals, "MESH_INVALID")
     if len(along) != len(places):
         raise FieldFormatError(f"{len(along)} normals for {len(places)} points", reason="MESH_INVALID")
@@ -261,9 +260,8 @@ def _faces(faces: Any, vertices: int) -> Int64Array:
     if len(corners) == 0:
         raise FieldFormatError("there are no triangles", reason="MESH_INVALID")
     if corners.min() < 0 or corners.max() >= vertices:
-        hint = None
-        if corners.min() == 1 and corners.max() == vertices:
-            hint = "They seem to be counted from 1: subtract 1."
+        from_one = corners.min() == 1 and corners.max() == vertices
+        hint = "They seem to be counted from 1: subtract 1." if from_one else "Indices are counted from 0."
         message = f"faces name the vertices {corners.min()} to {corners.max()}, there are 0 to {vertices - 1}"
         raise FieldFormatError(message, reason="MESH_INVALID", hint=hint)
     return corners

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 
 from regnf_core.detections.detection import Detection
 from regnf_core.errors import InvalidDetectionError
+from regnf_core.labels import shown_number
 from regnf_core.rotations import Vector, cross, dot, normal_quaternion, rotation_columns
 
 Bounds = tuple[Sequence[float], Sequence[float]]
@@ -103,4 +104,4 @@ def _described(box: Detection, scene: Bounds) -> str:
 
 
 def _vector(values: Sequence[float]) -> str:
-    return f"[{', '.join(f'{value:.4g}' for value in values)}]"
+    return f"[{', '.join(map(shown_number, values))}]"

@@ -7,6 +7,8 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from regnf_core.labels import shown_number
+
 
 @runtime_checkable
 class SdfField(Protocol):
@@ -41,7 +43,7 @@ class SdfField(Protocol):
 
 def field_repr(field: SdfField) -> str:
     """A field in a line: its class, and where it has meaning."""
-    low, high = ([float(f"{value:.4g}") for value in corner.tolist()] for corner in field.bounds)
+    low, high = (f"[{', '.join(map(shown_number, corner.tolist()))}]" for corner in field.bounds)
     return f"<{type(field).__name__}, bounds {low} to {high}, {field.device}>"
 
 

@@ -23,9 +23,10 @@ class TransformedField:
 
     def __init__(self, field: SdfField, T_field_frame: Sim3) -> None:
         if isinstance(field, TransformedField):  # one transform in float64: two would lose the digits between them
-            field, T_field_frame = field.field, field.T_field_frame @ T_field_frame
-        self.field = field
-        self.T_field_frame = T_field_frame
+            T_field_frame = field.T_field_frame @ T_field_frame
+            field = field.field
+        self.field: SdfField = field
+        self.T_field_frame: Sim3 = T_field_frame
         if has_color(field):
             self.color = color_in_frame(field, T_field_frame)
 

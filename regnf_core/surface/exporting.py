@@ -45,8 +45,10 @@ def write_mesh(field: SdfField, path: Path, resolution: int = 128, progress: Pro
 
 def glb_of(mesh: trimesh.Trimesh, origin: Floats) -> bytes:
     """The mesh as .glb, ``origin`` (3,) added to its places by its node: vertices have single precision alone."""
+    shift = np.eye(4)
+    shift[:3, 3] = origin
     scene = trimesh.Scene()
-    scene.add_geometry(mesh, transform=trimesh.transformations.translation_matrix(origin))
+    scene.add_geometry(mesh, transform=shift)
     export: Callable[..., bytes] = partial(export_glb, include_normals=True)
     return export(scene)
 
