@@ -14,7 +14,7 @@ from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.metrics import errors_against_truth
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
-from regnf_core.hints import HINTS
+from regnf_core.hints import verdict_hint
 from regnf_core.result import Alternative, ConsideredPose, IterationRecord, RegistrationResult
 from regnf_core.verdicts import VERDICT_REASONS
 from regnf_core.version import __version__
@@ -47,7 +47,7 @@ def result_document(
         "verdict": result.verdict,
         "verdict_reason": result.verdict_reason,
         "verdict_detail": VERDICT_REASONS.get(result.verdict_reason, ""),
-        "verdict_hint": HINTS.get(result.verdict_reason, ""),
+        "verdict_hint": verdict_hint(result.verdict_reason, result.options),
         "T_object_scene": result.T_object_scene.to_dict(),
         "T_scene_object": result.T_object_scene.inverse().to_dict(),
         "T_object_scene_initial": result.T_object_scene_initial.to_dict(),
