@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -16,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from regnf_cli.batch_file import FilePair
 from regnf_core.errors import InvalidInputError, RegnfError
 from regnf_core.pair_result import short_result
+from regnf_core.parent_process import die_with_parent
 
 if TYPE_CHECKING:
     from regnf_core.fields.base import SdfField
@@ -58,11 +61,12 @@ def _one_pool(
 ) -> Iterator[tuple[FilePair, dict[str, Any]]]:
     """Results until all pairs are done. When a process dies, those that were begun are put into ``again``."""
     running: dict[Future[dict[str, Any]], tuple[FilePair, int]] = {}
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin)
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _begin, (os.getpid(),))
     try:
         while True:
             while len(running) < 2 * processes and (found := _next(left, again)) is not None:
-                running[pool.submit(register_pair, found[0])] = found
+                with _kept_from_children():
+                    running[pool.submit(register_pair, found[0])] = found
             if not running:
                 return
             for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -75,6 +79,8 @@ def _one_pool(
         raise
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+        for child in multiprocessing.active_children():  # those in the midst of a pair that nobody waits for any more
+            child.kill()
 
 
 def _next(left: Iterator[FilePair], again: list[tuple[FilePair, int]]) -> tuple[FilePair, int] | None:
@@ -83,8 +89,19 @@ def _next(left: Iterator[FilePair], again: list[tuple[FilePair, int]]) -> tuple[
     return next(((pair, 0) for pair in islice(left, 1)), None)
 
 
-def _begin() -> None:
+@contextmanager
+def _kept_from_children() -> Iterator[None]:
+    """Processes that begin meanwhile never get a terminal's signals: this one has them, and ends the others."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(parent: int) -> None:
     """One thread each: the processes share the cores."""
+    die_with_parent(parent)
     os.environ["OMP_NUM_THREADS"] = "1"
     import torch
 

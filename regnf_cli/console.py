@@ -7,6 +7,8 @@ import re
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
+from regnf_core.hints import hint_of
+
 EXIT_REGISTERED = 0
 EXIT_NOT_REGISTERED = 1
 EXIT_BAD_INPUT = 2
@@ -22,7 +24,7 @@ def fail(reason: str, message: str, code: int = EXIT_BAD_INPUT, hint: str | None
     """Say on stderr what went wrong, and what to do next; returns the exit code."""
     err.print(f"[bold red]{reason}[/] ", end="")
     err.print(_with_commands(message), markup=False, soft_wrap=True)
-    if hint:
+    if hint := hint or hint_of(reason):
         err.print("[bold]hint:[/] ", end="")
         err.print(_with_commands(hint), markup=False, soft_wrap=True)
     return code

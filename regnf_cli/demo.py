@@ -61,7 +61,8 @@ def demo(
                 out.print(f"service      {address}  (log: {folder / 'serve.log'})")
                 job, result = _register(address)
                 good = _show(result)
-                out.print(f"page         [bold]{address}/jobs/{job['id']}/view[/]", soft_wrap=True)
+                if waits:  # else the service ends now, and its page with it
+                    out.print(f"page         [bold]{address}/jobs/{job['id']}/view[/]", soft_wrap=True)
                 out.print(f"total        {time.monotonic() - started:.1f} s")
                 if waits:
                     _wait_for_enter()

@@ -14,6 +14,7 @@ from regnf_cli.console import err, out
 from regnf_cli.field_options import choice_of, source_of
 from regnf_cli.options import Config, Description, Field, NoConfig, Token
 from regnf_cli.paths import file, output_folder
+from regnf_cli.report import axis_in_words
 from regnf_cli.shelves import Shown, files_of, open_shelf
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_source import FieldSource
@@ -237,7 +238,7 @@ def _words(symmetry: dict[str, Any] | None) -> str:
     if symmetry is None:
         return "not known"
     axis = symmetry.get("axis")
-    about = "" if axis is None else f" about {', '.join(f'{part:.3g}' for part in axis)}"
+    about = "" if axis is None else f" about {axis_in_words(axis)}"
     if symmetry["continuous"]:
         return f"every turn{about}"
     return f"{symmetry['order']} turns{about}" if symmetry["order"] > 1 else "none"

@@ -17,7 +17,11 @@ from regnf_state.settings import Settings
 
 _BACKLOG = 2048
 _TOKENS_HINT = "Write entries as NAME:TOKEN, in REGNF_API_TOKENS as a JSON list or one a line in REGNF_API_TOKENS_FILE."
-
+_SECRETS_HINT = (
+    "Write entries as CALLER:whsec_BASE64, in REGNF_WEBHOOK_SECRETS as a JSON list or one a line in "
+    "REGNF_WEBHOOK_SECRETS_FILE."
+)
+_WEBHOOK_HOSTS_HINT = 'Write REGNF_WEBHOOK_HOSTS as a JSON list, for example ["hooks.example.org", "10.0.0.5:9000"].'
 _HOSTS_HINT = (
     'Write REGNF_ALLOWED_HOSTS as a JSON list, for example ["fields.example.org", "*.lab.example.org"], and'
     ' REGNF_CORS_ORIGINS likewise: ["https://app.example.org"].'
@@ -39,10 +43,16 @@ def check_access(settings: Settings) -> None:
         )
     try:
         read_callers(settings.api_tokens, settings.api_tokens_file)
-        read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
-        AllowList(settings.webhook_hosts)
     except TokensError as error:
         raise StartError(str(error), reason=error.reason, hint=_TOKENS_HINT) from error
+    try:
+        read_secrets(settings.webhook_secrets, settings.webhook_secrets_file)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason, hint=_SECRETS_HINT) from error
+    try:
+        AllowList(settings.webhook_hosts)
+    except TokensError as error:
+        raise StartError(str(error), reason=error.reason, hint=_WEBHOOK_HOSTS_HINT) from error
     try:
         allowed_hosts(settings)
         cors_origins(settings)

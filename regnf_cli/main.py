@@ -134,6 +134,7 @@ def _run() -> int:
     from regnf_cli.console import EXIT_BAD_INPUT, EXIT_UNAVAILABLE, fail
     from regnf_cli.usage import usage_fault
     from regnf_core.errors import RegnfError
+    from regnf_core.hints import HINTS
 
     usage_error: type[Exception] = typer.BadParameter.__mro__[1]  # typer does not export its name
     asked = sys.argv[1:2]
@@ -149,7 +150,10 @@ def _run() -> int:
         code = EXIT_UNAVAILABLE if getattr(error, "unavailable", False) else EXIT_BAD_INPUT
         from regnf_cli.candidates import show_candidates
 
-        fail(error.reason, str(error), code, error.hint)
+        hint = error.hint
+        if hint == HINTS["INVALID_OPTIONS"] and "options." not in str(error):  # options of the command line
+            hint = f"`regnf {asked[0]} --help` shows what it takes."
+        fail(error.reason, str(error), code, hint)
         show_candidates(error)
         return code
     except FileNotFoundError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from rich.markup import escape
@@ -88,11 +89,18 @@ def show_ranking(document: dict[str, Any], top: int) -> None:
         _line("", f"no object: {one['object']} ({one['verdict_reason']})")
 
 
+def axis_in_words(axis: Sequence[float]) -> str:
+    """z for (0, 0, 1) and its opposite, for a turn is about both; else the direction."""
+    parts = [round(value, 2) + 0.0 for value in axis]  # adding zero makes -0.00 plain
+    if sorted(map(abs, parts)) == [0, 0, 1]:
+        return "xyz"[[abs(part) for part in parts].index(1)]
+    return f"({', '.join(f'{part:.2f}' for part in parts)})"
+
+
 def symmetry_in_words(symmetry: dict[str, Any]) -> str:
     """An object's symmetry as a result document has it: order, axis, continuous."""
     order, axis = symmetry["order"], symmetry["axis"]
-    numbers = ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in axis or ())  # adding zero makes -0.00 plain
-    about = "" if axis is None else f" about ({numbers}) of the object"
+    about = "" if axis is None else f" about {axis_in_words(axis)} of the object"
     if symmetry["continuous"]:
         return f"any rotation{about}" + (", and upside down" if order > 1 else "")
     return "none found" if order == 1 else f"{order} rotations{about} look the same, the identity included"

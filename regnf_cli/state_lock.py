@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -24,6 +25,7 @@ class StateLock:
 
     def __init__(self, state_dir: Path) -> None:
         self._state_dir = state_dir
+        self._noted: dict[str, object] = {}
         self.socket_dir: Path | None = None
 
     def __enter__(self) -> StateLock:
@@ -37,11 +39,14 @@ class StateLock:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            held = self._read()
             self._file.close()
-            detail = f"another `regnf serve` uses {self._state_dir}"
+            who = f" (process {held['pid']}, {held.get('address', 'not listening yet')})" if "pid" in held else ""
+            detail = f"another `regnf serve`{who} uses {self._state_dir}"
             hint = "Use that one, or stop it, or give this one its own folder with --state-dir."
             raise StartError(detail, reason="STATE_DIR_IN_USE", hint=hint) from error
         self._remove_leftover()
+        self.note(pid=os.getpid())
         return self
 
     def __exit__(
@@ -57,21 +62,29 @@ class StateLock:
         usual = tempfile.gettempdir()
         folder = Path(tempfile.mkdtemp(prefix=_SOCKET_PREFIX, dir=usual if len(usual) < 60 else "/tmp"))  # noqa: S108
         self.socket_dir = folder
-        self._write({"socket_dir": str(folder)})
+        self.note(socket_dir=str(folder))
         return folder
 
-    def _write(self, content: dict[str, str]) -> None:
+    def note(self, **more: object) -> None:
+        """Record more of this service: process, address, the folder of its socket."""
+        self._noted |= more
+        self._write(self._noted)
+
+    def _write(self, content: Mapping[str, object]) -> None:
         self._file.seek(0)
         self._file.truncate()
         json.dump(content, self._file)
         self._file.flush()
 
-    def _remove_leftover(self) -> None:
+    def _read(self) -> dict[str, object]:
         self._file.seek(0)
         try:
             content = json.loads(self._file.read() or "{}")
         except ValueError:
-            return
-        left = Path(str(content.get("socket_dir", ""))) if isinstance(content, dict) else Path()
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def _remove_leftover(self) -> None:
+        left = Path(str(self._read().get("socket_dir", "")))
         if left.name.startswith(_SOCKET_PREFIX) and left.is_dir() and left.stat().st_uid == os.getuid():
             shutil.rmtree(left, ignore_errors=True)

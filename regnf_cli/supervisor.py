@@ -55,6 +55,7 @@ class Supervisor:
             stack.enter_context(self._handled_signals())
             lock = stack.enter_context(StateLock(self._settings.state_dir))
             listener = stack.enter_context(open_socket(self._settings))
+            lock.note(address=address_of(listener))
             lifeline, held = os.pipe()
             stack.callback(os.close, held)
             stack.callback(os.close, lifeline)

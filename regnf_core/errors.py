@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from regnf_core.field_candidates import Candidate, Said
-from regnf_core.hints import HINTS
+from regnf_core.hints import hint_of
 
 
 class RegnfError(Exception):
@@ -40,7 +40,7 @@ class RegnfError(Exception):
 
     @property
     def hint(self) -> str | None:
-        return self._hint or HINTS.get(self.reason)
+        return self._hint or hint_of(self.reason)
 
 
 class InvalidInputError(RegnfError):

@@ -6,7 +6,8 @@ Command line, problem objects, result documents and page all show these. Torch-f
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 HINTS: dict[str, str] = {
     "NO_SURFACE_IN_DETECTION": "Check that the box is in the scene field's own frame and units, and that it encloses "
@@ -123,8 +124,81 @@ HINTS: dict[str, str] = {
     "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",
     "STORAGE_FULL": "Free space on the disk, or delete fields and jobs, then send it again.",
     "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
+    "MESH_TOO_LARGE": "Reduce the number of its triangles, for example in MeshLab or Blender.",
+    "MESH_EXTERNAL_REFERENCE": "Put everything into one file: export it as .glb.",
+    "NO_ZERO_LEVEL": "Check its bounds and its sign: positive outside, negative inside. `regnf inspect FILE --picture "
+    "field.png` draws it.",
+    "FAMILY_NOT_SUPPORTED": "docs/import-gate.md lists the networks that are taken.",
+    "LATENT_MISSING": "Give the latent codes of the decoder: docs/families.md says where they are looked for.",
+    "UNSAFE_GLOBAL_IN_WEIGHTS": "Save the state_dict alone with torch.save: docs/families.md shows it.",
+    "FILE_NOT_FOUND": "Check the path.",
+    "FILE_IS_FOLDER": "Give a file inside it.",
+    "FILE_IS_NO_FOLDER": "Name another folder.",
+    "FILE_UNUSABLE": "Check who may read and write there, or name another place.",
+    "FIT_DIVERGED": "Use fewer or better images, or another seed; docs/fitting.md says what images are needed.",
+    "MALFORMED_JSON": "Check the brackets, commas and quotation marks there.",
+    "INVALID_TRANSFORM": "Write a 4x4 with rows of x -> s R x + t, the last one 0 0 0 1.",
+    "INVALID_REQUEST": "docs/api.md shows every member of a request.",
+    "NO_WORKER": "Start a worker: `regnf worker`, or `regnf serve`, which brings its own.",
+    "BOUNDS_INVALID": "Give two corners in a description, the lower one first: docs/import-gate.md shows it.",
+    "INVALID_DESCRIPTION": "docs/import-gate.md lists every entry of a description.",
+    "INVALID_SYMMETRY": "docs/how-to/symmetry.md shows how a symmetry is said.",
+    "INITIAL_TRANSFORM_UNSUPPORTED": "Leave the initial transform out, or use the preset robust.",
+    "NO_SURFACE_IN_SCENE": "Check the scene's bounds and its sign: positive outside, negative inside.",
+    "NO_SURFACE_IN_TARGET": "Check that the box encloses the object.",
+    "TARGET_OUTSIDE_GRID": "Use a box within the field's bounds; `regnf inspect` shows them.",
+    "NO_PICTURE": "Register with pictures, or draw one: `regnf inspect FILE --picture field.png`.",
+    "OBJECT_MODEL_INVALID": "Delete it: it is made again when it is needed.",
+    "FIELD_NOT_FINITE": "The training may have diverged: give an earlier checkpoint.",
+    "FIELD_NOT_A_FUNCTION": "Give the checkpoint that the trainer wrote; docs/import-gate.md lists what is taken.",
+    "FIELD_NOT_FOUND": "Upload the field first. Another caller's fields are not shown.",
+    "FIELD_REJECTED": "The field's own error says why; upload a corrected one.",
+    "DEMO_DATA_MISSING": "Install regnf anew: its example fields are missing.",
+    "EMBEDDED_REDIS_MISSING": "Install it: pip install 'regnf[embedded]'; or name a Redis in REGNF_REDIS_URL.",
+    "INTERNAL": "This is a fault of regnf: please report it with what the log says.",
 }
 """Errors may carry a hint of their own, which says more."""
+_FAMILIES: dict[str, str] = {
+    "DATASET_": "docs/datasets.md describes the folder of images that is taken.",
+    "IMPORT_": "Give a smaller field or mesh; with a service, docs/runbook.md names the limits of imports.",
+    "SETTINGS_": "docs/import-gate.md lists the settings of each trainer.",
+    "CAMERAS_": "docs/import-gate.md lists the files of cameras that are read.",
+    "CAMERA_": "docs/editing.md describes cameras.",
+    "EDIT": "docs/editing.md describes every edit.",
+    "RENDER_": "docs/editing.md names the limits of renderings.",
+    "CHECKPOINT_": "Begin the fit anew, without the checkpoint; docs/fitting.md says when one is used.",
+    "LIBRARY_": "docs/how-to/library.md describes libraries.",
+    "RECORDING_": "docs/how-to/recording.md describes recordings.",
+    "QUOTA_": "Wait until others of yours have ended, or delete some; docs/errors.md lists the quotas.",
+    "TOO_MANY_": "Send fewer at once, and try again later.",
+    "REDIS_": "docs/deployment.md describes how Redis is named and protected.",
+    "STORAGE_": "docs/deployment.md describes storage.",
+    "STATE_DIR_": "Give another folder with --state-dir.",
+    "TEXT_": "Save it as UTF-8.",
+    **dict.fromkeys(
+        ("ARCHIVE_", "LEGACY_", "NPY_", "ONNX_", "PICKLE_", "SAFETENSORS_", "SQLITE_", "TENSOR_", "HASH_GRID_", "RUN_",
+         "SAFE_FORMAT_", "FIELD_SHAPES_", "FIELD_INDEX_", "FIELD_KIND_"),
+        "Copy the file again, or save it anew with its trainer; docs/import-gate.md lists what is taken.",
+    ),
+}  # fmt: skip
+"""Of reasons that begin so and have no hint by themselves."""
+
+
+def hint_of(reason: str) -> str | None:
+    """What to do next about an error of this reason; None where it says all by itself."""
+    family = next((hint for beginning, hint in _FAMILIES.items() if reason.startswith(beginning)), None)
+    return HINTS.get(reason, family)
+
+
+def verdict_hint(reason: str, options: Mapping[str, Any]) -> str:
+    """What to do next about a verdict, under these options of the registration; "" where nothing needs to be done."""
+    if reason == "SEVERAL_POSES_AGREE" and options.get("up_axis") is not None:
+        return (
+            "Choose a pose among the alternatives: all of them stand upright. A box that shows what tells the sides "
+            "apart, or more views of it, may decide."
+        )
+    return HINTS.get(reason, "")
+
 
 RENAMED: dict[str, str] = {
     "centre": "center",

@@ -200,13 +200,15 @@ class RegistrationOptions:
         Raises InvalidOptionsError naming the first faulty option.
         """
         try:
-            return _ADAPTER.validate_python(values, strict=False)
+            read = _ADAPTER.validate_python(values, strict=False)
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"])
             hint = did_you_mean(first["loc"]) if first["type"] == UNKNOWN_OPTION else ""
             what = "no such option" if first["type"] == UNKNOWN_OPTION else first["msg"]
             raise InvalidOptionsError(f"options.{where}: {what}{hint}") from error
+        _refuse_other_types(values, read)
+        return read
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of every option, defaults included, in a fixed order."""
@@ -219,6 +221,20 @@ class RegistrationOptions:
             raise InvalidOptionsError(
                 f"only the preset `robust` {feature}; the options name `{self.preset}`", reason=reason
             )
+
+
+def _refuse_other_types(given: Mapping[str, Any], read: Any, place: str = "options") -> None:
+    """Raises InvalidOptionsError for a number written as a text or a truth value, as the HTTP interface refuses it."""
+    for name, value in given.items():
+        taken = getattr(read, name)
+        if isinstance(value, Mapping):
+            _refuse_other_types(value, taken, f"{place}.{name}")
+        elif isinstance(value, str | bool) and type(value) is not type(taken):
+            what, hint = (
+                ("a text", "Remove the quotation marks.") if isinstance(value, str) else ("true or false", None)
+            )
+            wanted = "true or false" if isinstance(taken, bool) else "a number"
+            raise InvalidOptionsError(f"{place}.{name}: is {what}, expected {wanted}", hint=hint)
 
 
 OptionsLike = RegistrationOptions | Mapping[str, Any] | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from regnf_core.hints import HINTS
+from regnf_core.hints import hint_of
 from regnf_state.reasons import REASONS
 
 _ENGINE_STATUS = 422
@@ -13,7 +13,7 @@ _ENGINE_STATUS = 422
 def problem_document(reason: str, detail: str | None = None, *, hint: str | None = None, **more: Any) -> dict[str, Any]:
     """The members of a problem. A reason that is not in REASONS is one of the engine's, which are about the input."""
     known = REASONS.get(reason)
-    hint = hint or HINTS.get(reason)
+    hint = hint or hint_of(reason)
     return {
         "type": f"/docs#{reason}",
         "title": known.title if known is not None else reason.replace("_", " ").capitalize(),

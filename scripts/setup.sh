@@ -20,21 +20,21 @@ if have "$stamp" || { [[ ${1-} == demo ]] && have "$stamp-demo"; }; then
 fi
 
 [[ -x .venv/bin/python ]] || "$python" -m venv .venv
-pip=(.venv/bin/python -m pip --disable-pip-version-check --quiet)
-export PIP_NO_COMPILE=1 # Python compiles what is used, when it is: a quarter of a gigabyte less, and half a minute
+# Python compiles what is used, when it is: .venv is a quarter of a gigabyte smaller.
+install=(.venv/bin/python -m pip --disable-pip-version-check --quiet install --no-compile -c constraints.txt)
 echo "Installing into .venv (the first time takes a few minutes) ..."
 # torch first and by its pinned version: an open range may resolve to a build with gigabytes of GPU libraries.
-"${pip[@]}" install -c constraints.txt torch
+"${install[@]}" torch
 if [[ ${1-} == demo ]]; then
-    "${pip[@]}" install -c constraints.txt -e '.[all]'
+    "${install[@]}" -e '.[all]'
     stamp+=-demo
 else
-    "${pip[@]}" install -c constraints.txt -e '.[dev]'
+    "${install[@]}" -e '.[dev]'
     # The benchmark's peers weigh 2 MB, but not every machine has wheels of them: without them their tests are skipped.
-    "${pip[@]}" install -c constraints.txt --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
+    "${install[@]}" --only-binary kiss-matcher,small_gicp -e '.[benchmarks]' ||
         echo "The benchmark's optional packages do not install here; tests of them will be skipped." >&2
     # Makes a client from the contract, in a test. Last, because it asks for an older typer than ours; it works with ours.
-    "${pip[@]}" install -c constraints.txt --no-deps openapi-python-client
+    "${install[@]}" --no-deps openapi-python-client
 fi
 if ! .venv/bin/python -c 'import open3d' 2>.venv/open3d-error.txt; then
     echo "open3d does not load; a system library is missing:" >&2

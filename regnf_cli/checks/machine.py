@@ -67,9 +67,9 @@ def _port(host: str, port: int) -> Finding:
 def _taken(subject: str, host: str, port: int, error: OSError) -> Finding:
     try:
         answer = httpx.get(f"http://{host}:{port}/version", timeout=5.0)
-        if answer.is_success and "engine_revision" in answer.text:
+        if answer.is_success and answer.json().get("name") == "regnf":
             return Finding(subject, "ok", f"regnf serves on {host}:{port}")
-    except httpx.HTTPError:
+    except (httpx.HTTPError, ValueError, AttributeError):
         pass
     hint = "Use another one: regnf serve --port 8081, or REGNF_PORT."
     return Finding(subject, "error", f"cannot be used on {host}: {error.strerror}", hint)

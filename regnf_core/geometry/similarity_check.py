@@ -19,7 +19,8 @@ def similarity_fault(rows: Any) -> str | None:
     if not all(abs(number) <= _MAX_NUMBER for row in rows for number in row):
         return f"a number is not finite, or larger than {_MAX_NUMBER:g}"
     if list(rows[3]) != [0, 0, 0, 1]:
-        return "the last row is not 0 0 0 1"
+        transposed = [row[3] for row in rows] == [0, 0, 0, 1]
+        return "the last row is not 0 0 0 1" + (", but the last column is: is it transposed?" if transposed else "")
     x, y, z = ([float(row[column]) for row in rows[:3]] for column in range(3))
     squared = (_dot(x, x) + _dot(y, y) + _dot(z, z)) / 3
     if squared < _MIN_SCALE**2:

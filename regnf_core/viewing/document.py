@@ -13,7 +13,7 @@ from regnf_core.field_notes import FieldNotes
 from regnf_core.geometry.metrics import errors_against_truth, paper_errors
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.geometry.symmetry import Symmetries
-from regnf_core.hints import HINTS
+from regnf_core.hints import verdict_hint
 from regnf_core.result import Alternative, ConsideredPose, IterationRecord, RegistrationResult
 from regnf_core.verdicts import verdict_in_words
 from regnf_core.version import __version__
@@ -50,7 +50,7 @@ def result_document(
         "verdict": result.verdict,
         "verdict_reason": result.verdict_reason,
         "verdict_detail": verdict_in_words(result.verdict_reason, result.verdict_limit),
-        "verdict_hint": HINTS.get(result.verdict_reason, ""),
+        "verdict_hint": verdict_hint(result.verdict_reason, result.options),
         "probability": None if result.probability is None else _json_number(result.probability),
         "T_scene_object": result.T_scene_object.to_dict(),
         "T_object_scene": result.T_object_scene.to_dict(),

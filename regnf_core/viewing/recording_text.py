@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from regnf_core.hints import HINTS
+from regnf_core.hints import verdict_hint
 from regnf_core.result import ConsideredPose, RegistrationResult
 from regnf_core.verdicts import verdict_in_words
 
@@ -16,7 +16,7 @@ def verdict_text(result: RegistrationResult, object_name: str | None = None) -> 
     """Verdict, reason, probability, hint, the transform and the poses that were judged, as Markdown."""
     reason = result.verdict_reason
     lines = [f"# {result.verdict}", "", f"**{reason}**: {verdict_in_words(reason, result.verdict_limit)}", ""]
-    if (hint := HINTS.get(reason)) is not None:
+    if hint := verdict_hint(reason, result.options):
         lines += [hint, ""]
     if object_name is not None:
         lines += [f"Object: `{object_name}`", ""]

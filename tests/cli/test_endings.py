@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.conftest import DATA
+from tests.contract.live import eventually
 
 SIGNALED = """
 import os, signal, sys
@@ -30,12 +32,8 @@ from regnf_cli.main import main
 sys.meta_path.insert(0, At())
 main()
 """
-PAIR = [
-    str(DATA / "mix-room.safetensors"),
-    str(DATA / "armchair.safetensors"),
-    "--detection",
-    str(DATA / "detection.json"),
-]
+ROOM, CHAIR, BOX = (str(DATA / name) for name in ("mix-room.safetensors", "armchair.safetensors", "detection.json"))
+PAIR = [ROOM, CHAIR, "--detection", BOX]
 CUT_OFF = [
     *[("SIGINT", name, ["register", *PAIR]) for name in ("typer", "rich", "pydantic", "regnf_cli.console", "numpy")],
     *[("SIGINT", name, ["register", *PAIR]) for name in ("regnf_cli.register", "torch", "torch._C", "torch.nn")],
@@ -86,6 +84,25 @@ def test_a_signal_ends_a_command_silently(name: str, module: str, command: list[
     lines = [line for line in done.stderr.splitlines() if line.strip() and "0:00:" not in line]  # the bar's last state
     assert (done.returncode, done.stdout, lines) == (128 + number, "", [])
     assert left(tmp_path) == []
+
+
+def test_an_interrupted_batch_ends_its_processes_silently(tmp_path: Path) -> None:
+    """A terminal sends Ctrl+C to every process of the group."""
+    pair = {"scene": ROOM, "object": CHAIR, "detection": BOX}
+    (tmp_path / "pairs.jsonl").write_text("".join(json.dumps(pair | {"seed": seed}) + "\n" for seed in range(40)))
+    results = tmp_path / "pairs.results.jsonl"
+    command = [sys.executable, "-m", "regnf_cli.main", "batch", "pairs.jsonl", "--jobs", "2"]
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    ) as running:  # fmt: skip
+        eventually(lambda: results.is_file() and results.read_text().count("\n") >= 1, "the first result")
+        os.killpg(running.pid, signal.SIGINT)
+        stdout, stderr = running.communicate(timeout=60)
+    assert (running.returncode, stdout) == (130, "")
+    said = [line for line in stderr.splitlines() if line.strip() and "0:00:" not in line and "━" not in line]
+    assert said == [f"40 pairs, 0 done; results in {results.name}", "interrupted: the same command goes on from here"]
 
 
 SWALLOWED = """

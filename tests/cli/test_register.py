@@ -85,9 +85,7 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     assert re.search(r"^center( +-?[\d.]+){3} in the scene, ±( [\d.e-]+){3} scene units$", said, flags=re.M)
     assert re.search(r"^scale +[\d.]+ object units for each scene unit, ± [\d.e-]+ %$", said, flags=re.M)
     assert re.search(r"^rotation +±( [\d.e-]+){3} degrees about the object's x, y, z$", said, flags=re.M)
-    assert re.search(
-        r"^symmetry +2 rotations about \(0\.00, 0\.00, 1\.00\) of the object look the same", said, flags=re.M
-    )
+    assert re.search(r"^symmetry +2 rotations about z of the object look the same", said, flags=re.M)
 
 
 @pytest.mark.parametrize(
@@ -95,10 +93,10 @@ def test_an_ambiguous_registration_ends_with_4_and_lists_the_alternatives(run: R
     [
         ({"order": 1, "axis": None, "continuous": False}, "none"),
         ({"order": 4, "axis": None, "continuous": False}, "4 rotations look the same, the identity included"),
-        ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any rotation about (0.00, 0.00, 1.00) of the object"),
+        ({"order": 1, "axis": [0, 0, 1], "continuous": True}, "any rotation about z of the object"),
         (
             {"order": 2, "axis": [1, 0, 0], "continuous": True},
-            "any rotation about (1.00, 0.00, 0.00) of the object, and",
+            "any rotation about x of the object, and",
         ),
     ],
 )

@@ -21,7 +21,7 @@ BOXES = [
     Case("YAML", "MALFORMED_JSON", 2, "b.json", "not JSON", "Write it as JSON", "center: [0, 0, 0]"),
     Case("empty detection", "MALFORMED_JSON", 2, "b.json", "value is expected", "It is empty", ""),
     Case("cut off", "MALFORMED_JSON", 2, "b.json", "not JSON", "ends too early", '{"center": [0, 0, 0]'),
-    Case("NaN", "INVALID_DETECTION", 2, r"b.json: detection.center\[0\] is NaN", "expected a finite", "Leave", '{"center": [NaN, 0, 0], "size": [1, 1, 1]}'),
+    Case("NaN", "INVALID_DETECTION", 2, r"b.json: detection.center\[0\] is NaN", "expected a finite", "leave such boxes out", '{"center": [NaN, 0, 0], "size": [1, 1, 1]}'),
     Case("numbers as texts", "INVALID_DETECTION", 2, r'center\[0\] is the text "0"', "expected a number", "quotation", '{"center": ["0", 0, 0], "size": [1, 1, 1]}'),
     Case("no size", "INVALID_DETECTION", 2, "detection.size", "is missing", FORMS, '{"center": [0, 0, 0]}'),
     Case("misspelled member", "INVALID_DETECTION", 2, "detection.cnter", "not a member", "Did you mean `center`", '{"cnter": [0, 0, 0], "size": [1, 1, 1]}'),

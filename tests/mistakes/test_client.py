@@ -90,7 +90,7 @@ MADE = [
     Case("address without http", "INVALID_ADDRESS", 0, "127.0.0.1:8080", "no http://", "Did you mean http://127.0.0.1:8080", {"address": "127.0.0.1:8080"}),
     Case("scheme misspelled", "INVALID_ADDRESS", 0, "htp://localhost", "no http://", "regnf serve", {"address": "htp://localhost"}),
     Case("token with Bearer", "INVALID_TOKEN", 0, "token", "characters", "without `Bearer`", {"token": "Bearer the-secret-of-alice"}),
-    Case("token with a line break", "INVALID_TOKEN", 0, "token", "characters", "line breaks", {"token": "the-secret-of-alice\n"}),
+    Case("token with a line break", "INVALID_TOKEN", 0, "token", "characters", "line breaks", {"token": "the-secret\nof-alice"}),
 ]  # fmt: skip
 
 

@@ -71,10 +71,18 @@ def test_a_port_in_use(run: Run, folder: Path) -> None:
 def test_two_services_on_one_state_folder(run: Run, folder: Path) -> None:
     from regnf_cli.state_lock import StateLock
 
-    with StateLock(folder / "state"):
+    with StateLock(folder / "state") as held:
+        held.note(address="http://127.0.0.1:1")
         outcome = run("serve", "--state-dir", "state", "--port", 0)
     assert outcome.code == 3
-    Case("", "", 3, "STATE_DIR_IN_USE .*/state", "another `regnf serve` uses", "--state-dir").check(outcome.stderr)
+    Case(
+        "",
+        "",
+        3,
+        "STATE_DIR_IN_USE .*/state",
+        rf"another `regnf serve` \(process {os.getpid()}, http://127.0.0.1:1\) uses",
+        "--state-dir",
+    ).check(outcome.stderr)
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,30 @@ _OTHER_FILES = (
     (b"version https://git-lfs", "a Git LFS pointer, not the file itself; run `git lfs pull`, and give it again"),
     (b"<!doctype html", "an HTML page, not a field; the download failed, or it needs a login"),
     (b"<html", "an HTML page, not a field; the download failed, or it needs a login"),
-    (b"<?xml", "an XML document, not a field; the download failed, or it is another file"),
+    (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),
     (b"\x89PNG", "a PNG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
     (b"\xff\xd8\xff", "a JPEG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
+    *(
+        (magic, f"{what}, which is not read; export it as .glb, .ply, .obj or .stl")
+        for magic, what in (
+            (b"Kaydara FBX", "an FBX file"),
+            (b"; FBX", "an FBX file"),
+            (b"ISO-10303-21", "a STEP file"),
+            (b"#usda", "a USD file"),
+            (b"PXR-USDC", "a USD file"),
+            (b"<robot", "a robot's description"),
+            (b"<sdf", "a world's description"),
+            (b"<mujoco", "a robot's description"),
+            (b"BLENDER", "a Blender file"),
+            (b"# vtk DataFile", "a VTK file"),
+            (b"3D Geometry File Format", "a Rhino file"),
+            (b"AC10", "a DWG drawing"),
+            (b"#VRML", "a VRML file"),
+            (b"#X3D", "an X3D file"),
+            (b"LASF", "a LAS file"),
+            (b"ASTM-E57", "an E57 file"),
+        )
+    ),
     (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
     (b"%PDF", "a PDF document, not a field"),
     (
