@@ -21,9 +21,8 @@ from regnf_service.http.middleware import RequestContext, TokenGate
 from regnf_service.http.origin_gate import OriginGate
 from regnf_service.http.query import refuse_unknown_parameters
 from regnf_service.http.rate_limits import RateGate, RateLimiter, RedisRateLimiter
-from regnf_service.http.request_gate import RequestGate
 from regnf_service.http.routes import LENIENT_ROUTERS, ROUTERS
-from regnf_service.http.turns import TurnGate
+from regnf_service.http.turns import RequestGate, TurnGate
 from regnf_service.http.write_limits import WriteGate
 from regnf_service.lifespan import lifespan_of
 from regnf_service.metrics import Measured, Metrics

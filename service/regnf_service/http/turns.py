@@ -1,4 +1,4 @@
-"""In which order requests begin, when more come in than can be answered at once.
+"""In which order requests begin when more come in than can be answered at once, and how many of a caller go on.
 
 A few begin in each turn of the event loop. Callers take turns. Of one caller the connection goes first that was
 answered longest ago: who asks now and then is not behind connections that ask without a pause, or are made anew.
@@ -12,10 +12,13 @@ from collections import OrderedDict
 from itertools import count
 
 from starlette.datastructures import Headers
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from regnf_service.concurrency import whose
+from regnf_service.concurrency import Slots, whose
 from regnf_service.http.connections import site_of
+from regnf_service.http.middleware import is_open
+from regnf_service.http.problems import problem_response
+from regnf_service.problem import Problem
 from regnf_service.tokens import Callers, caller_of
 from regnf_state.ownership import ANONYMOUS
 
@@ -86,3 +89,42 @@ class TurnGate:
             whose.set(who)
             await self._turns.come(who, quiet_since)
         await self._app(scope, receive, send)
+
+
+class RequestGate:
+    """Refuses the requests of a caller that has ``slots`` of them in progress, before any of them waits for a thread.
+
+    Each uses a connection that cannot be closed for others.
+
+    Where no token is asked for, an address counts as a caller. What needs no token elsewhere is not counted.
+    """
+
+    def __init__(self, app: ASGIApp, slots: Slots) -> None:
+        self._app = app
+        self._slots = slots
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or is_open(scope):
+            await self._app(scope, receive, send)
+            return
+        who = fair_key(scope, scope["state"]["caller"])
+        try:
+            self._slots.take(who)
+        except Problem as problem:
+            await problem_response(problem, scope)(scope, receive, send)
+            return
+        held = [who]
+
+        def free() -> None:
+            while held:
+                self._slots.free(held.pop())
+
+        async def send_last(message: Message) -> None:
+            if message["type"] == "http.response.body" and not message.get("more_body", False):
+                free()  # whether its client reads the answer is not the caller's next request's concern
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_last)
+        finally:
+            free()
