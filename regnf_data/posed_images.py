@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from regnf_core.geometry.box import OrientedBox
@@ -65,7 +66,7 @@ class PosedImages:
         T_world_local[:3, 3] = origin
 
         def box(one: OrientedBox) -> OrientedBox:
-            return replace(one, center=scale * (one.center - origin), size=scale * one.size)
+            return replace(one, center=scale * (one.center - torch.from_numpy(origin)), size=scale * one.size)
 
         def of_local(T: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
             return None if T is None else T @ T_world_local
