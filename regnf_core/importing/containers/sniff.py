@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from regnf_core.importing.containers.sniff_mesh import HEAD_BYTES, sniff_mesh
-
-__all__ = ["HEAD_BYTES", "RUN_ARCHIVES", "explain_refusal", "sniff_format"]
+from regnf_core.importing.containers.sniff_mesh import HEAD_BYTES as HEAD_BYTES
+from regnf_core.importing.containers.sniff_mesh import sniff_mesh
 
 _SQLITE_MAGIC = b"SQLite format 3\x00"
 _VDB_MAGICS = (b" BDV", b"NanoVDB")
