@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.base import SdfField, field_repr
 from regnf_core.fields.color import ColorFunction, color_in_frame, has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation, observation_of
 from regnf_core.geometry.sim3 import Sim3
@@ -29,6 +29,9 @@ class TransformedField:
         self.T_field_frame: Sim3 = T_field_frame
         if has_color(field):
             self.color = color_in_frame(field, T_field_frame)
+
+    def __repr__(self) -> str:
+        return field_repr(self)
 
     @property
     def bounds(self) -> Tensor:
