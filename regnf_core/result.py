@@ -110,7 +110,7 @@ class RegistrationResult:
     metrics: dict[str, float]
     """residual_rms (object diameters, both directions), inlier_share_scene, inlier_share_object, iterations,
     field_evaluations, and seconds by phase as seconds_<phase>. The preset `robust` adds ``probability`` and more:
-    docs/reference/metrics.md."""
+    the manual lists them all."""
     trace: list[IterationRecord]
     residuals: dict[str, Tensor]
     """Per point of both clouds: scene_points, scene_residuals, object_points, object_residuals; object units."""

@@ -59,7 +59,7 @@ def color_in_unit(field: ColoredField, scale: float) -> ColorFunction:
 
 def _color_in_frame(field: ColoredField, T_field_frame: Sim3, points: Tensor, directions: Tensor) -> Tensor:
     moved = T_field_frame.apply(points.double())
-    return field.color(moved, directions @ T_field_frame.rotation.to(directions).T)
+    return field.color(moved, directions @ T_field_frame.rotation.to(directions).T).float()
 
 
 def _color_in_unit(field: ColoredField, scale: float, points: Tensor, directions: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from typing import Any
 import anyio
 import pytest
 
+from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_state.blobs.base import StorageFullError, StorageUnavailableError
 from tests.contract.bad_input import GOOD, PNG, PUT_GOOD, TOO_LARGE, announced
 from tests.contract.world import World, assert_refused, field_bytes, make_world, sha256
@@ -127,14 +128,15 @@ def test_too_large_is_noticed_by_count(world: World) -> None:
 
 def test_an_unknown_kind_is_refused_before_the_rest_is_sent(world: World) -> None:
     sent = []
+    begun = PNG.ljust(HEAD_BYTES, b"\0")
 
     def pieces() -> Iterator[bytes]:
-        for piece in (PNG, b"rest"):
+        for piece in (begun, b"rest"):
             sent.append(piece)
             yield piece
 
     assert_refused(world.client.post("/fields", content=pieces()), 415, "FIELD_NOT_RECOGNIZED")
-    assert sent == [PNG]
+    assert sent == [begun]
 
 
 def raw_call(app: Any, messages: list[dict[str, Any]], headers: list[tuple[bytes, bytes]] | None = None) -> Any:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from threading import Lock
 from typing import Any
 
@@ -13,10 +14,11 @@ import httpx
 import pytest
 from redis import Redis
 
+from regnf_core.importing.containers.sniff import HEAD_BYTES
 from regnf_state.blobs.local import LocalBlobWriter
 from regnf_state.pieces import MOST_PIECES, Pieces
 from tests.contract.bad_input import announced
-from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, sha256
+from tests.contract.world import ALICE, BOB, TOKENS, World, assert_refused, field_bytes, make_world, sha256
 
 DATA = field_bytes("in pieces", 2000)
 NAME = sha256(DATA)
@@ -94,9 +96,10 @@ def test_the_digest_of_a_piece_is_compared(world: World) -> None:
     assert put(world, 0, 700, headers={"Content-Digest": announced(DATA[:700])}).status_code == 202
 
 
-def test_a_file_that_is_no_field_is_refused_with_its_first_piece(world: World) -> None:
-    picture = b"\x89PNG\r\n\x1a\n" + b"\0" * 2000
-    assert_refused(put(world, 0, 1500, picture), 415, "FIELD_NOT_RECOGNIZED")
+def test_a_file_that_is_no_field_is_refused_with_its_first_piece(tmp_path: Path, any_redis: Redis) -> None:
+    world = make_world(tmp_path, any_redis, max_upload_bytes=4 * HEAD_BYTES)
+    picture = b"\x89PNG\r\n\x1a\n" + b"\0" * 2 * HEAD_BYTES
+    assert_refused(put(world, 0, HEAD_BYTES, picture), 415, "FIELD_NOT_RECOGNIZED")
     assert world.blobs.blobs == {}
 
 

@@ -112,10 +112,13 @@ class World:
     def succeed(self, job_id: str, artifacts: dict[str, bytes] | None = None, pending: Sequence[str] = ()) -> None:
         """What a worker leaves behind in the end; ``pending`` is still to come."""
         attempt = self.run(job_id).attempt
-        listed = self._put(job_id, attempt, {"result.json": json.dumps(RESULT).encode()} | (artifacts or {}))
+        files = {"result.json": json.dumps(RESULT).encode()} | (artifacts or {})
+        listed = self._put(job_id, attempt, files)
         document = {"attempt": attempt, "artifacts": listed} | ({"pending": list(pending)} if pending else {})
         self.blobs.put(f"jobs/{job_id}/manifest.json", json.dumps(document).encode())
-        self.records.update_job(job_id, attempt, status="successful", verdict=RESULT["verdict"])
+        self.records.update_job(
+            job_id, attempt, status="successful", verdict=json.loads(files["result.json"]).get("verdict")
+        )
 
     def finish(self, job_id: str, artifacts: dict[str, bytes]) -> None:
         """What it leaves behind of what was still to come."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from regnf_core.importing.containers.sniff_mesh import sniff_mesh
 
-HEAD_BYTES = 16 * 1024
+HEAD_BYTES = 4096
 """How many first bytes are looked at: text may have a license before its first statement."""
 
 _SQLITE_MAGIC = b"SQLite format 3\x00"

@@ -21,7 +21,7 @@ _OBJ_WORDS = frozenset(
 """The statements of the format's specification."""
 _OBJ_FEW = 8
 """Statements that decide: by then every writer has written one that no other text begins with."""
-_LONG_COMMENT = 4096
+_LONG_COMMENT = 2048
 """Bytes of comments, and nothing else, before the first statement: of the formats taken only OBJ has such."""
 _CONTROL = frozenset(range(32)) - frozenset(b"\t\n\v\f\r")
 

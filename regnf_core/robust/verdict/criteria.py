@@ -54,9 +54,9 @@ class _Limit:
         return -1.0 if math.isnan(slack) else slack
 
     def __str__(self) -> str:
-        # As few digits as tell the two apart: 0.6996 is not "0.7, at least 0.7".
-        texts = ((f"{self.value:.{digits}g}", f"{self.limit:.{digits}g}") for digits in (3, 5, 17))
-        value, limit = next((pair for pair in texts if pair[0] != pair[1]), (str(self.value), str(self.limit)))
+        value, limit = f"{self.value:.3g}", f"{self.limit:.3g}"
+        if value == limit:  # 0.6996 is not "0.7, at least 0.7"
+            value, limit = str(self.value), str(self.limit)
         return f"{self.name} {value}, " + (
             f"at most {limit} is allowed" if self.upper else f"at least {limit} is needed"
         )

@@ -40,7 +40,7 @@ def test_a_mesh_comes_back(kind: str, tmp_path: Path) -> None:
 
 def test_a_grid_holds_the_field_s_values(tmp_path: Path) -> None:
     bounds = torch.tensor([[-1.0, -0.5, -0.7], [1.0, 0.6, 0.7]], dtype=torch.float64)
-    field = Formula(lambda points: points @ torch.tensor([1.0, 10.0, 100.0]), bounds)
+    field = Formula(lambda points: points @ torch.tensor([1.0, 10.0, 100.0]).to(points), bounds)
     shape = write_grid(field, tmp_path / "grid.npz", 20)
     grid = np.load(tmp_path / "grid.npz", allow_pickle=False)
     assert shape == grid["sdf"].shape == (21, 12, 15)

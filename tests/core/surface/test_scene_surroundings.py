@@ -20,7 +20,7 @@ def test_points_lie_on_the_floor_and_leave_the_box_out() -> None:
     assert len(cloud.points) > 1500
     assert not ROUND_THE_BALL.contains(cloud.points).any()
     assert cloud.points[:, 2].abs().max() < 0.01
-    torch.testing.assert_close(cloud.normals[:, 2], torch.ones(len(cloud.points)), atol=1e-4, rtol=0)
+    torch.testing.assert_close(cloud.normals[:, 2], torch.ones(len(cloud.points)).to(cloud.normals), atol=1e-4, rtol=0)
     assert cloud.points[:, :2].abs().max() <= 1.0
 
 

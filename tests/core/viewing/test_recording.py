@@ -101,7 +101,7 @@ def test_points_are_those_of_the_result(found: regnf.Registered, rows: Rows) -> 
         ("/scene/surroundings", found.surroundings.points),
         ("/scene/object/samples", found.object_samples.points),
     ):
-        assert np.array_equal(np.array(rows[entity][0]["Points3D:positions"], dtype=np.float32), points.numpy())
+        assert np.array_equal(np.array(rows[entity][0]["Points3D:positions"], dtype=np.float32), points.float().numpy())
 
 
 def test_in_the_end_the_object_has_the_colors_of_its_residuals(found: regnf.Registered, rows: Rows) -> None:
@@ -155,7 +155,7 @@ def test_each_pose_that_was_judged_is_an_entity(found: regnf.Registered, tmp_pat
         expected = np.linalg.inv(np.asarray(pose.T_object_scene))
         np.testing.assert_allclose(matrix_of(placed), expected, atol=2e-6)
         (samples,) = rows[f"/scene/considered/{number}/samples"]
-        assert np.array_equal(np.array(samples["Points3D:positions"], dtype=np.float32), few.numpy())
+        assert np.array_equal(np.array(samples["Points3D:positions"], dtype=np.float32), few.float().numpy())
     assert samples["Points3D:labels"] == ["1.2 %, LOW_OVERLAP"]
     colors = colors_of(samples)
     assert (colors[[0, 2, 3]] == colors[0]).all()

@@ -152,6 +152,8 @@ NO_REASONS = frozenset(
         "OMP_NUM_THREADS",
         "OPENBLAS_NUM_THREADS",
         "REGNF_NATIVE",
+        "CESIUM_RTC",
+        "FUNCTION_UNUSABLE",  # of functions in Python, which no gate sees
     }
 )
 """Words of the same form that name warnings, files, attributes and variables of the environment."""
