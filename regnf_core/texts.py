@@ -21,6 +21,9 @@ _LITERALS = {"None": "null", "True": "true", "False": "false"}
 _TRAILING_COMMA = re.compile(r",\s*[}\]]")
 _CURLED = "\N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}\N{DOUBLE LOW-9 QUOTATION MARK}"
 
+for _name in ("cp1252", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-le", "utf-32-be"):
+    codecs.lookup(_name)  # now: the import's process may load no module once it is confined
+
 
 class TextError(ValueError):
     """Bytes that are no text in any encoding that is tried. The message goes on from "FILE is "; it repeats nothing."""
