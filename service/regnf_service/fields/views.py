@@ -2,48 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 
-from starlette.requests import Request
-from starlette.responses import Response
-
-from regnf_service.concurrency import in_thread
-from regnf_service.http.etags import IfNoneMatch, field_etag
-from regnf_service.http.ranges import file_answer
 from regnf_service.problem import Problem
 from regnf_service.services import Services
-from regnf_state.field_views import view_key
 from regnf_state.records import FieldRecord, StaleAttemptError
 
 _AGAIN = {"Retry-After": "1"}
-_CACHING = "private, max-age=3600"
 
 
-async def view_answer(
-    request: Request,
-    services: Services,
-    record: FieldRecord,
-    names: Sequence[str],
-    reason: str,
-    media_type: str,
-    held: IfNoneMatch,
-) -> Response:
-    """The first of the files ``names`` that a ready field has.
+def missing_view(services: Services, record: FieldRecord, reason: str) -> Problem:
+    """What is to be said of a view that is not there: ``reason``. Blocking.
 
-    Raises Problem ``reason``; with Retry-After while a worker is to make them, which it does sooner for this call.
+    With Retry-After while a worker is to make it, which it does sooner for this call.
     """
-    if record.state == "ready":
-        headers = {"ETag": field_etag(record), "Cache-Control": _CACHING}
-        for name in names:
-            with suppress(FileNotFoundError):
-                key = view_key(record.sha256, name)
-                return await file_answer(request, services.blobs, key, media_type, headers, held)
-    raise await in_thread(_missing, services, record, reason)
-
-
-def _missing(services: Services, record: FieldRecord, reason: str) -> Problem:
-    """What is to be said of a view that is not there. A worker is told that somebody asks for it."""
     if record.state != "ready":
         return Problem(reason)
     if record.views is None:  # imported by an earlier release
