@@ -45,6 +45,7 @@ import numpy as np
 from benchmarks.service_load.house import House, running_house
 from benchmarks.service_load.report import headed, load, write
 from benchmarks.service_load.small_fields import SmallPair, write_small_pair
+from benchmarks.service_load.webhook_receiver import SECRET
 from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
 from regnf_core.library_entries import EntryNotes
 from regnf_state.blobs.local import LocalBlobStore
@@ -267,7 +268,7 @@ async def uploads(alice: Alice) -> None:
     async def one(number: int) -> None:
         for again in count():
             header = json.dumps({"__metadata__": {"n": f"{number} {again}"}}).encode()
-            data = (len(header).to_bytes(8, "little") + header).ljust(8 << 20, b"\n--")
+            data = (len(header).to_bytes(8, "little") + header) + b"\n--b" * (2 << 20)
             part = b'--b\r\nContent-Disposition: form-data; name="file"; filename="f"\r\n\r\n'
             kind, body = "application/octet-stream", data
             if number % 2:
@@ -456,6 +457,7 @@ def measure(folder: Path, name: str | None, seconds: float, connections: int) ->
         settings: dict[str, Any] = {
             "api_tokens": json.dumps([f"{who}:{token}" for who, token in _TOKENS.items()]),
             "webhook_hosts": json.dumps([f"http://127.0.0.1:{receiver}"]),
+            "webhook_secrets": json.dumps([f"alice:{SECRET}"]),
             "quota_stored_bytes": 300 << 20,
             "write_limit_per_s": 100,
         }

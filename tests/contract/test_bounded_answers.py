@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
@@ -283,3 +283,31 @@ def cut_off(live: Live) -> int:
         line.split()[-1] for line in text.splitlines() if 'regnf_connections_refused_total{cause="unread"}' in line
     ]
     return int(float(found[0])) if found else 0
+
+
+def test_large_bodies_of_one_caller_are_bounded_by_the_number_of_its_uploads(worlds: Callable[..., World]) -> None:
+    """Each would be a mebibyte in memory for as long as its client takes to send it."""
+    world = worlds(max_uploads_per_caller=2)
+    sending, go_on = asyncio.Event(), asyncio.Event()
+
+    async def large_body() -> AsyncIterator[bytes]:
+        yield b" " * 20_000
+        sending.set()
+        await go_on.wait()
+        yield b"{}"
+
+    async def run() -> tuple[int, int, list[int]]:
+        transport = httpx.ASGITransport(world.app)
+        headers = {"Content-Type": "application/json"}
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost", headers=headers) as client:
+            held = [asyncio.create_task(client.post("/register", content=large_body())) for _ in range(2)]
+            async with asyncio.timeout(20):
+                await sending.wait()
+                while (taken := world.app.state.services.uploads.taken) < 2:
+                    await asyncio.sleep(0.01)
+            small = await client.post("/register", content=b"{}")
+            go_on.set()
+            return taken, small.status_code, [(await one).status_code for one in held]
+
+    assert asyncio.run(run()) == (2, 422, [422, 422])
+    assert world.app.state.services.uploads.taken == 0

@@ -8,7 +8,6 @@ from starlette.requests import Request
 
 from regnf_service.http.pace import Pace
 from regnf_service.problem import CLOSE, Problem
-from regnf_state.settings import Settings
 
 
 def declared_length(request: Request, besides: int = 0) -> int | None:
@@ -56,12 +55,3 @@ async def chunks(request: Request, limit: int, pace: Pace, too_large: str = "UPL
         more = message.get("more_body", False)
     if declared is not None and received != declared:
         raise Problem("UPLOAD_INCOMPLETE", headers=CLOSE)
-
-
-async def read_small(request: Request, settings: Settings) -> bytes:
-    """A whole body for JSON, of at most the settings' size. Raises as ``chunks``, with REQUEST_TOO_LARGE."""
-    refuse_encoding(request)
-    body = bytearray()
-    async for data in chunks(request, settings.max_request_bytes, Pace(settings), "REQUEST_TOO_LARGE"):
-        body += data
-    return bytes(body)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Query
@@ -12,15 +14,15 @@ from regnf_core.field_candidates import MOST_CANDIDATES
 from regnf_core.field_views import MESH_NAMES, PICTURE_NAME
 from regnf_service.concurrency import blocking, in_thread
 from regnf_service.fields.redescribe import redescribe
+from regnf_service.fields.views import missing_view
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.description_change import described_anew
 from regnf_service.http.digests import is_sha256
-from regnf_service.http.etags import IfNoneMatchDep, field_etag
-from regnf_service.http.field_answers import view_answer
+from regnf_service.http.etags import IfNoneMatch, IfNoneMatchDep, field_etag
 from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.parsing import read_body
+from regnf_service.http.parsing import read_json
 from regnf_service.http.ranges import file_answer
 from regnf_service.http.routes.documentation import (
     BINARY,
@@ -37,6 +39,7 @@ from regnf_service.http.schemas.references import reference
 from regnf_service.http.waiting import wait_for
 from regnf_service.problem import CLOSE, Problem
 from regnf_service.services import Services
+from regnf_state.field_views import view_key
 from regnf_state.originals import candidate_key
 from regnf_state.ownership import reference_of
 from regnf_state.queue import Work
@@ -46,6 +49,7 @@ router = APIRouter(tags=["fields"])
 _PATCHES = (JSON, "application/merge-patch+json")
 _NUMBERS = frozenset(str(number) for number in range(1, MOST_CANDIDATES + 1))
 _CHANGE = {"schema": reference(FieldChange)}
+_PRIVATE_HOUR = "private, max-age=3600"
 _PICTURE_ANSWERS: dict[int | str, dict[str, Any]] = {
     200: {"description": "Two views of the surface and a section.", "content": {"image/png": BINARY}},
     304: NOT_MODIFIED,
@@ -113,7 +117,7 @@ async def get_field_preview(
     Made once the field is ready, as the mesh is.
     """
     record = await in_thread(_require, services, caller, sha256)
-    return await view_answer(request, services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND", "image/png", held)
+    return await _view_answer(request, services, record, (PICTURE_NAME,), "FIELD_PREVIEW_NOT_FOUND", "image/png", held)
 
 
 @get_and_head(
@@ -146,7 +150,7 @@ async def get_field_mesh(
     record = await in_thread(_require, services, caller, sha256)
     fine, coarse = MESH_NAMES
     names = (coarse, fine) if detail == "coarse" else (fine,)
-    return await view_answer(request, services, record, names, "FIELD_MESH_NOT_FOUND", "model/gltf-binary", held)
+    return await _view_answer(request, services, record, names, "FIELD_MESH_NOT_FOUND", "model/gltf-binary", held)
 
 
 @get_and_head(
@@ -174,6 +178,24 @@ async def get_candidate_picture(
         return await file_answer(request, services.blobs, key, "image/png", headers, held)
     except FileNotFoundError as error:
         raise Problem("FIELD_PREVIEW_NOT_FOUND") from error
+
+
+async def _view_answer(
+    request: Request,
+    services: Services,
+    record: FieldRecord,
+    names: Sequence[str],
+    reason: str,
+    media_type: str,
+    held: IfNoneMatch,
+) -> Response:
+    """The first of the files ``names`` that a ready field has. Raises Problem ``reason``."""
+    headers = {"ETag": field_etag(record), "Cache-Control": _PRIVATE_HOUR}
+    for name in names if record.state == "ready" else ():
+        with suppress(FileNotFoundError):
+            key = view_key(record.sha256, name)
+            return await file_answer(request, services.blobs, key, media_type, headers, held)
+    raise await in_thread(missing_view, services, record, reason)
 
 
 @router.get(
@@ -217,6 +239,7 @@ def list_fields(
             "MALFORMED_JSON",
             "UPLOAD_INCOMPLETE",
             "UPLOAD_STALLED",
+            "TOO_MANY_UPLOADS",
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",
             "INVALID_REQUEST",
@@ -242,7 +265,7 @@ async def patch_field(
     """
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
-    change = await read_body(FieldChange, await body.read_small(request, services.settings))
+    change = await read_json(request, services, caller, FieldChange)
     record, imported = await in_thread(_changed, services, caller, sha256, change)
     headers = {"ETag": field_etag(record)} | ({"Retry-After": "1"} if imported else {})
     return JSONResponse(field_document(record, prefix), status_code=202 if imported else 200, headers=headers)

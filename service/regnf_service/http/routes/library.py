@@ -15,7 +15,7 @@ from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuer
 from regnf_service.http.etags import IfNoneMatch
 from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
-from regnf_service.http.parsing import read_body
+from regnf_service.http.parsing import read_json
 from regnf_service.http.ranges import file_answer
 from regnf_service.http.routes.documentation import BINARY, JSON, header, refusals
 from regnf_service.http.routes.pages import HTML, page
@@ -41,6 +41,7 @@ _BODY_REFUSALS = (
     "MALFORMED_JSON",
     "UPLOAD_INCOMPLETE",
     "UPLOAD_STALLED",
+    "TOO_MANY_UPLOADS",
     "REQUEST_TOO_LARGE",
     "UNSUPPORTED_MEDIA_TYPE",
     "INVALID_REQUEST",
@@ -98,7 +99,7 @@ async def post_library(request: Request, services: ServicesDep, caller: CallerDe
     """
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
-    asked = await read_body(NewEntry, await body.read_small(request, services.settings))
+    asked = await read_json(request, services, caller, NewEntry)
     notes = EntryNotes.checked(asked.name, asked.tags, asked.unit, asked.note, _plain(asked.symmetry))
     entry, created = await in_thread(add_entry, services, caller, asked.field, notes)
     document = entry_document(entry, prefix)
@@ -132,7 +133,7 @@ async def patch_library_entry(
     (RFC 7396)."""
     if body.media_type(request) not in _PATCHES:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", f"Send {' or '.join(_PATCHES)}.", headers=CLOSE)
-    change = await read_body(EntryChange, await body.read_small(request, services.settings))
+    change = await read_json(request, services, caller, EntryChange)
     entry = await in_thread(_changed, services, caller, name, change)
     return JSONResponse(entry_document(entry, prefix))
 

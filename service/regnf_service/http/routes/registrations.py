@@ -18,7 +18,7 @@ from regnf_service.http.by_reference import Library, asked_by_reference
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
-from regnf_service.http.parsing import read_body
+from regnf_service.http.parsing import read_json, read_text
 from regnf_service.http.routes.documentation import (
     FILE,
     JSON,
@@ -132,9 +132,7 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
 
 
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
-    settings = services.settings
-    text = await body.read_small(request, settings)
-    spec = await read_body(RegisterRequest, text)
+    spec = await read_json(request, services, caller, RegisterRequest)
     asked, named = await in_thread(asked_by_reference, Library(services, caller), spec)
     await in_thread(check_fields, services, caller, asked, named)
     return asked
@@ -161,7 +159,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
-        spec = await read_body(RegistrationSpec, parts["request"])
+        spec = await read_text(RegistrationSpec, parts["request"])
         said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}
         beside = {name: Beside(said[name], await configs[name].received(), role=name) for name in _ROLES}

@@ -15,7 +15,7 @@ from regnf_service.concurrency import in_thread
 from regnf_service.http import body
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.json_size import MOST_VALUES_WITH_CAMERAS
-from regnf_service.http.parsing import read_body
+from regnf_service.http.parsing import read_json
 from regnf_service.http.routes.documentation import JSON, refusals
 from regnf_service.http.routes.examples import RENDER_EXAMPLES
 from regnf_service.http.routes.submitting import (
@@ -54,6 +54,7 @@ router = APIRouter(tags=["renderings"])
             "REQUEST_TOO_LARGE",
             "UNSUPPORTED_MEDIA_TYPE",
             "UPLOAD_STALLED",
+            "TOO_MANY_UPLOADS",
             "UPLOAD_INCOMPLETE",
             "INVALID_REQUEST",
             "INVALID_OPTIONS",
@@ -94,8 +95,7 @@ async def render(
     check_idempotency_key(idempotency_key)
     if body.media_type(request) != JSON:
         raise Problem("UNSUPPORTED_MEDIA_TYPE", "Send application/json.", headers=CLOSE)
-    text = await body.read_small(request, services.settings)
-    said = await read_body(RenderBody, text, most_values=MOST_VALUES_WITH_CAMERAS)
+    said = await read_json(request, services, caller, RenderBody, MOST_VALUES_WITH_CAMERAS)
     asked = await in_thread(_checked, services, caller, said)
     return await answer(services, caller, prefix, asked, Asking(dry_run, prefer, idempotency_key))
 
