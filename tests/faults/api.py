@@ -26,7 +26,7 @@ from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 class DyingQueue(RqJobQueue):
     """A queue that the process does not reach."""
 
-    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS) -> None:
+    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
