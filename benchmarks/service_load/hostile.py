@@ -207,6 +207,8 @@ async def requests(alice: Alice) -> None:
             writer.write(head + long[:-100_000])
             for begin in range(len(long) - 100_000, len(long), 8192):
                 await asyncio.sleep(1.0)
+                if writer.is_closing() or reader.at_eof():
+                    break
                 writer.write(long[begin : begin + 8192])
             await reader.read(1 << 16)
             writer.close()
