@@ -54,7 +54,7 @@ BEFORE: list[tuple[Case, Call]] = [
     (Case("pair beyond the lists", "PAIR_UNKNOWN", 0, r"no pair \(1, 0\)", "1 detections", "count from 0"), lambda c: c.register_batch(SCENE, [BOX], [OBJECT], [(1, 0)])),
     (Case("one object for a search", "INVALID_INPUT", 0, "objects", "must be a list", r"\[object\]"), lambda c: c.search(SCENE, OBJECT, BOX)),
     (Case("search among nothing", "LIBRARY_EMPTY", 0, "objects", "is empty", "choose among"), lambda c: c.search(SCENE, [], BOX)),
-    (Case("file that is no field", "FORMAT_NOT_RECOGNIZED", 0, "photo.png", "picture|image|PNG", "docs/families.md|checkpoint"), lambda c: c.upload("photo.png")),
+    (Case("file that is no field", "FORMAT_NOT_RECOGNIZED", 0, "photo.png", "picture|image|PNG", "docs/import-gate.md|checkpoint"), lambda c: c.upload("photo.png")),
 ]  # fmt: skip
 AFTER: list[tuple[Case, Call]] = [
     (Case("field that is not there", "FIELD_NOT_FOUND", 404, "field", "Upload|no such", "upload"), lambda c: c.register(ANY, ANY, BOX)),

@@ -46,10 +46,10 @@ CASES = [
     Case("gzip archive", "FILE_TRUNCATED", 2, "a.tar.gz", "cut short", "again", "a.tar.gz", write("a.tar.gz", b"\x1f\x8b\x08\0\0\0")),
     Case("notes", "FORMAT_NOT_RECOGNIZED", 2, "notes.txt", FIELD, "checkpoint|mean", "notes.txt", write("notes.txt", b"to do")),
     Case("bare pickle", "RAW_PICKLE", 2, "a.pkl", "torch.save", "Save it again", "a.pkl", write("a.pkl", b"\x80\x04\x95\0\0\0\0}.")),
-    Case("zip of other things", "RUN_WITHOUT_CHECKPOINT", 2, "a.zip", "checkpoint", "regnf manual families", "a.zip", write("a.zip", zip_bytes([("a.txt", b"to do")]))),
+    Case("zip of other things", "RUN_WITHOUT_CHECKPOINT", 2, "a.zip", "checkpoint", "regnf manual import-gate", "a.zip", write("a.zip", zip_bytes([("a.txt", b"to do")]))),
     Case("truncated checkpoint", "FILE_TRUNCATED", 2, "cut.ckpt", "cut short", "again", "cut.ckpt", cut_checkpoint),
     Case("truncated safe field", "SAFE_FORMAT_INVALID", 2, "a.safetensors", "safetensors", "again|docs", "a.safetensors", lambda folder: (folder / "a.safetensors").write_bytes((DATA / "armchair.safetensors").read_bytes()[:3000])),
-    Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "no known", "regnf manual families", "other.ckpt", foreign_checkpoint),
+    Case("checkpoint of another network", "FIELD_NOT_RECOGNIZED", 2, "other.ckpt.*encoder", "no known", "regnf manual import-gate", "other.ckpt", foreign_checkpoint),
 ]  # fmt: skip
 
 

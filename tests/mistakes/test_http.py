@@ -55,9 +55,9 @@ CASES = [
     Case("upload under another hash", "DIGEST_MISMATCH", 400, f"/fields/{ANY}", "announced", "sha256sum", {"method": "PUT", "path": f"/fields/{ANY}", "content": field_bytes("a")}),
     Case("upload under a file's name", "INVALID_DIGEST", 400, "/fields/room.ckpt", "64 lower-case", "sha256sum", {"method": "PUT", "path": "/fields/room.ckpt", "content": field_bytes("a")}),
     Case("empty upload", "UPLOAD_EMPTY", 400, "/fields", "no bytes", "curl --data-binary", {"path": "/fields", "content": b""}),
-    Case("upload of a picture", "FIELD_NOT_RECOGNIZED", 415, "a PNG picture", "field is expected", "docs/families.md", {"path": "/fields", "content": b"\x89PNG\r\n\x1a\n" + bytes(600)}),
+    Case("upload of a picture", "FIELD_NOT_RECOGNIZED", 415, "a PNG picture", "field is expected", "docs/import-gate.md", {"path": "/fields", "content": b"\x89PNG\r\n\x1a\n" + bytes(600)}),
     Case("upload of a Git LFS pointer", "FIELD_NOT_RECOGNIZED", 415, "Git LFS pointer", "not the file itself", "git lfs pull", {"path": "/fields", "content": b"version https://git-lfs.github.com/spec/v1\n" + bytes(600)}),
-    Case("upload of JSON", "FIELD_NOT_RECOGNIZED", 415, "The file is", "formats", "docs/families.md", {"path": "/fields", "content": json.dumps({"a": [0.5] * 200}).encode()}),
+    Case("upload of JSON", "FIELD_NOT_RECOGNIZED", 415, "The file is", "formats", "docs/import-gate.md", {"path": "/fields", "content": json.dumps({"a": [0.5] * 200}).encode()}),
     Case("job of no such id", "JOB_NOT_FOUND", 404, "/jobs/x", "unknown|deleted", "GET /jobs", {"method": "GET", "path": "/jobs/x"}),
     Case("unknown query parameter", "INVALID_QUERY", 400, "parameters", "unknown", "errors", {"path": "/register?dryrun=true"}),
 ]  # fmt: skip

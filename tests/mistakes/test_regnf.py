@@ -30,8 +30,8 @@ def batch(detections: Any, **more: Any) -> Any:
 CASES = [
     Case("scene misspelled", "FILE_NOT_FOUND", 0, "rom.safetensors", "no such file", "Did you mean room.safetensors", registered("rom.safetensors")),
     Case("object misspelled", "FILE_NOT_FOUND", 0, "chiar.safetensors", "no such file", "Did you mean chair.safetensors", registered(obj="chiar.safetensors")),
-    Case("no scene", "NO_FIELD", 0, "the scene is a NoneType", "expected a field or its path", "open_field", registered(None)),
-    Case("array for an object", "NO_FIELD", 0, "the object is a ndarray", "expected a field or its path", "open_field", registered(obj=np.zeros((3, 3)))),
+    Case("no scene", "NO_FIELD", 0, "the scene is of the type NoneType", "expected a field or its path", "open_field", registered(None)),
+    Case("array for an object", "NO_FIELD", 0, "the object is of the type numpy ndarray", "expected a field or its path", "open_field", registered(obj=np.zeros((3, 3)))),
     Case("settings for a field", "FORMAT_NOT_RECOGNIZED", 0, "config.yml", "expected a field", "step-000030000.ckpt", registered("run/config.yml")),
     Case("text for options", "INVALID_OPTIONS", 0, "options is a str", "expected a dictionary", "up_axis", registered(options="robust")),
     Case("option misspelled", "INVALID_OPTIONS", 0, "options.upaxis", "no such option", "did you mean `up_axis`", registered(options={"upaxis": "z"})),

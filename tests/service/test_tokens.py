@@ -39,7 +39,7 @@ def test_a_token_has_one_caller(tmp_path: Path) -> None:
     with pytest.raises(TokensError, match="same token") as refused:
         read_callers([f"alice:{SECRET}", f"bob:{SECRET}"], None)
     assert SECRET not in str(refused.value)
-    with pytest.raises(TokensError, match="FileNotFoundError"):
+    with pytest.raises(TokensError, match="cannot be read"):
         create_app(Settings(state_dir=tmp_path, api_tokens_file=tmp_path / "none"))
 
 

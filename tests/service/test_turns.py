@@ -120,6 +120,6 @@ def test_threads_go_round_between_callers_and_none_has_all() -> None:
         await ask(threads, "last")
 
     asyncio.run(all_at_once())
-    assert set(begun[4:8]) >= {"honest", "other"}
+    assert set(begun[4:14]) >= {"honest", "other"}, "long before the last of the greedy one"
     assert most["greedy"] <= 3
     assert Counter(begun) == {"greedy": 29, "honest": 2, "other": 1, "last": 1}

@@ -12,7 +12,7 @@ from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.manifest import read_manifest
 from regnf_state.redis.jobs import RedisRecordStore
 from regnf_state.redis.webhook_outbox import RedisOutbox
-from tests.state.captured import members_before, put_back
+from tests.state.captured import put_back
 from tests.state.journal_world import World, fresh_world
 from tests.state.record_makers import change, job, started
 from tests.stores import HeldBlobs
@@ -75,20 +75,6 @@ def test_the_journal_of_the_release_before_is_read(upgraded: World) -> None:
     upgraded.rebuilder.run_if_needed()
     after = {job.id: job.status for job in upgraded.records.list_jobs(None, 100, None).records}
     assert after == before | {"running": "accepted"}
-
-
-def test_a_rollback_finds_the_members_that_it_knows_and_no_others(world: World) -> None:
-    """The reader of the release before refuses every other member."""
-    world.field()
-    world.accept(webhook="https://hooks.example/1")
-    world.run()
-    world.end("failed")
-    for kind, key in (("job", "regnf:job:j1"), ("field", f"regnf:field:{'a' * 64}")):
-        assert set(json.loads(world.redis.hget(key, "document"))) == members_before(kind)  # type: ignore[arg-type]
-    for key in ("journal/jobs/j1/000001-ended", f"journal/fields/{'a' * 64}"):
-        with world.blobs.open(key) as file:
-            kind = "job" if "jobs" in key else "field"
-            assert members_before(kind) <= set(json.load(file)), "it leaves out what it does not know"
 
 
 # members of a later release
