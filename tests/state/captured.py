@@ -34,12 +34,3 @@ _PUT: dict[str, Any] = {
     "stream": _stream,
     "string": lambda redis, key, value: redis.set(key, value),
 }
-
-
-def members_before(kind: str) -> set[str]:
-    """The members of a document of the earlier release. Its reader takes no others."""
-    hashes = [value for key, (shape, value) in CAPTURED["redis"].items() if shape == "hash"]
-    documents = [json.loads(value["document"]) for value in hashes if "document" in value]
-    mark = {"job": "request", "field": "state"}[kind]
-    (members,) = {frozenset(one) for one in documents if mark in one}
-    return set(members)
