@@ -250,6 +250,24 @@ def test_refused(mend: Change, reason: str, folder: Path) -> None:
     assert refused.value.reason == reason, refused.value
 
 
+LOST = [[float("nan")] * 4] * 4
+
+
+def test_frames_of_lost_cameras_are_left_out(folder: Path) -> None:
+    whole = load_dataset(folder)
+    change(folder, set_frame(camtoworld=LOST))
+    rest = load_dataset(folder)
+    assert len(rest) == len(whole) - 1
+    np.testing.assert_array_equal(rest.T_world_camera, np.delete(whole.T_world_camera, 1, axis=0))
+
+
+def test_a_dataset_of_lost_cameras_alone_is_refused(folder: Path) -> None:
+    change(folder, lambda metadata: [frame.update(camtoworld=LOST) for frame in metadata["frames"]])
+    with pytest.raises(DatasetError) as refused:
+        load_dataset(folder)
+    assert refused.value.reason == "DATASET_POSE_NOT_RIGID"
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
