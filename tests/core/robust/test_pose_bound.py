@@ -12,6 +12,7 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
 from regnf_core.registration import register
 from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.pipeline import WarmStart
 from regnf_core.robust.search.pose_bound import PoseBound
 from tests.core.robust.shapes import random_pose, reframed
 
@@ -80,13 +81,18 @@ def test_loosened() -> None:
     assert bound(0.1).loosened(2.0).admits(placed(1.3)).item()
 
 
-@pytest.mark.parametrize(("tolerance", "verdict"), [(0.0, "rejected"), (1.0, "registered")])
-def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str) -> None:
-    """Every edge of the box is .7 of the chair's."""
-    scene, obj, box, _ = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
+@pytest.mark.parametrize(
+    ("tolerance", "verdict", "reason"),
+    [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")],
+)
+def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str, reason: str) -> None:
+    """Every edge of the box is 0.7 of the chair's. The right pose is where the search begins, so it is the one judged."""
+    scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
     part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
     options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
-    assert register(scene, obj, part, options, seed=0, clouds=False).verdict == verdict
+    found = register(scene, obj, part, options, seed=0, warm_start=WarmStart(T_object_scene=truth), clouds=False)
+    assert (found.verdict, found.verdict_reason) == (verdict, reason)
+    assert float(found.T_object_scene.scale) == pytest.approx(float(truth.scale), rel=1e-3)
 
 
 def test_a_flat_boxs_thickness_is_compared_with_more_than_itself() -> None:
