@@ -86,7 +86,7 @@ def test_loosened() -> None:
     [(0.0, "rejected", "OUTSIDE_DETECTION"), (1.0, "registered", "SURFACES_AGREE")],
 )
 def test_around_a_part_the_tolerance_decides(tolerance: float, verdict: str, reason: str) -> None:
-    """Every edge of the box is 0.7 of the chair's. The right pose is where the search begins, so it is the one judged."""
+    """Every edge of the box is 0.7 of the chair's. The search begins at the right pose, so it is the one judged."""
     scene, obj, box, truth = reframed(random_pose(1, 1.0), random_pose(2, 1.0))
     part = OrientedBox(box.center, 0.7 * box.size, box.rotation)
     options = RegistrationOptions.from_dict({"robust": {"box_tolerance": tolerance}})
