@@ -22,7 +22,7 @@ from regnf_state.settings import MIB, Settings
 
 _DRAIN_S = 5
 """How long open requests may go on once the process is told to stop."""
-_MOST_UNREAD = 128 * MIB
+_MOST_UNREAD = 64 * MIB
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _SHED = 64
 _SWITCH_S = 0.001

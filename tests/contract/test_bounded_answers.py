@@ -270,7 +270,7 @@ def test_answers_that_nobody_reads_take_little_memory(unread: Live, path: str) -
         ended = cut_off(unread)
         for _ in range(400):
             stack.enter_context(silent(unread, path))
-        assert eventually(lambda: cut_off(unread) > ended or 400 * size < 32 * MIB, "the first that is cut off", 20)
+        assert eventually(lambda: cut_off(unread) > ended or 400 * size < 16 * MIB, "the first that is cut off", 20)
         assert client.get("/healthz").status_code == 200
         assert unread.peak_memory() - before <= 64 * MIB
         assert len(client.get(path).content) == size, "whoever reads is served"

@@ -309,14 +309,14 @@ def test_a_process_that_cannot_begin_takes_nothing_with_it(table: Bench, breaks:
     table.submit("draw_for_ever", "drawn")
     assert table.finished("drawn").status == "successful"
     (drawing,) = children_of(worker.pid)
-    folders = sorted(table.context.settings.scratch_dir.glob("*"))
+    folders = sorted(table.context.settings.scratch_dir.glob("[!.]*"))
     (table.context.settings.state_dir / "break").touch()
     table.submit("succeed")
     failed = table.finished()
     assert (failed.status, (failed.error or {}).get("reason")) == ("failed", reason), table.log()
     assert alive(drawing)
     assert worker.poll() is None
-    assert sorted(table.context.settings.scratch_dir.glob("*")) == folders
+    assert sorted(table.context.settings.scratch_dir.glob("[!.]*")) == folders
     assert table.context.queue.live_workers() == 1
     manifest = read_manifest(table.context.blobs, "drawn")
     assert manifest is not None

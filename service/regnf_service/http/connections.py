@@ -9,6 +9,7 @@ bytes of answers wait to be read than may, the caller that has most of them lose
 from __future__ import annotations
 
 import asyncio
+import gc
 import ipaddress
 import math
 import time
@@ -20,6 +21,9 @@ _SWEEP_EVERY_S = 1.0
 _RANKING_SHARE = 0.1
 """Of the time at most. Sorting thousands for each new connection would be a way to keep the server busy."""
 _IPV6_SITE = 64
+_GARBAGE_SHARE = 8
+_COLLECT_AFTER_S = 0.05
+"""Until the calls of the connections that were lost have come to their end."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ class Connections:
         self._most_unread = most_unread
         self._unread: dict[Guarded, tuple[str, int]] = {}
         self._unread_of: Counter[str] = Counter()
+        self._abandoned = 0
         self._open: set[Guarded] = set()
         self._of_site: Counter[str] = Counter()
         self._ranked: dict[str, list[Guarded]] = {}
@@ -107,13 +112,21 @@ class Connections:
         return True
 
     def remove(self, one: Guarded) -> None:
-        """It has ended."""
+        """It has ended. What its client has not read is freed soon.
+
+        A call that is cut off leaves circles of references, through tracebacks, that hold pieces of its answer. Nothing
+        else would start a garbage collection for few large objects.
+        """
         if one in self._open:
             self._open.remove(one)
             self._of_site[one.site] -= 1
             if not self._of_site[one.site]:
                 del self._of_site[one.site]
+        self._abandoned += self._unread.get(one, ("", 0))[1]
         self._forget_unread(one)
+        if self._abandoned > self._most_unread // _GARBAGE_SHARE:
+            self._abandoned = 0
+            asyncio.get_running_loop().call_later(_COLLECT_AFTER_S, gc.collect)
 
     def note_unread(self, one: Guarded, who: str, size: int) -> None:
         """So many bytes of an answer to a call of ``who`` wait until the client of ``one`` reads them."""

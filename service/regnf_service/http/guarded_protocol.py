@@ -88,7 +88,9 @@ class GuardedProtocol(H11Protocol):
         await app(scope, receive, send_in_blocks)
 
     def _count_unread(self) -> None:
-        self._held.note_unread(self, self._who, self._pending + self.transport.get_write_buffer_size())
+        """An answer that waits takes about a block more than its bytes (measured): buffers on the way, the call."""
+        unread = self._pending + self.transport.get_write_buffer_size()
+        self._held.note_unread(self, self._who, unread + _BLOCK_BYTES if unread else 0)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._held.remove(self)
