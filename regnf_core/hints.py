@@ -145,9 +145,10 @@ HINTS: dict[str, str] = {
     "INVALID_SYMMETRY": "docs/how-to/symmetry.md shows how a symmetry is said.",
     "INITIAL_TRANSFORM_UNSUPPORTED": "Leave the initial transform out, or use the preset robust.",
     "NO_SURFACE_IN_SCENE": "Check the scene's bounds and its sign: positive outside, negative inside.",
-    "NO_SURFACE_IN_TARGET": "Check that the box encloses the object.",
-    "TARGET_OUTSIDE_GRID": "Use a box within the field's bounds; `regnf inspect` shows them.",
-    "NO_PICTURE": "Register with pictures, or draw one: `regnf inspect FILE --picture field.png`.",
+    "NO_SURFACE_IN_TARGET": "Give a mesh with triangles that have an area, or a field with a surface; "
+    "`regnf inspect FILE` shows what a file holds.",
+    "TARGET_OUTSIDE_GRID": "Scale it: `regnf fit MESH FIELD --extent 1.0`; in Python `fit(..., extent=1.0)`.",
+    "NO_PICTURE": "Convert the field to a grid, which is faster, and draw that: `regnf convert FILE grid.npz`.",
     "OBJECT_MODEL_INVALID": "Delete it: it is made again when it is needed.",
     "FIELD_NOT_FINITE": "The training may have diverged: give an earlier checkpoint.",
     "FIELD_NOT_A_FUNCTION": "Give the checkpoint that the trainer wrote; docs/import-gate.md lists what is taken.",

@@ -298,7 +298,11 @@ REASONS: dict[str, Reason] = {
         422, "No initial transform", "No initial transform was found. Object and scene may have no shape in common."
     ),
     "CANCELLED": Reason(409, "Cancelled", "The job stopped because it was cancelled."),
-    "FIELD_IMPORT_TIMEOUT": Reason(422, "Import took too long", "The field could not be converted in time."),
+    "FIELD_IMPORT_TIMEOUT": Reason(
+        422,
+        "Import took too long",
+        "A job waited too long for the import of one of its fields. An import that is itself too slow is `IMPORT_TIMEOUT`.",
+    ),
     "JOB_TIMEOUT": Reason(500, "Job took too long", "The job exceeded its time and was stopped."),
     "WORKER_LOST": Reason(500, "Worker lost", "The worker vanished twice while it ran this job. Post it again."),
     "OUT_OF_MEMORY": Reason(500, "Out of memory", "The job needed more memory than the worker has."),

@@ -1,4 +1,4 @@
-"""What a neighbour who can write to Redis may do: records and queue entries with random faults, put there by hand."""
+"""What a neighbor who can write to Redis may do: records and queue entries with random faults, put there by hand."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class RenderOptions:
 
     mode: Literal["surface", "volume"] = "surface"
     """surface: where rays first meet the zero level. volume: NeuS's opacity along the ray; it shows how sharp a field
-    is, and takes about four times as long."""
+    is, and takes three to four times as long."""
     coloring: Literal["auto", "field", "shaded"] = "auto"
     """auto: the field's colors where it has some, else shading. field: an error where it has none. shaded: never."""
     tints: bool = True

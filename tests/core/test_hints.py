@@ -1,4 +1,4 @@
-"""What a person is told to do next: for every reason something, and nothing that is not there."""
+"""What a person is told to do next: for every reason something, and nothing that is not there. The manual has all."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from regnf_core.hints import _FAMILIES, HINTS, hint_of, verdict_hint
 from regnf_core.importing.containers.sniff import explain_refusal, sniff_format
 from regnf_core.options import RegistrationOptions, _names
 from regnf_core.rendering.options import RenderOptions
+from regnf_state.reasons import REASONS
 from regnf_state.settings import Settings
 
 ROOT = Path(__file__).parents[2]
@@ -51,6 +52,24 @@ def reasons() -> Iterator[str]:
                 yield str(node.value.value)
 
 
+def constants() -> Iterator[tuple[ast.AST, str]]:
+    """Every literal text of the code, with what it stands in."""
+    for path in (path for top in (*PACKAGES, "service") for path in (ROOT / top).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for child in ast.iter_child_nodes(node):
+                if isinstance(child, ast.Constant) and isinstance(child.value, str):
+                    yield node, child.value
+
+
+def reasons_of_classes() -> Iterator[str]:
+    """Those that errors have by their class, or as the default of a function that makes them."""
+    for node, text in constants():
+        is_default = isinstance(node, ast.arguments) and "reason" in {one.arg for one in node.args}
+        is_assigned = isinstance(node, ast.Assign | ast.AnnAssign) and "reason" in ast.unparse(node).partition("=")[0]
+        if (is_assigned or is_default) and re.fullmatch(r"[A-Z]+(_[A-Z]+)+", text):
+            yield text
+
+
 def hinted_on_the_spot() -> set[str]:
     """Reasons of which each use of the code gives a hint of its own."""
     always: dict[str, bool] = {}
@@ -69,6 +88,30 @@ def test_every_reason_has_a_hint() -> None:
     named = set(reasons())
     assert len(named) > 100
     assert {one for one in named if hint_of(one) is None} - hinted_on_the_spot() - HAVE_IT_IN_THEIR_MESSAGE == set()
+
+
+def test_the_manual_lists_every_reason_and_no_other() -> None:
+    pages = [
+        path for path in (ROOT / "docs").rglob("*.md") if "adr" not in path.parts and path.stem != "worlds-history"
+    ]
+    manual = {path.name: path.read_text(encoding="utf-8") for path in pages}
+    named = {*reasons(), *reasons_of_classes(), *HINTS, *REASONS}
+    assert len(named) > 250
+    assert {one for one in named if not any(f"`{one}`" in text for text in manual.values())} == set()
+    tables = [
+        line
+        for name in ("errors.md", "import-gate.md", "datasets.md", "fitting.md")
+        for line in manual[name].splitlines()
+    ]
+    first = {
+        one
+        for line in tables
+        if line.startswith("| `")
+        for one in re.findall(r"`([A-Z]+(?:_[A-Z]+)+)`", line.split("|")[1])
+    }
+    written = {word for _, text in constants() for word in re.findall(r"[A-Z][A-Z0-9_]+", text)}
+    assert len(first) > 200
+    assert first - written == set()
 
 
 def test_every_page_that_a_hint_names_is_there() -> None:
