@@ -96,6 +96,15 @@ class Journal:
         keys = (key.removeprefix(f"{_JOBS}/").split("/") for key in self._blobs.list(_JOBS))
         return (job_id for job_id, _ in groupby(parts[0] for parts in keys))
 
+    def accepted(self, job_id: str) -> JobRecord | None:
+        """The job as it was last accepted, with all of its request; None where nothing is written that can be read."""
+        keys = [key for key in self._blobs.list(_folder(job_id)) if key.endswith("-accepted")]
+        try:
+            return self._read(job_id, int(max(keys).rpartition("/")[2].partition("-")[0]), "accepted") if keys else None
+        except UnreadableRecordError as error:
+            logger.error("%s in the journal", error)
+            return None
+
     def recall(self, job_id: str, now: float) -> JobRecord | None:
         """The job as it continues: ended as it did, or to be run as an attempt that did not exist before."""
         try:

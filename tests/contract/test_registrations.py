@@ -151,6 +151,22 @@ def test_a_search_is_a_job_like_any_other(world: World) -> None:
     assert record.request["candidates"] == sorted(sha256(field_bytes(name)) for name in ("chair", "table"))
 
 
+@pytest.mark.parametrize("kind", ["one object", "a search"])
+def test_a_job_that_has_ended_says_what_was_asked_for(world: World, kind: str) -> None:
+    turned = [[0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    one = world.valid_request() | {"initial_transform": turned, "pictures": False}
+    request = library(world, "chair", "table") if kind == "a search" else one
+    request |= {"seed": 3, "options": {"up_axis": "y", "robust": {"rotations": 99}}}
+    job = world.client.post("/register", json=request).json()
+    address = f"/jobs/{job['id']}"
+    world.records.update_job(job["id"], 1, status="failed", error={"reason": "NO_SURFACE_IN_DETECTION"})
+    again = world.client.get(f"{address}/request").json()
+    assert again["options"]["robust"]["rotations"] == 99
+    assert world.client.delete(address).status_code == 204
+    answer = world.client.post("/register", json=again)
+    assert (answer.status_code, answer.json()["id"]) == (202, job["id"])
+
+
 def test_the_order_of_candidates_and_their_spelling_say_nothing(world: World) -> None:
     request = library(world, "chair", "table", "can")
     spelled = [{"field": sha} for sha in reversed(request["candidates"])]

@@ -17,7 +17,7 @@ from regnf_service.http.page_requests import wants_page
 from regnf_service.http.paging import decode_token, encode_token
 from regnf_service.http.routes.documentation import NOT_MODIFIED, header, refusals
 from regnf_service.http.routes.pages import HTML, page
-from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document
+from regnf_service.http.schemas.jobs import JobDocument, JobPage, Status, job_document, request_document
 from regnf_service.http.waiting import wait_for
 from regnf_service.jobs.identity import digest
 from regnf_service.jobs.lookup import find_job
@@ -30,6 +30,7 @@ from regnf_state.redis.webhook_outbox import Delivery
 router = APIRouter(tags=["jobs"])
 _RETRY_AFTER_S = "1"
 _EVENT_ID = {"pattern": "^[0-9]{1,19}(-[0-9]{1,19})?$"}
+_REQUEST = {"$ref": "#/components/schemas/RegisterRequest"}
 _EVENT = {
     "description": "One event of the stream.",
     "type": "object",
@@ -139,6 +140,21 @@ async def get_job(
     if wait and not held.given:
         seen = await in_thread(_seen, services, seen.record)
     return held.apply(_answer(services, seen, prefix, 200))
+
+
+@router.get(
+    "/jobs/{id}/request",
+    summary="What a registration was asked for",
+    responses={200: {"content": {"application/json": {"schema": _REQUEST}}}, **refusals("JOB_NOT_FOUND", "JOB_EXPIRED")},
+)
+@blocking
+def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
+    """The body of `POST /register`, without the webhook, to be posted again as it is or with other options."""
+    record = find_job(services, id, caller)
+    accepted = services.records.journal.accepted(record.id)
+    if record.kind != "registration" or accepted is None:
+        raise Problem("JOB_NOT_FOUND", "The request of this job is not kept.")
+    return JSONResponse(request_document(accepted.request), headers={"Cache-Control": "no-cache"})
 
 
 @router.get(

@@ -13,6 +13,7 @@ from regnf_service.http.paging import NEXT_PAGE
 from regnf_service.http.schemas.common import Links, Moment, Outgoing, ProblemDocument, Sha256, outgoing_problem
 from regnf_service.http.schemas.results import Verdict
 from regnf_service.times import rfc3339
+from regnf_state.ownership import sha256_of
 from regnf_state.records import ACTIVE, WARNINGS, JobRecord
 from regnf_state.redis.webhook_outbox import Delivery
 
@@ -21,6 +22,7 @@ _PHASES = ["loading", "sampling", "initializing", "optimizing", "verifying", "ex
 # said in the contract alone: a record that an older version wrote is shown as it is
 _Phase = Annotated[str, WithJsonSchema({"type": "string", "enum": _PHASES})]
 _Verdict = Annotated[str, WithJsonSchema({"type": "string", "enum": list(get_args(Verdict))})]
+_NOT_ASKED_AGAIN = frozenset({"version", "webhook"})
 
 
 class WebhookDocument(Outgoing):
@@ -111,6 +113,18 @@ def job_document(
         "webhooks": [_webhook(url, one) for url, one in zip_longest(record.webhooks, deliveries)],
         "links": _links(record, f"{prefix}/jobs/{record.id}"),
     }
+
+
+def request_document(request: dict[str, Any]) -> dict[str, Any]:
+    """What a registration was asked for, to be posted again. request: of the job's record as it was accepted."""
+    asked = {name: value for name, value in request.items() if value is not None and name not in _NOT_ASKED_AGAIN}
+    asked["scene"] = sha256_of(asked["scene"])
+    if "object" in asked:
+        asked["object"] = sha256_of(asked["object"])
+    else:
+        asked["candidates"] = [sha256_of(one) for one in asked["candidates"]]
+    asked["detection"] = {name: value for name, value in asked["detection"].items() if value is not None}
+    return asked
 
 
 def _webhook(url: str, delivery: Delivery | None) -> dict[str, Any]:

@@ -4,8 +4,8 @@ import { told } from './api.js';
 import { el } from './dom.js';
 import { OptionsForm } from './options-form.js';
 
-/** Whether a job's request can be made anew from its documents: a search's candidates stand in its result alone. */
-export const canRunAgain = ({ kind, status, inputs }) => kind === 'registration' && Boolean(inputs?.object || status === 'successful');
+/** Whether a job that has ended can be asked for again with other options. */
+export const canRunAgain = ({ kind }) => kind === 'registration';
 
 /** Opens the form for a registration that has ended. */
 export async function runAgain(service, job) {
@@ -20,10 +20,10 @@ export async function runAgain(service, job) {
   document.body.append(dialog);
   dialog.showModal(); // at once: nothing else can be clicked while the answer is on its way
   try {
-    const result = job.status === 'successful' ? await service.json(`/jobs/${job.id}/result`) : {};
-    const form = new OptionsForm(host, service, result.options, job.inputs.seed);
+    const request = await service.json(`/jobs/${job.id}/request`);
+    const form = new OptionsForm(host, service, request.options, request.seed);
     await form.load();
-    start.onclick = () => post(service, requestOf(job, result, form), start, note);
+    start.onclick = () => post(service, { ...request, ...form.values(request.options.up_axis ?? 'z') }, start, note);
     start.disabled = false;
   } catch (error) {
     note.textContent = told(error);
@@ -39,15 +39,4 @@ async function post(service, request, start, note) {
     note.textContent = told(error);
     start.disabled = false;
   }
-}
-
-function requestOf(job, result, form) {
-  const { scene, object, detection } = job.inputs;
-  const candidates = object ? null : (result.candidates ?? []).map((one) => one.object);
-  return {
-    scene,
-    ...(object ? { object } : { candidates }),
-    detection: { center: detection.center, size: detection.size, rotation_quaternion_xyzw: detection.rotation_quaternion_xyzw },
-    ...form.values(result.options?.up_axis ?? 'z'),
-  };
 }
