@@ -344,6 +344,28 @@ def test_buttons_have_gaps_and_no_choice_is_cut(
     page.set_viewport_size({"width": 1280, "height": 800})
 
 
+@pytest.mark.parametrize(("on_paper", "alpha"), [(True, 0), (False, 255)])
+def test_the_paper_of_a_picture_is_left_out(visit: Visit, service: str, on_paper: bool, alpha: int) -> None:
+    """White paper would be a white box on a dark page; a rendered picture stays whole."""
+    visit.page.goto(f"{service}/fields")
+    found = visit.page.evaluate(
+        """async (onPaper) => {
+          const { canvasOf } = await import('/static/js/pictures.js');
+          const drawn = new OffscreenCanvas(60, 20);
+          const pencil = drawn.getContext('2d');
+          pencil.fillStyle = 'rgb(248 248 247)';
+          pencil.fillRect(0, 0, 60, 20);
+          pencil.fillStyle = 'rgb(200 205 210)';
+          pencil.fillRect(5, 5, 5, 5);
+          const canvas = await canvasOf(await drawn.convertToBlob(), 'a thing', null, onPaper);
+          const at = (x, y) => [...canvas.getContext('2d').getImageData(x, y, 1, 1).data];
+          return [at(1, 1)[3], at(7, 7)];
+        }""",
+        on_paper,
+    )
+    assert found == [alpha, [200, 205, 210, 255]]
+
+
 @pytest.fixture
 def phone(context_options: dict[str, Any]) -> None:
     context_options |= {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}

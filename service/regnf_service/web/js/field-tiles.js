@@ -42,7 +42,7 @@ export class FieldTiles {
       sayRole(field.sha256, select.value);
       this.store.tell();
     };
-    return el('label', { className: 'role note' }, 'This is ', select);
+    return el('label', { className: 'role note', title: 'Your choice is kept in this browser only.' }, 'This is ', select);
   }
 
   actions(field) {

@@ -33,7 +33,7 @@ export async function showStrip(api, names) {
   if (!names.includes(STRIP)) return;
   const blob = new Blob([await api.artifact(STRIP)]);
   const caption = 'Before, after';
-  const canvas = await canvasOf(blob, 'The scene before and after its edits, side by side');
+  const canvas = await canvasOf(blob, 'The scene before and after its edits, side by side', null, false);
   byId('in-scene-picture').replaceChildren(el('figure', {}, canvas, el('figcaption', { className: 'note' }, caption)));
   show(byId('in-scene'));
 }
