@@ -116,7 +116,7 @@ def _check_header(path: Path, names: list[str], line: int) -> None:
     try:
         _check_names(names)
         if len(set(names)) < len(names):
-            raise InvalidInputError("a name stands there twice", reason="INVALID_REQUEST", hint=_HEADER_HINT)
+            raise InvalidInputError("a column name occurs twice", reason="INVALID_REQUEST", hint=_HEADER_HINT)
     except InvalidInputError as error:
         hint = error.hint if error.hint and error.hint != _HINT else _HEADER_HINT
         raise InvalidInputError(f"{path}, line {line}, the header: {error}", reason=error.reason, hint=hint) from error
@@ -180,7 +180,7 @@ def _check_names(given: Collection[str]) -> None:
 
 def _fields(folder: Path, given: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
     if "candidates" in given and "object" in given:
-        message = "`object` and `candidates` are both given: one of them is taken"
+        message = "`object` and `candidates` are both given, expected one of them"
         raise InvalidInputError(message, reason="INVALID_REQUEST", hint=_HINT)
     several = given["candidates"] if "candidates" in given else [given["object"]]
     if not (isinstance(several, list) and several):

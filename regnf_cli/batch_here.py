@@ -168,7 +168,9 @@ def _require_nothing_of_one_object(start: object, truth: object) -> None:
     ):
         if given is not None:
             hint = f"Leave `{name}` out, or give `object` in place of `candidates`."
-            raise InvalidInputError(f"`{name}` is of one object, not of several candidates", reason=reason, hint=hint)
+            raise InvalidInputError(
+                f"`{name}` applies to one object, not to several candidates", reason=reason, hint=hint
+            )
 
 
 @lru_cache(_FIELDS_OPEN)

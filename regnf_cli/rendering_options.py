@@ -30,7 +30,9 @@ Request = Annotated[
 Size = Annotated[str | None, typer.Option(help="Of every picture; 480x360 by default.", metavar="WIDTHxHEIGHT")]
 ModeChoice = Annotated[
     Mode | None,
-    typer.Option(help="surface: the zero level (the default). volume: as NeuS renders; takes three to four times as long."),
+    typer.Option(
+        help="surface: the zero level (the default). volume: as NeuS renders; takes three to four times as long."
+    ),
 ]
 Frames = Annotated[int | None, typer.Option(min=1, max=MOST_FRAMES, help="Cameras on the orbit; 8 by default.")]
 Elevation = Annotated[float | None, typer.Option(help="Of the orbit above the horizon, degrees; 25 by default.")]

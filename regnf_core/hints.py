@@ -61,8 +61,8 @@ HINTS: dict[str, str] = {
     "CAMERAS_INTRINSICS_MISSING": "With regnf convert: --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT.",
     "CAMERAS_OF_ANOTHER_FRAME": "Give the trainer's settings, or dataset_transform in a description; or say which way "
     "cameras look: cameras.axes, opencv or opengl.",
-    "TRUNCATION_UNKNOWN": "Say the distance that the value 1 stands for: --scene-description '{\"truncation\": ...}'; "
-    "of an object --object-description, for inspect and convert --description, over HTTP the description's truncation.",
+    "TRUNCATION_UNKNOWN": "Give the distance that the value 1 stands for: --scene-description '{\"truncation\": ...}', "
+    "or --object-description; with inspect and convert --description; over HTTP `truncation` of the description.",
     "DATASET_NO_METADATA": "docs/datasets.md shows the layout: meta_data.json with frames, each with rgb_path, "
     "camtoworld and intrinsics.",
     "DATASET_METADATA_INVALID": "docs/datasets.md lists the members of meta_data.json.",
@@ -81,8 +81,8 @@ HINTS: dict[str, str] = {
     "DATASET_DEPTH_MISSING": "Name depth images with sensor_depth_path; 0 stands for no measurement.",
     "DATASET_TOO_LARGE": "Take fewer images, or smaller ones.",
     "DATASET_BOUNDS_EMPTY": "scene_box.aabb is the lowest corner, then the highest.",
-    "DATASET_NO_COLOR_VARIETY": "Without depths the colors are all there is to fit to: check the images.",
-    "DATASET_NOTHING_IN_BOUNDS": "Check the units of poses, depths and scene_box in meta_data.json: they are one.",
+    "DATASET_NO_COLOR_VARIETY": "Without depths only colors can be fitted. Check that the images are not of one color.",
+    "DATASET_NOTHING_IN_BOUNDS": "Poses, depths and scene_box in meta_data.json must have the same unit. Check them.",
     "DATASET_FRAMES_DISAGREE": "docs/datasets.md says what poses and depths are; --camera-axes takes poses of OpenGL.",
     "DATASET_OF_ANOTHER_FRAME": "Give the images that the field was made from, in the field's frame and unit.",
     "DATASET_FOLDER_NOT_EMPTY": "Give another folder, or empty it.",
@@ -120,7 +120,7 @@ HINTS: dict[str, str] = {
     "IMPORT_OUT_OF_MEMORY": "Make the file smaller (a coarser mesh or grid), use a machine with more memory, or set a "
     "higher limit for the service (REGNF_IMPORT_MEMORY_BYTES).",
     "IMPORT_OUTPUT_TOO_LARGE": "Make the field smaller: a coarser mesh or grid.",
-    "IMPORT_CRASHED": "Try it once more. If it ends so again, the service's log has the last words of the import.",
+    "IMPORT_CRASHED": "Try it once more. If it fails again, the service's log has the end of the import's output.",
     "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",
     "STORAGE_FULL": "Free space on the disk, or delete fields and jobs, then send it again.",
     "OUT_OF_MEMORY": "Use fewer samples, or a worker with more memory.",
@@ -170,7 +170,7 @@ _FAMILIES: dict[str, str] = {
     "CHECKPOINT_": "Begin the fit anew, without the checkpoint; docs/fitting.md says when one is used.",
     "LIBRARY_": "docs/how-to/library.md describes libraries.",
     "RECORDING_": "docs/how-to/recording.md describes recordings.",
-    "QUOTA_": "Wait until others of yours have ended, or delete some; docs/errors.md lists the quotas.",
+    "QUOTA_": "Wait until some of yours have ended, or delete some; docs/errors.md lists the quotas.",
     "TOO_MANY_": "Send fewer at once, and try again later.",
     "REDIS_": "docs/deployment.md describes how Redis is named and protected.",
     "STORAGE_": "docs/deployment.md describes storage.",

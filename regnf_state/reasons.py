@@ -164,7 +164,9 @@ REASONS: dict[str, Reason] = {
     ),
     "LIBRARY_EMPTY": Reason(422, "No objects in the library", "No entry of your library is meant. Check the tags."),
     "LIBRARY_TOO_LARGE": Reason(
-        422, "Too many objects", "More entries are meant than one search takes. Name fewer, or a tag that fewer have."
+        422,
+        "Too many objects",
+        "The request names more entries than one search takes. Name fewer, or a tag that fewer have.",
     ),
     # registration requests
     "INVALID_IDEMPOTENCY_KEY": Reason(
@@ -301,7 +303,7 @@ REASONS: dict[str, Reason] = {
     "FIELD_IMPORT_TIMEOUT": Reason(
         422,
         "Import took too long",
-        "A job waited too long for the import of one of its fields. An import that is itself too slow is `IMPORT_TIMEOUT`.",
+        "A job waited too long for the import of one of its fields. An import that is too slow is `IMPORT_TIMEOUT`.",
     ),
     "JOB_TIMEOUT": Reason(500, "Job took too long", "The job exceeded its time and was stopped."),
     "WORKER_LOST": Reason(500, "Worker lost", "The worker vanished twice while it ran this job. Post it again."),

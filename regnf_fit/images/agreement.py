@@ -94,9 +94,9 @@ class Agreement:
 
     def said(self) -> str:
         if self.places == 0:
-            return "no image sees a place that another one saw"
+            return "no two images see the same place"
         share = 100.0 * self.contradicting / self.places
-        return f"of {self.places} places that two of them saw, the other looked through {share:.2g} %"
+        return f"of {self.places} surface points in view of two images, {share:.2g} % are free space in the other image"
 
     @property
     def score(self) -> float:

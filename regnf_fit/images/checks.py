@@ -53,10 +53,10 @@ def check_seen(images: PosedImages, shown: int) -> None:
         return
     text = f"only {shown} pixels show anything within the bounds, {_box(images.bounds)}"
     if np.array_equal(images.bounds, USUAL_BOUNDS):
-        text += " (what is taken where meta_data.json has no scene_box)"
+        text += " (the default where meta_data.json has no scene_box)"
     origins, rays, depths = sampled_rays(images)
     if len(depths) == 0:
-        hint = None if images.masks is None else "Masks are true on the thing: are these the other way round?"
+        hint = None if images.masks is None else "Masks are true on the object. Are these the other way round?"
         raise DatasetError(text, reason="DATASET_NOTHING_IN_BOUNDS", hint=hint)
     ends = np.quantile(origins + depths[:, None] * rays, [0.05, 0.95], axis=0)
     text += f"; depths are {np.median(depths):.4g} in the median and end within {_box(ends)}"
@@ -89,7 +89,8 @@ def _unit_hint(images: PosedImages, origins: Floats, rays: Floats, depths: Float
             ends = of_origins * origins + of_depths * depths[:, None] * rays
             within = float(((ends >= images.bounds[0]) & (ends <= images.bounds[1])).all(axis=1).mean())
             told = f"divided by {1 / factor:.4g}" if factor < 1.0 else f"times {factor:.4g}"
-            text = f"Are {name} in {unit}? {told[0].upper()}{told[1:]}, {100 * within:.0f} % of the depths end within."
+            share = f"{100 * within:.0f} % of the depths end within the bounds"
+            text = f"Are {name} in {unit}? {told[0].upper()}{told[1:]}, {share}."
             found.append((within, of_depths / of_origins, text))
     most = max(within for within, _, _ in found)
     if most < _EXPLAINED:

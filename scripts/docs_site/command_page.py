@@ -13,8 +13,8 @@ _HEAD = """# Command line
 
 Made from the commands themselves; `regnf COMMAND --help` says the same. How they go together:
 [How-to](../how-to/index.md).
-Exit codes: 0 registered or done, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable, 70 an error of regnf itself,
-128 + N ended by the signal N.
+Exit codes: 0 registered or done, 4 ambiguous, 1 rejected, 2 bad input, 3 service unavailable,
+70 an error of regnf itself, 128 + N ended by the signal N.
 """
 
 

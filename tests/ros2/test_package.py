@@ -356,9 +356,7 @@ def test_a_wrong_parameter_ends_the_node_with_one_line(monkeypatch: pytest.Monke
         monkeypatch.setattr(sys.modules["rclpy"], name, lambda: None)
     log.fatal = log.info  # type: ignore[attr-defined]
     assert part("node").main() == 2
-    assert log.lines == [
-        "map_frame: expected a text, and YAML has made True of it; put it into quotes: map_frame:=\"'...'\""
-    ]
+    assert log.lines == ["map_frame: expected a text, but YAML reads True; put it into quotes: map_frame:=\"'...'\""]
 
 
 def test_the_token_is_in_a_file_or_a_variable_and_no_parameter(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def _overruled(description: dict[str, Any], overrides: UploadDescription) -> dic
     if placement is None:
         return changed
     if {"bounds", "frame"} & said.keys():
-        message = "a field that was placed, in its dataset's frame or far from the origin, stays there, with its bounds"
+        message = "the field's place is fixed (its dataset's frame, or far from the origin), and so are its bounds"
         raise FieldFormatError(f"description: {message}", reason="INVALID_DESCRIPTION")
     rows = [[*row[:3], ratio * row[3]] for row in placement["transform"][:3]] + [placement["transform"][3]]
     return changed | {"placement": {"transform": rows, "bounds": _times(ratio, placement["bounds"])}}

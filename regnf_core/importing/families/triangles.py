@@ -210,7 +210,7 @@ def _scattered(vertices: npt.NDArray[np.float32], faces: Int64Array) -> tuple[st
     graph = coo_array((np.ones(len(edges), np.int8), edges.T), shape=(len(vertices), len(vertices)))
     parts = int(connected_components(graph, directed=False)[0])
     if parts > _MANY_PARTS:
-        text = f"it has {parts} parts that do not touch: what is inside is decided for all together, which takes long"
+        text = f"it has {parts} parts that do not touch. Their inside is computed for all together, which takes long"
         found.append(f"MANY_PARTS: {text}")
     corners = vertices.astype(np.float64)[faces]  # (F, 3, 3)
     area = areas(vertices.astype(np.float64), faces)

@@ -131,7 +131,7 @@ def _distances(
     if truncation is None:
         largest = float(np.abs(blocks.tsdf[seen]).max())
         if largest > _LARGEST:
-            said = f"values up to {largest:.3g}, where those of a map divided by its truncation end at 1"
+            said = f"values up to {largest:.3g}, while values divided by the truncation are at most 1"
             raise FieldFormatError(f"the map's truncation is not in the file: {said}", reason="TRUNCATION_UNKNOWN")
         if (voxels := length_of_one(blocks.tsdf, seen, blocks.keys)) is not None:
             truncation = voxels * size

@@ -80,8 +80,8 @@ def _no_surface(distance: Tensor, is_mesh: bool) -> FieldFormatError:
     low, high = float(distance.min()), float(distance.max())
     if is_mesh:
         message = (
-            f"the mesh encloses nothing: all {len(distance)} places asked for in its bounds are free. Is it flat, do"
-            " its faces look both ways, or is it very small beside something far off? Close it, or give it a thickness"
+            f"the mesh encloses no volume: all {len(distance)} points tested in its bounds are free space. It may be"
+            " flat, double-sided, or very small beside a part far away. Close it, or give it a thickness"
         )
         return FieldFormatError(message, reason="NO_ZERO_LEVEL")
     where = "free" if low > 0 else "inside matter" if high < 0 else "without a sound gradient"

@@ -10,7 +10,7 @@ ARGUMENTS = {
     "server": ("http://127.0.0.1:8080", "Address of the regnf service."),
     "token_file": ("", "File with the service's access token. Without it that of the variable REGNF_API_TOKEN."),
     "scene": ("", "SHA-256 of the room's field."),
-    "objects": ("", 'CLASS=SHA256 of each object, one behind the other; or JSON: {"CLASS": "SHA256"}.'),
+    "objects": ("", 'CLASS=SHA256 of each object, with blanks between them; or JSON: {"CLASS": "SHA256"}.'),
     "map_frame": ("map", "The fixed frame that the room's field is in."),
     "dataparser_transforms": ("", "dataparser_transforms.json, if the room's field is in its trainer's frame."),
     "scale_tolerance": ("", "The objects' fields are in meters, give or take this share: 0.03 for instance."),

@@ -25,9 +25,7 @@ def text_of(name: str, value: Any) -> str:
     """A text. Raises ValueError where YAML has made something else of it: what was written is lost then."""
     if isinstance(value, str):
         return value.strip()
-    raise ValueError(
-        f"{name}: expected a text, and YAML has made {value!r} of it; put it into quotes: {name}:=\"'...'\""
-    )
+    raise ValueError(f"{name}: expected a text, but YAML reads {value!r}; put it into quotes: {name}:=\"'...'\"")
 
 
 def axis_of(name: str, value: Any) -> str:

@@ -47,7 +47,7 @@ async def check_piece(services: Services, caller: str, sha256: str, piece: Piece
     if piece.first != found.offset:
         raise _at("UPLOAD_OFFSET_MISMATCH", found.offset)
     if found.total not in (0, piece.total):
-        raise Problem("INVALID_HEADER", f"The pieces before are of a file of {found.total} bytes.", headers=CLOSE)
+        raise Problem("INVALID_HEADER", f"The earlier pieces are of a file of {found.total} bytes.", headers=CLOSE)
     if found.pieces >= MOST_PIECES:
         raise Problem("TOO_MANY_PIECES", f"At most {MOST_PIECES} pieces are taken.", headers=CLOSE)
 

@@ -40,7 +40,9 @@ class Library:
         if not meant:
             raise Problem("LIBRARY_EMPTY", errors=[{"pointer": "/candidates/library", "detail": "no entry is meant"}])
         if len(meant) > MAX_SELECTED:
-            raise Problem("LIBRARY_TOO_LARGE", f"{len(meant)} entries are meant; one search takes {MAX_SELECTED}.")
+            raise Problem(
+                "LIBRARY_TOO_LARGE", f"The request names {len(meant)} entries; one search takes {MAX_SELECTED} at most."
+            )
         return meant
 
     def _by_name(self, names: Mapping[str, str]) -> list[str]:

@@ -145,7 +145,10 @@ async def get_job(
 @router.get(
     "/jobs/{id}/request",
     summary="What a registration was asked for",
-    responses={200: {"content": {"application/json": {"schema": _REQUEST}}}, **refusals("JOB_NOT_FOUND", "JOB_EXPIRED")},
+    responses={
+        200: {"content": {"application/json": {"schema": _REQUEST}}},
+        **refusals("JOB_NOT_FOUND", "JOB_EXPIRED"),
+    },
 )
 @blocking
 def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response:  # noqa: A002
@@ -153,7 +156,7 @@ def get_request(id: str, services: ServicesDep, caller: CallerDep) -> Response: 
     record = find_job(services, id, caller)
     accepted = services.records.journal.accepted(record.id)
     if record.kind != "registration" or accepted is None:
-        raise Problem("JOB_NOT_FOUND", "The request of this job is not kept.")
+        raise Problem("JOB_NOT_FOUND", "The request of this job is not kept, or it is a rendering.")
     return JSONResponse(request_document(accepted.request), headers={"Cache-Control": "no-cache"})
 
 

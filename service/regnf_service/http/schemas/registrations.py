@@ -172,7 +172,7 @@ class RegisterRequest(RegistrationSpec):
         if info.data.get("initial_transform") is not None:
             raise PydanticCustomError(START_UNSUPPORTED, "a search of a library starts from no given transform")
         if info.data.get("ground_truth") is not None:
-            raise ValueError("a ground truth is of one object, not of several candidates")
+            raise ValueError("a ground truth applies to one object, not to several candidates")
         return names
 
     @model_validator(mode="after")

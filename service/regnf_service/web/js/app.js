@@ -60,7 +60,7 @@ async function main() {
 
 /** What can be done with a job that has ended. */
 function offerActs(job) {
-  const service = new Service(() => Promise.reject(new Error('The token is no longer taken. Reload the page.')));
+  const service = new Service(() => Promise.reject(new Error('The token is no longer valid. Reload the page.')));
   show(byId('run-again'), canRunAgain(job));
   show(byId('delete-job'));
   byId('run-again').onclick = () => runAgain(service, job);

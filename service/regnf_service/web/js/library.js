@@ -56,7 +56,7 @@ function draw() {
 
 async function remove(entry) {
   const what = `Take ${entry.name} out of the library?`;
-  const lost = 'Its name, tags, unit, note and what was said of its symmetry go. The field stays.';
+  const lost = 'Its name, tags, unit, note and symmetry are deleted. The field stays.';
   const act = () => service.request(`/library/${encodeURIComponent(entry.name)}`, { method: 'DELETE' });
   if (await askFirst({ what, lost, verb: 'Remove', act })) await refresh();
 }

@@ -90,7 +90,7 @@ export class SceneChoice {
     try {
       const field = await this.service.imported(sha256);
       if (isLatest() && field?.state === 'ready') await this.use(field, isLatest);
-      else if (isLatest()) this.fail(new Error('The service has no such field that is ready. It may have been deleted.'));
+      else if (isLatest()) this.fail(new Error('The service has no ready field with this digest. It may have been deleted.'));
     } catch (error) {
       if (isLatest()) this.fail(error);
     }
