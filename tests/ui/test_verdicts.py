@@ -71,6 +71,7 @@ def test_residual_colors_say_whose_they_are(visit: Visit) -> None:
 
 def test_deviations_are_the_documents(visit: Visit) -> None:
     page = visit.open("ambiguous")
+    expect(page.locator("#certainty-words")).to_contain_text("If the pose is right, it is known: its center to ± ")
     shown = numbers(page.locator("#sigmas .mono:last-child").all_inner_texts())
     assert shown == [0.003, 0.001, 0.002, 0.4, 0.8, 0.2, 0.5]
     widths = [

@@ -24,7 +24,7 @@ export function showCertainty(result) {
   show(byId('certainty'), Boolean(uncertainty || symmetry));
 }
 
-/** How well the pose is known, in one sentence: of each kind the largest standard deviation. */
+/** How well the pose is known if it is the right one, in one sentence: of each kind the largest standard deviation. */
 function inWords({ uncertainty, metrics, T_scene_object: pose }) {
   const most = (values) => Math.max(...(values ?? [NaN]));
   const [center, turn, scale] = [most(uncertainty?.center_scene), most(uncertainty?.rotation_deg), uncertainty?.scale_percent];
@@ -34,7 +34,7 @@ function inWords({ uncertainty, metrics, T_scene_object: pose }) {
     Number.isFinite(turn) && `its rotation to ± ${number(turn, 2)}°`,
     Number.isFinite(scale) && `its scale to ± ${number(scale, 2)} %`,
   ].filter(Boolean);
-  return parts.length ? `The pose is known: ${parts.join('; ')}.` : '';
+  return parts.length ? `If the pose is right, it is known: ${parts.join('; ')}.` : '';
 }
 
 /** { order, axis, continuous } in words. */
