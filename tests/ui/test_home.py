@@ -208,6 +208,30 @@ def test_run_again_and_compare(visit: Visit, files: tuple[Path, Path]) -> None:
         page.goto("about:blank")
 
 
+def test_run_again_keeps_what_the_form_does_not_show(visit: Visit, files: tuple[Path, Path]) -> None:
+    page = visit.page
+    with home(Settings()) as address:
+        page.goto(address)
+        give_files(page, files)
+        fields = page.request.get(f"{address}/fields").json()["fields"]
+        named = {one["label"]: one["sha256"] for one in fields}
+        options = {"preset": "paper", "optimization": {"iterations": 7}}
+        turned = [[0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+        box = {"center": [0.9, 0.6, 0.5], "size": [0.8, 0.8, 1.1]}
+        asked = {"scene": named["room.ply"], "object": named["chair.glb"], "detection": box, "options": options}
+        posted = page.request.post(f"{address}/register", data=asked | {"ground_truth": {"T_object_scene": turned}})
+        assert posted.status == 202, posted.text()
+        page.goto(f"{address}/jobs")
+        page.get_by_role("button", name="Run again").click()
+        page.get_by_label("Seed").fill("9")
+        page.click("#again-start")
+        page.wait_for_url("**/view")
+        again = page.request.get(page.url.removesuffix("/view") + "/request").json()
+        assert (again["options"]["optimization"]["iterations"], again["seed"]) == (7, 9)
+        assert again["ground_truth"] == {"T_object_scene": turned}
+        page.goto("about:blank")
+
+
 def refuse_lists(page: Page, answers: int) -> list[str]:
     """Have the store of records busy at the first requests for the list of fields; the addresses asked for."""
     asked: list[str] = []

@@ -23,11 +23,18 @@ export async function runAgain(service, job) {
     const request = await service.json(`/jobs/${job.id}/request`);
     const form = new OptionsForm(host, service, request.options, request.seed);
     await form.load();
-    start.onclick = () => post(service, { ...request, ...form.values(request.options.up_axis ?? 'z') }, start, note);
+    start.onclick = () => post(service, requestOf(request, form), start, note);
     start.disabled = false;
   } catch (error) {
     note.textContent = told(error);
   }
+}
+
+/** The earlier request with what the form says; options that the form does not show stay as they were. */
+function requestOf(request, form) {
+  const { robust: _, up_axis: up, ...others } = request.options;
+  const { options, seed } = form.values(up ?? 'z');
+  return { ...request, seed, options: { ...others, ...options } };
 }
 
 async function post(service, request, start, note) {
