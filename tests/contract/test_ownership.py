@@ -83,6 +83,7 @@ ENTRY_ROUTES = [
 JOB_ROUTES = [
     ("GET", "/jobs/{job}"),
     ("GET", "/jobs/{job}?wait=1"),
+    ("GET", "/jobs/{job}/request"),
     ("GET", "/jobs/{job}/events"),
     ("GET", "/jobs/{job}/result"),
     ("GET", "/jobs/{job}/artifacts/trace.json"),
