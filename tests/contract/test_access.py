@@ -14,6 +14,7 @@ TOKENS = frozenset({"first-token", "second-token"})
 CALLS = [
     ("GET", "/"), ("GET", "/readyz"), ("GET", "/version"), ("GET", "/openapi.yaml"), ("POST", "/docs"),
     ("GET", "/openapi.json"),
+    ("GET", f"/jobs/{NOBODY}/request"),
     ("GET", "/jobs"), ("GET", f"/jobs/{NOBODY}"), ("GET", f"/jobs/{NOBODY}/events"), ("GET", f"/jobs/{NOBODY}/result"),
     ("GET", f"/jobs/{NOBODY}/artifacts/trace.json"), ("POST", f"/jobs/{NOBODY}/cancel"), ("DELETE", f"/jobs/{NOBODY}"),
     ("POST", "/register"), ("GET", "/fields"), ("POST", "/fields"), ("PUT", f"/fields/{NOBODY * 2}"),

@@ -156,7 +156,7 @@ def test_deleting_takes_the_artifacts_along(world: World) -> None:
     world.succeed(job_id, {"trace.json": b"[]"})
     assert world.client.delete(f"/jobs/{job_id}").status_code == 204
     assert world.blobs.blobs == {}
-    for path in ("", "/result", "/events", "/view", "/artifacts/trace.json"):
+    for path in ("", "/result", "/request", "/events", "/view", "/artifacts/trace.json"):
         assert_refused(world.client.get(f"/jobs/{job_id}{path}"), 404, "JOB_NOT_FOUND")
 
 
@@ -164,7 +164,7 @@ def test_a_job_that_outlived_its_retention_is_gone(world: World) -> None:
     job_id = world.submit()
     world.succeed(job_id)
     expire(world.redis, job_id)
-    for path in ("", "/result", "/events", "/view"):
+    for path in ("", "/result", "/request", "/events", "/view"):
         assert_refused(world.client.get(f"/jobs/{job_id}{path}"), 410, "JOB_EXPIRED")
     world.records.expire_jobs()
     assert_refused(world.client.get(f"/jobs/{job_id}"), 410, "JOB_EXPIRED")
