@@ -382,6 +382,11 @@ def test_ply_vertices_with_lists_are_read() -> None:
         (b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"),
         (b"# Octomap OcTree binary file\n", "OctoMap"),
         (b"NRRD0004\n", "NRRD"),
+        (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF"),
+        (b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"),
+        (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF"),
+        (b"AC1032\0\0", "DWG"),
+        (b"#X3D V3.0 utf8\n", "X3D"),
     ],
 )
 def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
@@ -389,3 +394,9 @@ def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
     reason, detail = explain_refusal(head)
     assert reason == "FORMAT_NOT_SUPPORTED"
     assert named in detail
+    assert detail.endswith("export it as .glb, .ply, .obj or .stl") or named == "numpy.savez"
+
+
+def test_a_text_that_names_another_program_is_not_that_programs_file() -> None:
+    for text in (b'{"note": "made with Blender"}', b"my notes on #usda and LASF files\n", b"# a <robot in a comment\n"):
+        assert explain_refusal(text)[0] == "FORMAT_NOT_RECOGNIZED"
