@@ -148,7 +148,6 @@ def test_faulty_obj_files(text: str, reason: str) -> None:
     "data",
     [
         exported("stl")[:-1],
-        exported("stl") + b"\0",
         b"solid ball\nfacet normal 0 0 1\nvertex 0 0\nendfacet",
         b"solid ball\nfacet normal 0 0 1\nvertex 0 0 0\nvertex 1 0 0\nendfacet",
         b"solid ball\nfacet normal 0 0 1\nendfacet",
