@@ -13,6 +13,7 @@ from regnf_core.field_files import require_file
 from regnf_core.fields.base import SdfField
 from regnf_core.hints import suggestion
 from regnf_core.in_memory import field_of
+from regnf_core.options import seed_of
 from regnf_data.sdfstudio import load_dataset
 from regnf_fit.images.fit import FitFiles, reconstruct
 from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
@@ -40,7 +41,7 @@ def fit(
     longest edge after it has been moved to the origin.
     Raises InvalidOptionsError, InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET ...).
     """
-    path = _checked_output(Path(output))
+    path, seed = _checked_output(Path(output)), seed_of(seed)
     if isinstance(source, SdfField):
         return fit_field(source, path, _options(FitOptions, options), seed, progress, label)
     if not isinstance(source, str | os.PathLike):

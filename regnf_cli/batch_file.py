@@ -6,9 +6,10 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ _SHA256 = re.compile(r"[0-9a-f]{64}")
 _KNOWN = frozenset((*MEMBERS, *_MORE))
 _HINT = 'Write {"scene": FILE, "object": FILE, "detection": BOX or FILE} on each line.'
 _HEADER_HINT = "Name the columns in the first line: scene,object,detection and more of " + ", ".join(MEMBERS) + "."
+_LINE_BEGINS = b'{"id": "'
+"""How every line of results begins: what is otherwise is another file of the user's."""
 _JSON_LINES = frozenset({".jsonl", ".ndjson", ".json"})
 _DELIMITERS = ",;\t|"
 _SEPARATOR_TOLD = re.compile(r"sep=([,;\t|])", re.IGNORECASE)
@@ -225,12 +228,20 @@ def _value(folder: Path, given: Any) -> Any:
 
 
 class ResultsFile:
-    """Results, a JSON line each, appended as they come. A line that a killed process left unfinished is cut off."""
+    """Results, a JSON line each, appended as they come. A line that a killed process left unfinished is cut off.
+
+    Raises InvalidInputError (RESULTS_UNREADABLE) for a file of something else, which is left as it is.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._cut_torn_line()
-        self._last = {told["id"]: told for told in self._lines()}
+        self._last: dict[str, dict[str, Any]] = {}
+        if path.exists():
+            *lines, torn = path.read_bytes().split(b"\n")
+            self._last = {told["id"]: told for told in self._read(lines)}
+            if not (torn.startswith(_LINE_BEGINS) or _LINE_BEGINS.startswith(torn)):
+                raise self._unreadable(len(lines) + 1)
+            os.truncate(path, path.stat().st_size - len(torn))
 
     def is_done(self, pair: FilePair) -> bool:
         """Whether an earlier run has a result of it. What failed is done again."""
@@ -257,32 +268,14 @@ class ResultsFile:
         found = [self._last[pair.id] for pair in pairs if pair.id in self._last]
         return Counter(str(one.get("verdict") or one["status"]) for one in found)
 
-    def _lines(self) -> Iterator[dict[str, Any]]:
-        if not self._path.exists():
-            return
-        with self._path.open(encoding="utf-8") as file:
-            for number, text in enumerate(file, 1):
-                try:
-                    told = json.loads(text)
-                    yield {"id": told["id"], "status": told["status"], "verdict": told.get("verdict")}
-                except (ValueError, KeyError, TypeError) as error:
-                    raise InvalidInputError(
-                        f"{self._path}: line {number} is no result",
-                        reason="RESULTS_UNREADABLE",
-                        hint="Name another file with --output, or delete this one.",
-                    ) from error
+    def _read(self, lines: Sequence[bytes]) -> Iterator[dict[str, Any]]:
+        for number, text in enumerate(lines, 1):
+            try:
+                told = json.loads(text)
+                yield {"id": told["id"], "status": told["status"], "verdict": told.get("verdict")}
+            except (ValueError, KeyError, TypeError, RecursionError) as error:
+                raise self._unreadable(number) from error
 
-    def _cut_torn_line(self) -> None:
-        if not self._path.exists():
-            return
-        with self._path.open("rb+") as file:
-            end = file.seek(0, 2)
-            while end > 0:
-                start = max(0, end - 4096)
-                file.seek(start)
-                place = file.read(end - start).rfind(b"\n")
-                if place >= 0:
-                    file.truncate(start + place + 1)
-                    return
-                end = start
-            file.truncate(0)
+    def _unreadable(self, number: int) -> InvalidInputError:
+        hint = "Name another file with --output, or delete this one."
+        return InvalidInputError(f"{self._path}: line {number} is no result", reason="RESULTS_UNREADABLE", hint=hint)

@@ -17,6 +17,7 @@ from regnf_cli.console import err, out
 from regnf_cli.extras import require
 from regnf_cli.field_options import choice_of, source_of
 from regnf_cli.options import Config, Description, Field, NoConfig
+from regnf_cli.paths import check_output
 from regnf_core.errors import InvalidOptionsError
 from regnf_core.field_source import FieldSource
 
@@ -54,6 +55,7 @@ def convert(
     if cameras is None and (intrinsics is not None or (axes is not None and images is None)):
         raise InvalidOptionsError("--intrinsics goes with --cameras, --camera-axes with --cameras or --images")
     source = source_of(field, said, choice_of(config, no_config))
+    check_output(output, _SUFFIXES, (source.file, *source.settings))
     if output.suffix.lower() == ".safetensors":
         _to_safe_field(source, output, images, cameras, opengl=axes == Axes.OPENGL)
     else:
@@ -62,11 +64,7 @@ def convert(
 
 def _check(output: Path, images: Path | None, cameras: Path | None) -> None:
     """Refuse before the work what would fail after it."""
-    if output.suffix.lower() not in _SUFFIXES:
-        message = f"{output}: expected a name that ends in one of {', '.join(_SUFFIXES)}"
-        raise InvalidOptionsError(message, hint="The ending chooses the format.")
-    if not output.parent.is_dir():
-        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
+    check_output(output, _SUFFIXES, (cameras,))
     if (images or cameras) is not None and output.suffix.lower() != ".safetensors":
         raise InvalidOptionsError("--images and --cameras go with a safe field (.safetensors)")
     if images is not None and cameras is not None:

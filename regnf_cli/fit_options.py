@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from regnf_cli.console import err, out
+from regnf_cli.paths import check_output
 from regnf_core.errors import InvalidOptionsError
 
 _LONGEST_LABEL = 200  # of the safe format
@@ -81,10 +82,7 @@ Device = Annotated[DeviceChoice, typer.Option(help="Images: where to compute.")]
 
 def check_field_to_write(output: Path, label: str | None) -> None:
     """Refuse before the work what would fail after it. Raises InvalidOptionsError."""
-    if output.suffix != ".safetensors":
-        raise InvalidOptionsError(f"{output}: expected a name that ends in .safetensors")
-    if not output.parent.is_dir():
-        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
+    check_output(output, (".safetensors",))
     if label is not None and len(label) > _LONGEST_LABEL:
         raise InvalidOptionsError(f"the label has more than {_LONGEST_LABEL} characters")
 

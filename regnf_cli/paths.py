@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from regnf_core.errors import InvalidInputError
+from regnf_core.errors import InvalidInputError, InvalidOptionsError
 from regnf_core.field_files import require_field_file, require_file
 from regnf_core.field_source import find_source
 from regnf_core.files import RECORDING_SUFFIX, new_file
@@ -63,6 +64,21 @@ def output_folder(text: str) -> Path:
             message = f"{place}: a file, expected a folder to write into"
             raise InvalidInputError(message, reason="FILE_IS_NO_FOLDER", hint="Name another folder.")
     return path
+
+
+def check_output(output: Path, endings: Sequence[str], given: Iterable[Path | None] = ()) -> None:
+    """Refuse, before the work, a file to write that cannot be written, or is one of those ``given`` to be read.
+
+    endings: those that its name may have. Raises InvalidOptionsError.
+    """
+    if output.suffix.lower() not in endings:
+        hint = "The ending chooses the format." if len(endings) > 1 else f"Write for example {output.stem}{endings[0]}."
+        expected = f"one of {', '.join(endings)}" if len(endings) > 1 else endings[0]
+        raise InvalidOptionsError(f"{output}: expected a name that ends in {expected}", hint=hint)
+    if not output.parent.is_dir():
+        raise InvalidOptionsError(f"{output.parent}: no such folder", hint=f"Make it: mkdir -p {output.parent}")
+    if any(one is not None and one.exists() and output.exists() and output.samefile(one) for one in given):
+        raise InvalidOptionsError(f"{output}: it is read, and would be overwritten", hint="Name another file to write.")
 
 
 def recording_file(text: str) -> Path:

@@ -95,6 +95,8 @@ def _near(path: Path) -> str:
     """What to do about a file that is not there: the name that is almost the same, or where to look."""
     if str(path).lstrip()[:1] in ("{", "["):
         return "A file is expected: write the JSON into a file, and give its name."
+    if re.match(r"[a-z][a-z0-9]+:/", str(path), re.IGNORECASE):
+        return "An address is not read: download the file, and give its name."
     folder = path.parent
     if not folder.is_dir():
         return f"There is no folder {str(folder)[:_MAX_NAME]} either. Check the path."

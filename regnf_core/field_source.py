@@ -113,6 +113,9 @@ def find_source(
 
     Raises InvalidInputError (FILE_NOT_FOUND) and FieldFormatError naming the path: what ``find_run`` does of a folder.
     """
+    if not isinstance(description, Mapping | None):
+        message = f"the description is a {type(description).__name__}, expected a dictionary"
+        raise FieldFormatError(message, reason="INVALID_DESCRIPTION", hint='Write for example {"up_axis": "z"}.')
     run, file = None, path
     if path.is_dir():
         with naming(path):

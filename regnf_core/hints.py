@@ -61,6 +61,9 @@ HINTS: dict[str, str] = {
     "CAMERAS_INTRINSICS_MISSING": "With regnf convert: --intrinsics FX,FY,CX,CY,WIDTH,HEIGHT.",
     "CAMERAS_OF_ANOTHER_FRAME": "Give the trainer's settings, or dataset_transform in a description; or say which way "
     "cameras look: cameras.axes, opencv or opengl.",
+    "TENSOR_SHAPE": "docs/families.md and docs/import-gate.md name the arrays of each family of fields.",
+    "TENSOR_NOT_FINITE": "Write any number into nodes of a grid that were never seen, and 0 into its array `weights`; "
+    "of a network, give an earlier checkpoint.",
     "TRUNCATION_UNKNOWN": "Give the distance that the value 1 stands for: --scene-description '{\"truncation\": ...}', "
     "or --object-description; with inspect and convert --description; over HTTP `truncation` of the description.",
     "DATASET_NO_METADATA": "docs/datasets.md shows the layout: meta_data.json with frames, each with rgb_path, "

@@ -8,6 +8,11 @@ MOST_OF_LABEL = 200
 """Characters."""
 
 
+def shown_path(path: str) -> str:
+    """The path of a file in a run or an archive; of a very long one, the end."""
+    return path if len(path) <= MOST_OF_LABEL else f"...{path[-MOST_OF_LABEL:]}"
+
+
 def shown_number(value: float) -> str:
     """A number as people read it: four digits, and of a large one, such as a coordinate in UTM, three decimals."""
     return f"{value:.4g}" if not 1e4 <= abs(value) < 1e12 else f"{value:.3f}".rstrip("0").rstrip(".")

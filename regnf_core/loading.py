@@ -58,7 +58,9 @@ def open_field(
     the file, and InvalidInputError (NO_FIELD) for what is neither a path nor a mesh.
     """
     if not isinstance(path, str | os.PathLike):
-        return field_of(path, description=description).to(device)
+        from regnf_core.fields.build import usable_device
+
+        return field_of(path, description=description).to(usable_device(device))
     loaded = load_field(find_source(Path(path), description, settings), device, cache_dir)
     for warning in loaded.notes.warnings:
         warnings.warn(f"{path}: {warning}", FieldWarning, stacklevel=2)

@@ -5,6 +5,7 @@ Every length is in normalized field units unless its name says otherwise, as in 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, ClassVar, Literal
@@ -251,6 +252,17 @@ def options_of(options: OptionsLike) -> RegistrationOptions:
         return RegistrationOptions.from_dict(dict(options))
     hint = 'Write {"up_axis": "z"} or RegistrationOptions(up_axis="z"); docs/api.md lists every option with its range.'
     raise InvalidOptionsError(f"options is a {type(options).__name__}, expected a dictionary", hint=hint)
+
+
+def seed_of(seed: Any) -> int:
+    """A seed as every interface takes it. Raises InvalidOptionsError."""
+    try:
+        found = -1 if isinstance(seed, bool) else operator.index(seed)
+    except TypeError:
+        found = -1
+    if not 0 <= found < 2**32:
+        raise InvalidOptionsError(f"the seed is {seed!r:.40}, expected a whole number of 0 to {2**32 - 1}")
+    return found
 
 
 def did_you_mean(location: Sequence[str | int]) -> str:

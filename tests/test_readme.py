@@ -44,8 +44,9 @@ def test_commands_named_in_the_readme_exist() -> None:
 
 def test_make_targets_named_in_the_readme_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in re.findall(r"make (\w+)", README):
-        assert re.search(rf"^{target}:", makefile, flags=re.M)
+    named = set(re.findall(r"make (\w+)", README))
+    assert "demo" in named
+    assert named <= set(re.findall(r"^(\w+):", makefile, flags=re.M))
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from regnf_core.editing.compose import compose as engine_compose
 from regnf_core.editing.edited_scene import EditedScene
 from regnf_core.editing.edits import Edit
 from regnf_core.errors import InvalidInputError, InvalidOptionsError
+from regnf_core.options import seed_of
 from regnf_core.rendering.camera import Camera
 from regnf_core.rendering.frame import Frame
 from regnf_core.rendering.options import RenderOptions
@@ -47,7 +48,7 @@ def compose(
     if not isinstance(edits, Sequence):
         hint = "Write a list: [Removal(box)]."
         raise InvalidInputError("edits must be a list", reason="EDIT_INVALID", hint=hint)
-    return engine_compose(opened(scene, "scene").field, edits, seed, progress)
+    return engine_compose(opened(scene, "scene").field, edits, seed_of(seed), progress)
 
 
 def _render_options(options: RenderOptionsLike) -> RenderOptions:

@@ -16,7 +16,7 @@ from regnf_core.detections.objects import BoxLike, detection_of
 from regnf_core.errors import InvalidDetectionError, RegnfError
 from regnf_core.field_files import require_file
 from regnf_core.geometry.box import OrientedBox
-from regnf_core.options import OptionsLike, options_of
+from regnf_core.options import OptionsLike, options_of, seed_of
 from regnf_core.pairs import pairs_of
 from regnf_core.result import ProgressCallback
 from regnf_core.robust.pipeline import WarmStart
@@ -54,7 +54,7 @@ def register(
     Raises InvalidOptionsError, InvalidDetectionError, FieldFormatError, InvalidInputError (NO_FIELD, FILE_NOT_FOUND,
     FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
     """
-    chosen, box = options_of(options), box_of(detection)
+    chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     place, thing = opened(scene, "scene"), opened(obj, "object")
     result = engine.register(place.field, thing.field, box, chosen, seed, progress, warm_start, clouds)
     return Registered.of(result, thing.name, notes_of(place, thing), box)
@@ -75,7 +75,7 @@ def register_batch(
     What they share is made once; a pair that fails does not stop the others. Arguments as of ``register``.
     Raises InvalidOptionsError for options of another preset, InvalidInputError (PAIR_UNKNOWN, NO_FIELD).
     """
-    chosen, boxes = options_of(options), [box_of(one) for one in _several(detections)]
+    chosen, boxes, seed = options_of(options), [box_of(one) for one in _several(detections)], seed_of(seed)
     pairs_of(pairs, len(boxes), len(objects))  # before any field is opened
     place = opened(scene, "scene")
     fields = [one if isinstance(one, ModeledObject) else opened_several([one], "object")[0] for one in objects]

@@ -19,7 +19,7 @@ from regnf_core.library import Candidate, LibraryObject, model_object, search_li
 from regnf_core.library_files import library_files
 from regnf_core.loading import load_field
 from regnf_core.object_models import object_model
-from regnf_core.options import OptionsLike, RobustOptions, options_of
+from regnf_core.options import OptionsLike, RobustOptions, options_of, seed_of
 from regnf_core.result import ProgressCallback
 
 Objects = str | Path | Sequence[FieldLike | LibraryObject] | Mapping[str, FieldLike]
@@ -54,7 +54,7 @@ def search(
     arguments as of ``register``. Raises InvalidInputError (LIBRARY_EMPTY), InvalidOptionsError
     (LIBRARY_SEARCH_UNSUPPORTED), NoSurfaceError, and what ``register`` raises.
     """
-    chosen, box = options_of(options), box_of(detection)
+    chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     chosen.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
     named = _named(objects)
     place = opened(scene, "scene")

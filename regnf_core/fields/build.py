@@ -9,6 +9,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
+from regnf_core.errors import InvalidOptionsError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.color_head import build_color_head
 from regnf_core.fields.feature_volumes import build_feature_volumes
@@ -45,11 +46,22 @@ def open_field(path: str | os.PathLike[str], device: torch.device | str = "cpu")
     """Open the field file ``path``, with its parameters on ``device``. On a CPU, float32 tensors are memory-mapped.
 
     Raises FieldFormatError: SAFE_FORMAT_INVALID, SAFE_FORMAT_VERSION, FIELD_KIND_UNKNOWN, FIELD_SHAPES_MISMATCH, and
-    what :func:`build_field` raises.
+    what :func:`build_field` raises; InvalidOptionsError for a device that is not there.
     """
     description, names = read_header(path)
-    with safe_open(os.fspath(path), framework="pt", device=str(device)) as file:
+    with safe_open(os.fspath(path), framework="pt", device=str(usable_device(device))) as file:
         return build_field(description, {name: file.get_tensor(name) for name in names})
+
+
+def usable_device(device: torch.device | str) -> torch.device:
+    """The device, if torch can use it on this machine. Raises InvalidOptionsError."""
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (AssertionError, NotImplementedError, RuntimeError, TypeError) as error:
+        hint = 'Take "cpu"; `regnf doctor` says whether torch finds a GPU.'
+        raise InvalidOptionsError(f"torch cannot use the device {device!r:.40} here", hint=hint) from error
+    return found
 
 
 def build_field(description: FieldDescription, tensors: Mapping[str, Tensor]) -> SdfField:

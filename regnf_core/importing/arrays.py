@@ -30,8 +30,8 @@ def require_shape(name: str, array: Float32Array, shape: tuple[int | None, ...])
         have == want or (want is None and have > 0) for have, want in zip(array.shape, shape, strict=True)
     )
     if not fits:
-        wanted = tuple("any" if extent is None else extent for extent in shape)
-        raise tensor_error(f"{name} has shape {array.shape}, expected {wanted}", "TENSOR_SHAPE")
+        wanted = ", ".join("any" if extent is None else str(extent) for extent in shape)
+        raise tensor_error(f"{name} has shape {array.shape}, expected ({wanted})", "TENSOR_SHAPE")
 
 
 def finite_float32(name: str, values: npt.NDArray[Any]) -> Float32Array:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from regnf_core.errors import FitDivergedError, InvalidInputError, InvalidOptionsError, NoSurfaceError
+from regnf_core.fields.build import usable_device
 from regnf_core.fields.neus_facto import NeusFactoField
 from regnf_core.fields.observation import Observation
 from regnf_core.schema.color import COLOR
@@ -152,11 +153,9 @@ def pick_device(name: str) -> torch.device:
     """``auto``: an NVIDIA GPU where there is one. Raises InvalidOptionsError."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InvalidOptionsError("there is no CUDA device")
     if name not in ("cpu", "cuda"):
         raise InvalidOptionsError(f"the device is auto, cpu or cuda, not {name:.40}")
-    return torch.device(name)
+    return usable_device(name)
 
 
 def _train(

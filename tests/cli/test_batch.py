@@ -123,10 +123,15 @@ def test_a_second_run_does_what_is_left(run: Run, folder: Path, monkeypatch: pyt
 def test_a_file_that_holds_no_results_is_left_as_it_is(run: Run, folder: Path) -> None:
     path = write(folder, [pair()])
     other = folder / "notes.txt"
-    other.write_text("not mine\n")
-    outcome = run("batch", path, "--output", other)
-    assert (outcome.code, "RESULTS_UNREADABLE" in outcome.stderr) == (2, True)
-    assert other.read_text() == "not mine\n"
+    for held in (b"not mine\n", b"not mine", b"\xa0\0\n\xff", b'{"id": "a", "status": "successful"}\nmine'):
+        other.write_bytes(held)
+        outcome = run("batch", path, "--output", other)
+        assert (outcome.code, "RESULTS_UNREADABLE" in outcome.stderr) == (2, True)
+        assert other.read_bytes() == held
+    path.write_text(path.read_text().rstrip("\n"))
+    before = path.read_bytes()
+    assert run("batch", path, "--output", path).code == 2
+    assert path.read_bytes() == before
 
 
 def test_a_table_is_read_too(folder: Path) -> None:
@@ -207,6 +212,7 @@ def test_a_torn_line_is_cut_off(tmp_path: Path) -> None:
     path.write_text('{"id": "a", "status": "successful"}\n' + '{"id": "b", "note": "' + "x" * 10_000)
     ResultsFile(path)
     assert path.read_text() == '{"id": "a", "status": "successful"}\n'
-    path.write_text("torn")
-    ResultsFile(path)
-    assert path.read_text() == ""
+    for torn in ("", "{", '{"id": "b'):
+        path.write_text(torn)
+        ResultsFile(path)
+        assert path.read_text() == ""

@@ -45,6 +45,19 @@ def test_a_field_becomes_a_mesh(run: Run, tmp_path: Path) -> None:
     assert trimesh.load_mesh(tmp_path / "chair.ply").is_watertight
 
 
+@pytest.mark.usefixtures("cache")
+def test_what_is_read_is_not_overwritten(run: Run, tmp_path: Path) -> None:
+    mesh, link = tmp_path / "chair.ply", tmp_path / "link.ply"
+    trimesh.creation.box().export(mesh)
+    link.symlink_to(mesh)
+    before = mesh.read_bytes()
+    for given, output in ((mesh, mesh), (mesh, link), (link, mesh)):
+        outcome = run("convert", given, output)
+        assert outcome.code == 2
+        assert outcome.stderr.startswith(f"INVALID_OPTIONS {output}: it is read, and would be overwritten")
+    assert mesh.read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("output", "reason"),
     [

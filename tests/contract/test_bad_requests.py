@@ -51,6 +51,21 @@ def test_options(world: World, options: Any, pointer: str) -> None:
     assert pointer in [entry["pointer"] for entry in problem["errors"]]
 
 
+def test_a_member_that_is_missing_is_not_called_malformed(world: World) -> None:
+    good = world.valid_request()
+    problem = assert_refused(
+        post(world, {name.title(): value for name, value in good.items()}), 422, "INVALID_DETECTION"
+    )
+    assert problem["detail"] == "The member /detection is missing."
+    assert problem["hint"] == "Did you mean `scene`?"
+
+
+def test_the_part_that_is_no_json_is_named(world: World) -> None:
+    parts = {"description": (None, "up z"), "file": ("a.glb", b"glTF")}
+    problem = assert_refused(world.client.post("/fields", files=parts), 400, "MALFORMED_JSON")
+    assert problem["detail"] == "The part `description` is not JSON from line 1, column 1 on."
+
+
 def test_an_unknown_option_is_answered_with_the_one_that_was_meant(world: World) -> None:
     body = world.valid_request() | {"options": {"robust": {"up_axis": "z"}}}
     (fault,) = assert_refused(post(world, body), 422, "INVALID_OPTIONS")["errors"]

@@ -74,10 +74,10 @@ def test_a_result_depends_neither_on_the_other_pairs_nor_on_their_order(
 
 def test_each_pair_ends_as_it_would_alone(together: dict[tuple[int, int], BatchOutcome]) -> None:
     for alone in register(PAIRS, ALONE):
-        same_but_for_rounding(together[alone.detection, alone.object], alone, BOXES[alone.detection])
+        assert_same_but_for_rounding(together[alone.detection, alone.object], alone, BOXES[alone.detection])
 
 
-def same_but_for_rounding(found: BatchOutcome, alone: BatchOutcome, box: OrientedBox) -> None:
+def assert_same_but_for_rounding(found: BatchOutcome, alone: BatchOutcome, box: OrientedBox) -> None:
     if alone.result is None or found.result is None:
         assert alone.error is not None
         assert found.error is not None
@@ -104,7 +104,7 @@ def test_groups_that_do_not_fit_follow_each_other(together: dict[tuple[int, int]
     assert Sizes(4 * 2**20).pairs == 1 < Sizes(MEMORY).pairs
     pairs = [(0, 1), (0, 0)]
     for found, pair in zip(register(pairs, small), pairs, strict=True):
-        same_but_for_rounding(found, together[pair], BOXES[pair[0]])
+        assert_same_but_for_rounding(found, together[pair], BOXES[pair[0]])
 
 
 def test_a_scale_that_is_known_and_a_symmetric_object() -> None:
@@ -140,7 +140,7 @@ def test_scenes_that_were_observed_in_part() -> None:
     scene = ObservedField(SCENE, Observation(states.to(torch.uint8).view(count, count, count), low, voxel))
     pairs = [(0, 0), (1, 0)]
     for found, alone in zip(register(pairs, scene=scene), register(pairs, ALONE, scene), strict=True):
-        same_but_for_rounding(found, alone, BOXES[found.detection])
+        assert_same_but_for_rounding(found, alone, BOXES[found.detection])
 
 
 class Faulty(AnalyticField):

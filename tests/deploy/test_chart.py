@@ -95,6 +95,7 @@ def test_every_variable_is_a_setting_and_no_secret_is_a_value(
 def test_labels_find_their_pods(rendered: dict[tuple[str, str], dict[str, Any]]) -> None:
     labels = [one["spec"]["template"]["metadata"]["labels"].items() for one in rendered.values()
               if "template" in one.get("spec", {})]  # fmt: skip
+    assert {"Service", "Deployment"} <= {kind for kind, _ in rendered}
     for (kind, name), one in rendered.items():
         if kind == "Service":
             assert any(one["spec"]["selector"].items() <= pod for pod in labels), name
@@ -106,9 +107,10 @@ def test_labels_find_their_pods(rendered: dict[tuple[str, str], dict[str, Any]])
 
 def test_ports_lead_somewhere(rendered: dict[tuple[str, str], dict[str, Any]]) -> None:
     ports = {port["name"] for pod in pods(rendered).values() for port in pod["containers"][0].get("ports", [])}
-    for (kind, name), one in rendered.items():
-        if kind == "Service":
-            assert {port["targetPort"] for port in one["spec"]["ports"]} <= ports, name
+    asked = [{port["targetPort"] for port in one["spec"]["ports"]} for (kind, _), one in rendered.items()
+             if kind == "Service"]  # fmt: skip
+    assert asked
+    assert all(some and some <= ports for some in asked)
 
 
 def test_plain_brings_its_own_redis_and_volume() -> None:

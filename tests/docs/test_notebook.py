@@ -46,6 +46,8 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
 
 
 def test_it_is_committed_without_outputs() -> None:
-    for cell in json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]:
+    cells = json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]
+    assert any(cell["cell_type"] == "code" for cell in cells)
+    for cell in cells:
         assert cell.get("outputs", []) == []
         assert cell.get("execution_count") is None

@@ -66,6 +66,7 @@ def test_every_link_of_the_site_leads_somewhere(site: Path) -> None:
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
+    assert next(site.rglob("*.html"), None) is not None
     for file in site.rglob("*.html"):
         assert [load for load in Page(file).loads if urlsplit(load).netloc] == [], file
     for sheet in site.rglob("*.css"):

@@ -32,27 +32,6 @@ _OTHER_FILES = (
     (b"<?xml", "an XML document, not a field; export a model as .glb, .ply, .obj or .stl"),
     (b"\x89PNG", "a PNG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
     (b"\xff\xd8\xff", "a JPEG picture; a field is expected: a checkpoint, a safe field, a mesh or a grid"),
-    *(
-        (magic, f"{what}, which is not read; export it as .glb, .ply, .obj or .stl")
-        for magic, what in (
-            (b"Kaydara FBX", "an FBX file"),
-            (b"; FBX", "an FBX file"),
-            (b"ISO-10303-21", "a STEP file"),
-            (b"#usda", "a USD file"),
-            (b"PXR-USDC", "a USD file"),
-            (b"<robot", "a robot's description"),
-            (b"<sdf", "a world's description"),
-            (b"<mujoco", "a robot's description"),
-            (b"BLENDER", "a Blender file"),
-            (b"# vtk DataFile", "a VTK file"),
-            (b"3D Geometry File Format", "a Rhino file"),
-            (b"AC10", "a DWG drawing"),
-            (b"#VRML", "a VRML file"),
-            (b"#X3D", "an X3D file"),
-            (b"LASF", "a LAS file"),
-            (b"ASTM-E57", "an E57 file"),
-        )
-    ),
     (b"7z\xbc\xaf", "a 7z archive; unpack it, and give the file inside"),
     (b"%PDF", "a PDF document, not a field"),
     (
@@ -62,18 +41,21 @@ _OTHER_FILES = (
     (b"\x08\x01\x12", "a TensorFlow model; export the network as ONNX"),
 )
 """Files that people give by mistake: their first bytes, and what they are."""
+_BLANK = b"\xef\xbb\xbf \t\r\n"
 _SHAPE_WITHIN = 512
 _SHAPES = (
     *((b"LASF", "a LAS or LAZ cloud of points"), (b"ASTM-E57", "an E57 cloud of points")),
     *((b"PXR-USDC", "a USD scene"), (b"#usda", "a USD scene"), (b"Kaydara FBX", "an FBX scene")),
     *((b"; FBX ", "an FBX scene"), (b"BLENDER", "a Blender file"), (b"3D Geometry File Format", "a Rhino file")),
-    *((b"ISO-10303-21", "a STEP model of CAD"), (b"SECTION\n  2\nHEADER", "a DXF drawing")),
+    *((b"ISO-10303-21", "a STEP model of CAD"), (b"0 SECTION 2 ", "a DXF drawing")),
+    *((b"AutoCAD Binary DXF", "a DXF drawing"), (b"AC10", "a DWG drawing"), (b"#X3D", "an X3D scene")),
     *((b"# vtk DataFile", "a VTK file"), (b"<VTKFile", "a VTK file"), (b"#VRML", "a VRML scene")),
     *((b"<X3D", "an X3D scene"), (b"<amf", "an AMF model"), (b"<robot", "a URDF robot, which names its meshes")),
-    *((b"<sdf ", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
+    *((b"<sdf", "a Gazebo model, which names its meshes"), (b"<mujoco", "a MuJoCo model, which names its meshes")),
     *((b"# Octomap", "an OctoMap"), (b"#binvox", "a binvox grid"), (b"NRRD000", "an NRRD volume")),
 )
-"""Shapes in formats that are not read: what stands near their beginning, and what they are."""
+"""Shapes in formats that are not read: how they begin, white space between words being one blank, and what they are. A
+tag may have XML's own lines before it."""
 
 
 def sniff_format(head: bytes) -> str | None:
@@ -116,8 +98,9 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
         return "FORMAT_NOT_SUPPORTED", "an OpenVDB or NanoVDB file; sample it on a dense grid in .npz"
     if head.startswith(_ZIP_LOCAL_HEADER) and _first_name(head) in _KERAS_MEMBERS:
         return "FORMAT_NOT_SUPPORTED", "a Keras model; export it as ONNX, or save its arrays by numpy.savez"
+    begin = b" ".join(head[:_SHAPE_WITHIN].lstrip(_BLANK).lower().split())
     for magic, what in _SHAPES:
-        if magic.lower() in head[:_SHAPE_WITHIN].lower():
+        if begin.startswith(magic.lower()) or (begin.startswith(b"<") and magic[:1] == b"<" and magic.lower() in begin):
             return "FORMAT_NOT_SUPPORTED", f"{what}; export it as .glb, .ply, .obj or .stl"
     if head.startswith(_ZIP_LOCAL_HEADER) and (package := _package(_first_name(head))):
         return "FORMAT_NOT_SUPPORTED", f"{package}; export it as .glb, .ply, .obj or .stl"
@@ -127,7 +110,7 @@ def explain_refusal(head: bytes) -> tuple[str, str]:
     if head[4:8] == b"TFL3":
         return "FORMAT_NOT_SUPPORTED", "a TensorFlow Lite model; export the network as ONNX"
     for magic, what in _OTHER_FILES:
-        if head.lstrip()[: len(magic)].lower() == magic.lower():
+        if head.lstrip(_BLANK)[: len(magic)].lower() == magic.lower():
             return "FORMAT_NOT_RECOGNIZED", what
     return (
         "FORMAT_NOT_RECOGNIZED",

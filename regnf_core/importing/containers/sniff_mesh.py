@@ -96,8 +96,9 @@ def _is_obj(text: bytes) -> bool:
 
 
 def _is_number(word: bytes) -> bool:
+    """Also with a decimal comma, which the reader then names."""
     try:
-        float(word)
+        float(word.replace(b",", b"."))
     except ValueError:
         return False
     return True

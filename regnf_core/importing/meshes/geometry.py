@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -37,6 +38,12 @@ class Geometry:
     """What the file holds or names that was not read, a few words each: the shape is the same without."""
     not_applied: tuple[str, ...] = ()
     """The same of what changes the shape: it is warned of."""
+
+
+def not_numbers(message: str, text: bytes) -> FieldFormatError:
+    """The error for words that are no numbers, which says so where the reason is how decimals are written."""
+    commas = re.search(rb"\d,\d", text) is not None
+    return malformed(message + (": decimals have points, not commas" if commas else ""))
 
 
 def malformed(message: str) -> FieldFormatError:

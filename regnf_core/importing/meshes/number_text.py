@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import Float64Array, malformed
+from regnf_core.importing.meshes.geometry import Float64Array, not_numbers
 
 
 def numbers_of(text: bytes, format_: str) -> Float64Array:
@@ -16,4 +16,4 @@ def numbers_of(text: bytes, format_: str) -> Float64Array:
             warnings.simplefilter("error")
             return np.fromstring(text.decode("ascii"), dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning) as error:
-        raise malformed(f"the {format_} file holds a word that is not a number") from error
+        raise not_numbers(f"the {format_} file holds a word that is not a number", text) from error

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from regnf_core.importing.meshes.geometry import Float64Array, Geometry, elsewhere, malformed, require_room, within_unit
+from regnf_core.importing.meshes.geometry import (
+    Float64Array,
+    Geometry,
+    elsewhere,
+    malformed,
+    not_numbers,
+    require_room,
+    within_unit,
+)
 
 _COMMANDS = (b"call", b"csh")
 _NOTED = {b"mtllib": "materials in another file", b"curv": "curves", b"l": "lines", b"p": "points"}
@@ -52,7 +60,7 @@ def _place(words: list[bytes]) -> list[float]:
     try:
         x, y, z = map(float, words[1:4])  # a fourth number is a weight, more are a color
     except ValueError as error:
-        raise malformed("an OBJ vertex is not three numbers") from error
+        raise not_numbers("an OBJ vertex is not three numbers", b" ".join(words)) from error
     return [x, y, z]
 
 

@@ -14,6 +14,7 @@ from regnf_core.importing.meshes.geometry import (
     fan,
     fans,
     malformed,
+    not_numbers,
     require_room,
     unsupported,
     within_unit,
@@ -95,7 +96,7 @@ def _number(word: bytes) -> float:
     try:
         number = float(word)
     except ValueError as error:
-        raise malformed("an OFF file holds a word that is not a number") from error
+        raise not_numbers("an OFF file holds a word that is not a number", word) from error
     if not abs(number) < 1e300:
         raise malformed("an OFF file holds a number that is not finite")
     return number

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from regnf_core.errors import FieldFormatError
+from regnf_core.labels import shown_path
 
 _TIERS = (
     (".ckpt", ".pth.tar", ".pth", ".pt"),
@@ -66,7 +67,7 @@ def choose_checkpoint(names: Iterable[str]) -> str:
             f"no file of the run is a checkpoint; looked for {ends}", reason="RUN_WITHOUT_CHECKPOINT"
         )
     if len({candidate.series for candidate in tier}) > 1:
-        shown = ", ".join(sorted(candidate.name[-100:] for candidate in tier)[:_SHOWN])
+        shown = ", ".join(sorted(shown_path(candidate.name) for candidate in tier)[:_SHOWN])
         message = f"{len(tier)} files of the run may be the checkpoint: {shown}; give one of them by itself"
         raise FieldFormatError(message, reason="AMBIGUOUS_RUN")
     return max(tier, key=lambda candidate: (candidate.age, candidate.name)).name

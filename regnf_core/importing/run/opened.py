@@ -13,6 +13,7 @@ from regnf_core.importing.run.settings_names import MAX_FILES, choose_settings
 from regnf_core.importing.run.tar_run import TarRun
 from regnf_core.importing.run.unpacking import archive_error
 from regnf_core.importing.run.zip_run import ZipRun
+from regnf_core.labels import shown_path
 
 MAX_SETTINGS_BYTES = 64 << 20
 """All settings together: latent codes of a thousand shapes are the largest."""
@@ -56,7 +57,7 @@ def open_upload(data: memoryview, folder: Path, most: int) -> OpenedUpload:
     siblings = _siblings(archive, name)
     taken = archive.take({name, *settings, *siblings.values()}, folder)
     if _opened(taken[name], most) is not None:
-        raise archive_error(f"{name[-100:]} is an archive in the archive; give it by itself", "ARCHIVE_NESTED")
+        raise archive_error(f"{shown_path(name)} is an archive in the archive; give it by itself", "ARCHIVE_NESTED")
     return OpenedUpload(
         taken[name],
         name,

@@ -10,6 +10,7 @@ from regnf_core.importing.pickle.pickle_reader import read_pickle
 from regnf_core.importing.pickle.pickle_values import TensorRef
 from regnf_core.importing.run.opened import MAX_SETTINGS_BYTES, SettingsFile
 from regnf_core.importing.tensor_source import TensorSource, lookup
+from regnf_core.labels import shown_path
 
 _MAX_CODE = 512
 
@@ -53,4 +54,4 @@ def _mapping(file: SettingsFile, value: object) -> dict[object, object]:
 
 
 def _malformed(file: SettingsFile, what: str) -> FieldFormatError:
-    return FieldFormatError(f"{file.name[-100:]}: {what}", reason="SETTINGS_MALFORMED")
+    return FieldFormatError(f"{shown_path(file.name)}: {what}", reason="SETTINGS_MALFORMED")

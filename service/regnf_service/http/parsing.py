@@ -39,8 +39,8 @@ async def read_json(
         return await read_text(model, bytes(text), most_values)
 
 
-async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VALUES) -> _Model:
+async def read_text(model: type[_Model], text: bytes, most_values: int = MOST_VALUES, what: str = "The body") -> _Model:
     """As ``read_model``. Raises Problem as that does."""
     if len(text) <= _SMALL_BYTES:
-        return read_model(model, text, _REASON, most_values)
-    return await PARSING.run(read_model, model, text, _REASON, most_values)
+        return read_model(model, text, _REASON, most_values, what)
+    return await PARSING.run(read_model, model, text, _REASON, most_values, what)

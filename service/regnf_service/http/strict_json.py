@@ -16,9 +16,10 @@ _MAX_DEPTH = 32
 _LARGEST_EXACT = 2**53
 
 
-def parse_json(body: bytes, most_values: int = MOST_VALUES) -> Any:
-    """The value in ``body``; a number without a fraction is an int, as JSON Schema has it, however it is spelled.
+def parse_json(body: bytes, most_values: int = MOST_VALUES, what: str = "The body") -> Any:
+    """The value in ``body``, which messages call ``what``.
 
+    A number without a fraction is an int, as JSON Schema has it, however it is spelled.
     NaN and Infinity are accepted here; the schema refuses them with their place.
 
     Raises Problem MALFORMED_JSON, REQUEST_TOO_LARGE for more values than any request needs.
@@ -26,7 +27,7 @@ def parse_json(body: bytes, most_values: int = MOST_VALUES) -> Any:
     if count_values(body) > most_values:
         raise Problem("REQUEST_TOO_LARGE", f"JSON of at most {most_values} members and values is taken.")
     try:
-        value = json_value(body, "The body is ", object_pairs_hook=_object, parse_float=_number)
+        value = json_value(body, f"{what} is ", object_pairs_hook=_object, parse_float=_number)
     except InvalidInputError as error:
         raise Problem("MALFORMED_JSON", f"{error}.", hint=error.hint) from error
     _check_depth(value)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 import regnf
+from regnf_core.errors import FieldFormatError, InvalidInputError, InvalidOptionsError
 from regnf_core.viewing import window
 from tests.cli.conftest import DATA
 
@@ -21,6 +24,39 @@ ROOM, CHAIR = DATA / "mix-room.safetensors", DATA / "armchair.safetensors"
 @pytest.fixture(scope="module")
 def found() -> regnf.Registered:
     return regnf.register(ROOM, str(CHAIR), BOX, {"up_axis": "z"}, seed=3)
+
+
+@pytest.mark.parametrize("seed", ["7", 1.5, -1, 2**32, True, None])
+def test_a_seed_is_a_whole_number_everywhere(seed: Any, tmp_path: Path) -> None:
+    calls: list[Callable[[], object]] = [
+        lambda: regnf.register(ROOM, CHAIR, BOX, seed=seed),
+        lambda: regnf.register_batch(ROOM, [BOX], [CHAIR], seed=seed),
+        lambda: regnf.search(ROOM, [CHAIR], BOX, seed=seed),
+        lambda: regnf.compose(ROOM, [], seed=seed),
+        lambda: regnf.fit(tmp_path / "none.ply", tmp_path / "a.safetensors", seed=seed),
+    ]
+    for call in calls:
+        with pytest.raises(InvalidOptionsError, match="the seed is"):
+            call()
+
+
+@pytest.mark.parametrize("device", ["gpu", "cuda:99", "", 3.5])
+def test_a_device_that_is_not_there_is_refused(device: Any) -> None:
+    for field in (CHAIR, trimesh.creation.box()):
+        with pytest.raises(InvalidOptionsError, match="cannot use the device"):
+            regnf.open_field(field, device=device)
+
+
+def test_a_description_is_a_dictionary() -> None:
+    with pytest.raises(FieldFormatError, match="the description is a str") as refused:
+        regnf.open_field(CHAIR, description="z up")  # type: ignore[arg-type]
+    assert refused.value.reason == "INVALID_DESCRIPTION"
+
+
+def test_an_address_is_no_file() -> None:
+    with pytest.raises(InvalidInputError, match="no such file") as refused:
+        regnf.open_field("https://example.org/chair.glb")
+    assert "download the file" in str(refused.value.hint)
 
 
 def test_a_result_says_what_it_is(found: regnf.Registered) -> None:

@@ -47,7 +47,7 @@ def runtime(proto: onnx.ModelProto, at: torch.Tensor) -> torch.Tensor:
     return torch.from_numpy(session.run(None, {"x": at.numpy()})[0].reshape(-1))
 
 
-def agrees(proto: onnx.ModelProto) -> None:
+def assert_agrees(proto: onnx.ModelProto) -> None:
     at = points()
     torch.testing.assert_close(field_of(proto).signed_distance(at), runtime(proto, at), rtol=2e-5, atol=2e-6)
 
@@ -70,7 +70,7 @@ WITH_SETTINGS = (
 
 @pytest.mark.parametrize("text", [*(f"{op} x" for op in ONE_BY_ONE.split()), *WITH_SETTINGS])
 def test_operators_of_one_input(text: str) -> None:
-    agrees(model(f"h = {text}; y = MatMul h w", {"w": W[:, :1]}))
+    assert_agrees(model(f"h = {text}; y = MatMul h w", {"w": W[:, :1]}))
 
 
 def scalar(value: float) -> np.ndarray[Any, Any]:
@@ -176,7 +176,7 @@ GRAPHS: dict[str, tuple[str, Initializers]] = {
 @pytest.mark.parametrize("name", GRAPHS)
 def test_graphs_agree_with_onnxruntime(name: str) -> None:
     text, initializers = GRAPHS[name]
-    agrees(model(text, initializers | {"axes": AXES}))
+    assert_agrees(model(text, initializers | {"axes": AXES}))
 
 
 def test_constants_with_values_of_their_own() -> None:
@@ -186,7 +186,7 @@ def test_constants_with_values_of_their_own() -> None:
     )
     fixed = nodes("d = Constant")[0]
     fixed.attribute.append(onnx.helper.make_attribute("value", onnx.numpy_helper.from_array(W[:, 0])))
-    agrees(model([filled, fixed, *nodes("m = Mul x c; h = Mul m d" + SUM)], {"three": ints(3), "axes": AXES}))
+    assert_agrees(model([filled, fixed, *nodes("m = Mul x c; h = Mul m d" + SUM)], {"three": ints(3), "axes": AXES}))
 
 
 def test_every_operator_is_tried() -> None:

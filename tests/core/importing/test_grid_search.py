@@ -79,7 +79,9 @@ def test_every_random_grid_is_among_those_found(seed: int) -> None:
 
 def test_every_grid_that_is_found_has_the_tables_size() -> None:
     for parameters in (12_196_240, 2 * 4096 * 16, 2**20):
-        for entry in find(parameters, 32):
+        found = find(parameters, 32)
+        assert found
+        for entry in found:
             assert entry.grid.entries * entry.grid.features_per_level == parameters
 
 

@@ -24,7 +24,7 @@ def entry(begin: int, end: int, **values: Any) -> dict[str, Any]:
     return {"dtype": "F32", "shape": [(end - begin) // 4], "data_offsets": [begin, end]} | values
 
 
-def refused(data: bytes, reason: str) -> None:
+def assert_rejected(data: bytes, reason: str) -> None:
     assert_refused(lambda: read_header(memoryview(data)), reason)
 
 
@@ -66,7 +66,7 @@ def test_a_sound_header_is_read() -> None:
     ],
 )
 def test_faulty_headers_are_refused(data: bytes, reason: str) -> None:
-    refused(data, reason)
+    assert_rejected(data, reason)
 
 
 @pytest.fixture(scope="module")

@@ -159,7 +159,7 @@ async def _one_shot(request: Request, services: Services, caller: str, keep: boo
         missing = [name for name in ("scene", "object", "request") if name not in parts]
         if missing:
             raise Problem("MISSING_PART", f"The part `{missing[0]}` is missing.")
-        spec = await read_text(RegistrationSpec, parts["request"])
+        spec = await read_text(RegistrationSpec, parts["request"], what="The part `request`")
         said = {name: read_description(parts.get(f"{name}_description")) for name in _ROLES}
         received = {name: await upload.finish() for name, upload in files.items()}
         beside = {name: Beside(said[name], await configs[name].received(), role=name) for name in _ROLES}

@@ -233,7 +233,11 @@ async def _receive_parts(
 
 def read_description(text: bytes | None) -> UploadDescription | None:
     """What a part says of a file. Raises Problem MALFORMED_JSON, INVALID_DESCRIPTION."""
-    return None if text is None else read_model(UploadDescription, text, "INVALID_DESCRIPTION")
+    return (
+        None
+        if text is None
+        else read_model(UploadDescription, text, "INVALID_DESCRIPTION", what="The part `description`")
+    )
 
 
 async def _compared(data: AsyncIterator[bytes], digest: str) -> AsyncIterator[bytes]:

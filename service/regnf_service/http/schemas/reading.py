@@ -59,13 +59,17 @@ class _Fault(NamedTuple):
 
 
 def read_model(
-    model: type[_Model], body: bytes, otherwise: str = "INVALID_REQUEST", most_values: int = MOST_VALUES
+    model: type[_Model],
+    body: bytes,
+    otherwise: str = "INVALID_REQUEST",
+    most_values: int = MOST_VALUES,
+    what: str = "The body",
 ) -> _Model:
-    """The body as ``model``, a pydantic model or dataclass, strictly.
+    """The body, or a part of it that messages call ``what``, as ``model``, a pydantic model or dataclass, strictly.
 
     Raises Problem: MALFORMED_JSON, the faulty member's reason, or ``otherwise``.
     """
-    text = json.dumps(parse_json(body, most_values))
+    text = json.dumps(parse_json(body, most_values, what))
     try:
         validated: _Model = _adapter(cast(Any, model)).validate_json(text, strict=True)
     except ValidationError as error:
@@ -84,11 +88,16 @@ def refusal(error: ValidationError, otherwise: str, model: Any) -> Problem:
     if any(fault["type"] == "json_invalid" for fault in raw):
         return Problem("MALFORMED_JSON", "A string holds half of a surrogate pair.")
     faults = [_fault(entry, model) for entry in raw[:MAX_ERRORS]]
-    reason = next(filter(None, map(_reason, faults)), otherwise)
-    of_box = next((one.detail for one in faults if one.kind == DETECTION_FAULT), None)
+    deciding = next(filter(_reason, faults), None)
+    reason = (deciding and _reason(deciding)) or otherwise
+    detail = None
+    if deciding is not None and deciding.kind == "missing":  # its reason speaks of one that is malformed
+        detail = f"The member {json_pointer(deciding.place)} is missing."
+    elif reason == "INVALID_DETECTION":
+        detail = next((one.detail for one in faults if one.kind == DETECTION_FAULT), None)
     return Problem(
         reason,
-        of_box if reason == "INVALID_DETECTION" else None,
+        detail,
         errors=[{"pointer": json_pointer(one.place), "detail": one.detail} for one in faults],
         hint=next((one.hint for one in faults if one.hint), None),
     )

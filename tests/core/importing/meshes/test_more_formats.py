@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.containers.sniff import HEAD_BYTES, explain_refusal, sniff_format
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
@@ -382,6 +383,11 @@ def test_ply_vertices_with_lists_are_read() -> None:
         (b"\x93NUMPY\x01\0v\0{'descr'", "numpy.savez"),
         (b"# Octomap OcTree binary file\n", "OctoMap"),
         (b"NRRD0004\n", "NRRD"),
+        (b"\xef\xbb\xbf\r\n<robot name='arm'>", "URDF"),
+        (b"<!-- made by hand -->\n<sdf version='1.7'>", "Gazebo"),
+        (b"  0\r\nSECTION\r\n  2\r\nHEADER\r\n", "DXF"),
+        (b"AC1032\0\0", "DWG"),
+        (b"#X3D V3.0 utf8\n", "X3D"),
     ],
 )
 def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
@@ -389,3 +395,33 @@ def test_shapes_in_other_formats_are_named(head: bytes, named: str) -> None:
     reason, detail = explain_refusal(head)
     assert reason == "FORMAT_NOT_SUPPORTED"
     assert named in detail
+    assert detail.endswith("export it as .glb, .ply, .obj or .stl") or named == "numpy.savez"
+
+
+def test_a_text_that_names_another_program_is_not_that_programs_file() -> None:
+    for text in (b'{"note": "made with Blender"}', b"my notes on #usda and LASF files\n", b"# a <robot in a comment\n"):
+        assert explain_refusal(text)[0] == "FORMAT_NOT_RECOGNIZED"
+
+
+def test_bytes_behind_the_triangles_of_an_stl_file_are_passed_over() -> None:
+    facet = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0)
+    data = b"made by a program".ljust(80) + struct.pack("<I", 2) + 2 * facet
+    found = read_mesh("stl", memoryview(data + bytes(7)))
+    np.testing.assert_array_equal(found.faces, read_mesh("stl", memoryview(data)).faces)
+    assert found.left_out == ("7 bytes behind the triangles",)
+    with pytest.raises(FieldFormatError, match="ends within its 2 facets"):
+        read_mesh("stl", memoryview(data[:-7]))
+
+
+@pytest.mark.parametrize(
+    ("format_", "text"),
+    [
+        ("obj", "v 0,0 1,5 0,0\nv 1,0 0,0 0,0\nv 0,0 0,5 0,0\nf 1 2 3\n"),
+        ("off", "OFF\n3 1 0\n0,0 1,5 0,0\n1,0 0,0 0,0\n0,0 0,5 0,0\n3 0 1 2\n"),
+        ("stl", "solid a\nfacet normal 0 0 1\nouter loop\n" + "vertex 0,0 1,5 0,0\n" * 3 + "endloop\nendfacet\n"),
+    ],
+)
+def test_decimal_commas_are_named(format_: str, text: str) -> None:
+    assert sniff_format(text.encode()) == format_
+    with pytest.raises(FieldFormatError, match="decimals have points, not commas"):
+        read_mesh(format_, memoryview(text.encode()))

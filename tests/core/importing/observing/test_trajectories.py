@@ -84,7 +84,7 @@ def neus() -> bytes:
     return out.getvalue()
 
 
-def require_same(found: Trajectory) -> None:
+def assert_same(found: Trajectory) -> None:
     expected = poses()
     points = np.random.default_rng(2).uniform(-1, 1, (20, 3))
     size = np.array([WIDTH, HEIGHT])
@@ -100,11 +100,11 @@ def require_same(found: Trajectory) -> None:
 
 
 def test_transforms_of_nerfstudio() -> None:
-    require_same(read_trajectory([file("transforms.json", json.dumps(transforms()))], NOTHING))
+    assert_same(read_trajectory([file("transforms.json", json.dumps(transforms()))], NOTHING))
 
 
 def test_the_name_of_the_file_does_not_matter() -> None:
-    require_same(read_trajectory([file("cameras", json.dumps(transforms()))], NOTHING))
+    assert_same(read_trajectory([file("cameras", json.dumps(transforms()))], NOTHING))
 
 
 def test_an_angle_in_place_of_pixels() -> None:
@@ -118,7 +118,7 @@ def test_an_angle_in_place_of_pixels() -> None:
 def test_axes_that_are_said_go_before_the_files_own() -> None:
     frames = [{"transform_matrix": pose[:3].tolist()} for pose in poses()]
     said = CamerasDescription(axes="opencv")
-    require_same(read_trajectory([file("transforms.json", json.dumps({**transforms(), "frames": frames}))], said))
+    assert_same(read_trajectory([file("transforms.json", json.dumps({**transforms(), "frames": frames}))], said))
 
 
 def test_the_transform_that_nerfstudio_applied_is_told() -> None:
@@ -134,27 +134,27 @@ def test_the_transform_that_nerfstudio_applied_is_told() -> None:
 
 
 def test_meta_data_of_sdfstudio_without_its_images() -> None:
-    require_same(read_trajectory([file("meta_data.json", json.dumps(meta_data()))], NOTHING))
+    assert_same(read_trajectory([file("meta_data.json", json.dumps(meta_data()))], NOTHING))
 
 
 def test_poses_of_tum() -> None:
-    require_same(read_trajectory([file("groundtruth.txt", tum())], SAID))
+    assert_same(read_trajectory([file("groundtruth.txt", tum())], SAID))
 
 
 def test_a_folder_of_poses_with_and_without_intrinsics() -> None:
-    require_same(read_trajectory(matrices(), SAID))
+    assert_same(read_trajectory(matrices(), SAID))
     text = "\n".join(" ".join(map(repr, row)) for row in K.tolist())
     size = CamerasDescription(size=[WIDTH, HEIGHT])
-    require_same(read_trajectory([*matrices(), file("camera-intrinsics.txt", text)], size))
+    assert_same(read_trajectory([*matrices(), file("camera-intrinsics.txt", text)], size))
 
 
 def test_cameras_of_neus() -> None:
-    require_same(read_trajectory([file("cameras_sphere.npz", neus())], CamerasDescription(size=[WIDTH, HEIGHT])))
+    assert_same(read_trajectory([file("cameras_sphere.npz", neus())], CamerasDescription(size=[WIDTH, HEIGHT])))
 
 
 def test_lost_cameras_are_passed_over() -> None:
     lost = file("frame-9.pose.txt", "\n".join(["-inf -inf -inf -inf"] * 4))
-    require_same(read_trajectory([*matrices(), lost], SAID))
+    assert_same(read_trajectory([*matrices(), lost], SAID))
 
 
 def _with(change: Callable[[dict[str, Any]], Any]) -> list[SettingsFile]:

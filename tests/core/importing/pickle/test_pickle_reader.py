@@ -25,7 +25,7 @@ def read(data: bytes) -> Any:
     return read_pickle(memoryview(data))
 
 
-def refused(data: bytes, reason: str) -> None:
+def assert_rejected(data: bytes, reason: str) -> None:
     assert_refused(lambda: read(data), reason)
 
 
@@ -172,12 +172,12 @@ def test_everything_done_to_a_placeholder_is_without_effect() -> None:
     ],
 )
 def test_opcodes_that_no_checkpoint_needs_are_refused(opcodes: bytes) -> None:
-    refused(PROTO + opcodes + b".", "PICKLE_OPCODE_NOT_ALLOWED")
+    assert_rejected(PROTO + opcodes + b".", "PICKLE_OPCODE_NOT_ALLOWED")
 
 
 @pytest.mark.parametrize("data", [b"", b"\x80", b"N.", b"\x80\x00N.", b"\x80\x01N.", b"\x80\x06N."])
 def test_other_protocols_are_refused(data: bytes) -> None:
-    refused(data, "PICKLE_PROTOCOL")
+    assert_rejected(data, "PICKLE_PROTOCOL")
 
 
 @pytest.mark.parametrize(
@@ -223,17 +223,17 @@ def test_other_protocols_are_refused(data: bytes) -> None:
     ],
 )
 def test_pickles_that_make_no_sense_are_refused(body: bytes) -> None:
-    refused(PROTO + body + b".", "PICKLE_MALFORMED")
+    assert_rejected(PROTO + body + b".", "PICKLE_MALFORMED")
 
 
 def test_a_pickle_cut_short_anywhere_is_refused() -> None:
     whole = pickle.dumps({"a": [1, 2.5, ("x", None)], "b": np.float64(3)}, 4)
     for end in range(2, len(whole)):
-        refused(whole[:end], "PICKLE_MALFORMED")
+        assert_rejected(whole[:end], "PICKLE_MALFORMED")
 
 
 def test_a_second_pickle_behind_the_first_is_refused() -> None:
-    refused(PROTO + b"N." + PROTO + b"N.", "PICKLE_TRAILING_DATA")
+    assert_rejected(PROTO + b"N." + PROTO + b"N.", "PICKLE_TRAILING_DATA")
 
 
 def test_a_tensor_made_by_an_unknown_function_carries_its_name() -> None:
@@ -254,7 +254,7 @@ def test_a_billion_laughs_cost_nothing() -> None:
 
 @pytest.mark.parametrize("opener", [b"(", b"]", b"}", b"N", b")"])
 def test_endless_nesting_is_refused(opener: bytes) -> None:
-    refused(PROTO + opener * 200_000, "PICKLE_TOO_DEEP")
+    assert_rejected(PROTO + opener * 200_000, "PICKLE_TOO_DEEP")
 
 
 def test_a_deep_tuple_is_harmless() -> None:
@@ -262,7 +262,7 @@ def test_a_deep_tuple_is_harmless() -> None:
 
 
 def test_a_deep_tuple_as_a_key_is_refused() -> None:
-    refused(PROTO + b"})" + b"\x85" * 300_000 + b"Ns.", "PICKLE_MALFORMED")
+    assert_rejected(PROTO + b"})" + b"\x85" * 300_000 + b"Ns.", "PICKLE_MALFORMED")
 
 
 def test_a_container_in_itself_is_harmless() -> None:
@@ -272,12 +272,12 @@ def test_a_container_in_itself_is_harmless() -> None:
 
 @pytest.mark.parametrize("opcode", [b"\x8a\xff" + b"\x7f" * 255, b"\x8b" + struct.pack("<I", 1 << 20) + bytes(1 << 20)])
 def test_giant_integers_are_refused(opcode: bytes) -> None:
-    refused(PROTO + opcode + b".", "PICKLE_INTEGER_TOO_LARGE")
+    assert_rejected(PROTO + opcode + b".", "PICKLE_INTEGER_TOO_LARGE")
 
 
 def test_giant_integers_as_keys_are_refused() -> None:
-    refused(PROTO + b"}\x8a\x0b" + b"\x7f" * 11 + b"Ns.", "PICKLE_INTEGER_TOO_LARGE")
+    assert_rejected(PROTO + b"}\x8a\x0b" + b"\x7f" * 11 + b"Ns.", "PICKLE_INTEGER_TOO_LARGE")
 
 
 def test_a_string_that_claims_gigabytes_is_refused() -> None:
-    refused(PROTO + b"X" + struct.pack("<I", 1 << 31) + b".", "PICKLE_STRING_TOO_LARGE")
+    assert_rejected(PROTO + b"X" + struct.pack("<I", 1 << 31) + b".", "PICKLE_STRING_TOO_LARGE")

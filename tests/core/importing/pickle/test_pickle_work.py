@@ -14,15 +14,15 @@ from tests.core.importing.archives import assert_refused, text
 PROTO = b"\x80\x02"
 
 
-def too_much(body: bytes) -> None:
+def assert_too_much(body: bytes) -> None:
     """The body asks for more than a hundred opcodes' work, or for more than ten remembered values."""
     limits = PickleLimits(opcodes=100, memo=10)
     assert_refused(lambda: read_pickle(memoryview(PROTO + body + b"."), limits), "PICKLE_TOO_COMPLEX")
 
 
 def test_opcodes_and_remembered_values_are_counted() -> None:
-    too_much(b"N0" * 60 + b"N")
-    too_much(b"N" + b"".join(b"q" + bytes([i]) for i in range(20)))
+    assert_too_much(b"N0" * 60 + b"N")
+    assert_too_much(b"N" + b"".join(b"q" + bytes([i]) for i in range(20)))
 
 
 @pytest.mark.parametrize(
@@ -37,14 +37,14 @@ def test_opcodes_and_remembered_values_are_counted() -> None:
 )
 def test_calls_cost_what_they_may_copy(arguments: bytes, call: bytes) -> None:
     """Arguments that are remembered can be used again and again at the price of a few opcodes."""
-    too_much(arguments + b"q\x00" + call * 5)
+    assert_too_much(arguments + b"q\x00" + call * 5)
 
 
 def test_persistent_ids_cost_their_length() -> None:
     identifier = (
         b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + b"K\x01" + b"N" * 30 + b"t"
     )
-    too_much(identifier + b"q\x00" + b"h\x00Q0" * 5)
+    assert_too_much(identifier + b"q\x00" + b"h\x00Q0" * 5)
 
 
 def keys_of_one_hash(count: int) -> list[tuple[int, int]]:

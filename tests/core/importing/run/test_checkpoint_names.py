@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.run.checkpoint_names import choose_checkpoint
 from regnf_core.importing.run.settings_names import choose_settings
 from tests.core.importing.archives import assert_refused
@@ -71,3 +72,12 @@ def test_codes_of_the_same_epoch_are_chosen() -> None:
 def test_data_of_several_scenes_is_nobody_s() -> None:
     names = ["data/a/transforms.json", "data/b/transforms.json"]
     assert choose_settings(names, "logs/x/epoch_1_iteration_2_checkpoint.pt") == ()
+
+
+def test_files_to_choose_from_are_named_whole() -> None:
+    names = [f"{'run ' * 20}/{part * 12}/{part}.safetensors" for part in ("coarse", "fine")]
+    with pytest.raises(FieldFormatError) as refused:
+        choose_checkpoint(names)
+    assert all(f" {name}" in str(refused.value) for name in names)
+    with pytest.raises(FieldFormatError, match=r": \.\.\.a"):
+        choose_checkpoint([f"{'a' * 300}/{part}.safetensors" for part in ("coarse", "fine")])
