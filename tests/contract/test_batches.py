@@ -19,6 +19,7 @@ from regnf_state.queue import QUEUE_NAME, Work
 from tests.contract.asgi import client_of
 from tests.contract.batch_posts import NDJSON, body_of, document, pairs, post, posted, results, work
 from tests.contract.world import BOX, RESULT, TOKENS, World, assert_refused, field_bytes, sha256
+from tests.round_trips import counted_round_trips
 
 # from lines to results
 
@@ -413,13 +414,13 @@ class KilledError(Exception):
     """The process ends here."""
 
 
-@pytest.mark.parametrize("at", range(0, 9, 2))
+@pytest.mark.parametrize("at", range(6))
 def test_a_post_that_dies_midway_is_taken_up_by_the_next(
     world: World, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
     lines = pairs(world, 4)
     calls = iter(range(100))
-    for target, name in ((world.queue, "enqueue_registration"), (world.records.journal, "accept")):
+    for target, name in ((world.queue, "enqueue_jobs"), (world.records.journal, "_accept")):
         whole = getattr(target, name)
 
         def dying(*args: Any, whole: Any = whole) -> Any:
@@ -428,12 +429,20 @@ def test_a_post_that_dies_midway_is_taken_up_by_the_next(
             return whole(*args)
 
         monkeypatch.setattr(target, name, dying)
-    if at < 8:
+    if at < 5:
         assert post(world, lines).status_code == 500
         assert world.client.get("/batches").json()["batches"] == [], "no half batch"
     batch_id = posted(world, lines)
     assert len(work(world)) == len({one["job"] for one in results(world, batch_id)}) == 4
     assert {world.records.get_job(one["job"]).attempt for one in results(world, batch_id)} == {1}
+
+
+def test_many_lines_take_few_round_trips(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = pairs(world, 80)
+    posted(world, lines[:1])
+    sent = counted_round_trips(monkeypatch)
+    posted(world, lines)
+    assert len(sent) < len(lines)
 
 
 def test_a_lost_redis_loses_no_pair(world: World) -> None:

@@ -29,7 +29,6 @@ from regnf_state.batches import Batch
 
 router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
-_LINES_AT_ONCE = 20
 _MOST_LINES = 2**31 - 1
 """More than any batch has; what a query may ask for at most."""
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
@@ -82,11 +81,10 @@ async def post_batch(request: Request, services: ServicesDep, caller: CallerDep,
     pace = Pace(services.settings)
     async with services.uploads.held(fair_key(request.scope, caller), pace):
         posting = await _read(request, services, Intake(services, caller), pace)
-        few = [posting.lines[start : start + _LINES_AT_ONCE] for start in range(0, len(posting.lines), _LINES_AT_ONCE)]
-        for lines in few:
+        for lines in posting.portions():
             await in_thread(posting.check, lines)
         await in_thread(posting.require_room)
-        for lines in few:
+        for lines in posting.portions():
             await in_thread(posting.submit, lines)
         batch = await in_thread(posting.keep)
     answer = await in_thread(_answer, services, batch, prefix, 202)
