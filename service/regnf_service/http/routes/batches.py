@@ -50,6 +50,7 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "INVALID_QUERY",
             "INVALID_HEADER",
             "UNSUPPORTED_MEDIA_TYPE",
+            "MALFORMED_JSON",
             "REQUEST_TOO_LARGE",
             "TOO_MANY_PAIRS",
             "BATCH_EMPTY",
