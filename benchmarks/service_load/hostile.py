@@ -174,8 +174,8 @@ async def library_batches(alice: Alice) -> None:
                 await alice.ask("POST", f"/batches/{batch}/cancel")
                 await alice.ask("DELETE", f"/batches/{batch}")
 
-    # of the queue's thousand places a caller has half: a batch of 2,000 is read whole, then refused
-    await alice.all_of(batches(2000 if number % 2 else 100) for number in range(8))
+    # of the queue's thousand places a caller has half: a batch of 1,000 is read whole, then refused
+    await alice.all_of(batches(1000 if number % 2 else 100) for number in range(8))
 
 
 async def batches(alice: Alice) -> None:
