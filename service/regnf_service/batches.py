@@ -28,8 +28,8 @@ COUNTED = ("registered", "ambiguous", "rejected", "failed", "refused")
 """How a pair can end: a verdict, an error of its job, or an error of its line."""
 _BATCH_ID = re.compile(r"[0-9a-f]{32}")
 _AT_ONCE = 100
-_NAMES_AT_ONCE = 300
-"""Fields and lines of a portion of a batch that is posted: a hundred pairs, or one search of a large library."""
+_NAMES_AT_ONCE = 2000
+"""That the lines have which are checked or started together: a megabyte of records of searches."""
 _LOOKED_AT = 500
 _PAGE_BYTES = 1 << 20
 """Of a page of results: pairs that it is chosen from, and bytes."""
@@ -73,7 +73,7 @@ class Posting:
         for line in self.lines:
             few.append(line)
             names += 1 + len(_fields_of(line))
-            if names >= _NAMES_AT_ONCE:
+            if names >= _NAMES_AT_ONCE or len(few) == _AT_ONCE:
                 yield few
                 few, names = [], 0
         if few:
