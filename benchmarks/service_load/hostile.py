@@ -83,9 +83,7 @@ class Alice:
         ]
         return "\r\n".join([*lines, *more, "", ""]).encode()
 
-    async def ask(
-        self, method: str, path: str, body: bytes = b"", kind: str = "application/json", *more: str
-    ) -> bytes:
+    async def ask(self, method: str, path: str, body: bytes = b"", kind: str = "application/json", *more: str) -> bytes:
         """One request on a connection of its own; what is answered."""
         more += (f"Content-Type: {kind}", f"Content-Length: {len(body)}") if method != "GET" else ()
         reader, writer = await asyncio.open_connection("127.0.0.1", self.port)

@@ -49,7 +49,7 @@ def transform_rows(value: Any) -> Rows:
     inverse = isinstance(value, Mapping) and "T_object_scene" not in value and "T_scene_object" in value
     if isinstance(value, Mapping):
         value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
-    rows = value.get("matrix") if isinstance(value, Mapping) else value
+    rows: Any = value.get("matrix") if isinstance(value, Mapping) else value
     fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
     if fault:
         raise ValueError(fault)

@@ -110,8 +110,11 @@ class FairQueue:
     def enqueue_each(self, waiting: Iterable[Waiting]) -> list[bool]:
         """The same for several, in their order and in one round trip."""
         steps = [
-            (one.work.name, one.owner, one.work.kind, self._weights.get(one.owner, 1.0), int(one.of_batch))
-            + tuple(part for pair in one.payload.items() for part in pair)
+            (
+                one.work.name,
+                *(one.owner, one.work.kind, self._weights.get(one.owner, 1.0), int(one.of_batch)),
+                *(part for pair in one.payload.items() for part in pair),
+            )
             for one in waiting
         ]
         return self._mended(lambda: self._enqueue(steps)) if steps else []

@@ -11,9 +11,9 @@ from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
+from regnf_state.records import JobRecord
 from regnf_state.redis import payload
 from regnf_state.redis.documents import shown
-from regnf_state.records import JobRecord
 from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
 
 

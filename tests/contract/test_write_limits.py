@@ -9,8 +9,8 @@ import httpx
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
-from regnf_service.http.buckets import Buckets
 from regnf_service.http import write_limits
+from regnf_service.http.buckets import Buckets
 from regnf_service.http.write_limits import WriteGate
 from regnf_state.settings import Settings
 from tests.contract.live import Live, live_service

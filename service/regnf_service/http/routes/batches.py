@@ -13,6 +13,7 @@ from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Intake, portions
 from regnf_service.http.batch_lines import lines_of
+from regnf_service.http.by_reference import read_library
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.pace import Pace
 from regnf_service.http.paging import decode_token, encode_token
@@ -99,6 +100,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
     async for lines in lines_of(chunks):
         for few in portions(lines):
             read = await PARSING.run(intake.read, few)
+            await read_library(intake.library, [spec for _, _, spec in read if spec is not None])
             await in_thread(intake.take, read)
     return intake.finish()
 
