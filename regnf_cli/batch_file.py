@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from regnf_cli.request_files import is_json
+from regnf_cli.request_files import as_transform, is_json
 from regnf_core.detections import parse_detection
 from regnf_core.engine_revision import ENGINE_REVISION
 from regnf_core.errors import InvalidInputError, RegnfError
@@ -212,6 +212,11 @@ def _request(folder: Path, given: Mapping[str, Any]) -> dict[str, Any]:
         raise InvalidInputError("`pictures` is neither true nor false", reason="INVALID_REQUEST", hint=_HINT)
     detection = parse_detection(box, given.get("detection_index")).canonical()
     more = {name: given[name] for name in _MORE if given.get(name) is not None}
+    if "initial_transform" in more:
+        more["initial_transform"] = as_transform(_value(folder, more["initial_transform"]), "`initial_transform`")
+    if "ground_truth" in more:
+        truth = as_transform(_value(folder, more["ground_truth"]), "`ground_truth`")
+        more["ground_truth"] = {"T_object_scene": truth}
     return {"detection": detection, "options": options, "seed": seed, **more}
 
 

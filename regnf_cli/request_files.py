@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from regnf_core.detections import Detection, parse_detection
 from regnf_core.errors import InvalidDetectionError, InvalidInputError, InvalidOptionsError
-from regnf_core.geometry.similarity_check import similarity_fault
+from regnf_core.geometry.similarity_check import Rows, transform_rows
 from regnf_core.options import Preset, RegistrationOptions
 from regnf_core.texts import json_value
 
-Rows = list[list[float]]
 _TRANSFORM = 'Write {"T_object_scene": [[4 numbers], [4], [4], [0, 0, 0, 1]]}: scene coordinates to object coordinates;'
 _TRANSFORM += ' or {"T_scene_object": ...}: object coordinates to scene coordinates.'
 
@@ -69,16 +66,15 @@ def read_transform(path: Path, what: str) -> Rows:
 
     Raises InvalidInputError (INVALID_TRANSFORM) when there is none, or it is no similarity.
     """
-    value = read_json(path, what)
-    inverse = isinstance(value, dict) and "T_object_scene" not in value and "T_scene_object" in value
-    if isinstance(value, dict):
-        value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
-    rows: Any = value.get("matrix") if isinstance(value, dict) else value
-    fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
-    if fault:
-        raise InvalidInputError(f"{what} {path}: {fault}", reason="INVALID_TRANSFORM", hint=_TRANSFORM)
-    plain = [[float(number) for number in row] for row in rows]
-    return np.linalg.inv(plain).tolist() if inverse else plain
+    return as_transform(read_json(path, what), f"{what} {path}")
+
+
+def as_transform(value: Any, what: str) -> Rows:
+    """The same of a value. Raises InvalidInputError (INVALID_TRANSFORM), which begins with ``what``."""
+    try:
+        return transform_rows(value)
+    except ValueError as error:
+        raise InvalidInputError(f"{what}: {error}", reason="INVALID_TRANSFORM", hint=_TRANSFORM) from error
 
 
 def is_json(text: str) -> bool:

@@ -21,7 +21,8 @@ _AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Request:
-    """What a registration asks for beside its fields. start: a T_object_scene to look at first."""
+    """What a registration asks for beside its fields. start: a T_object_scene to look at first, or
+    ``{"T_scene_object": ...}``."""
 
     detection: BoxLike
     options: OptionsLike = None

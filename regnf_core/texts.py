@@ -7,12 +7,15 @@ through here.
 from __future__ import annotations
 
 import codecs
+import io
 import json
 import re
 from typing import Any
 
 from regnf_core.errors import InvalidInputError
 
+_TELLING_BYTES = 4
+"""Of a text's beginning: they tell its encoding."""
 _MARK = "\N{ZERO WIDTH NO-BREAK SPACE}"
 _LINE_ENDS = re.compile(r"\r\n?")
 _MARKS = re.compile(f"^{_MARK}+", re.MULTILINE)
@@ -61,6 +64,34 @@ def _windows(raw: bytes, error: UnicodeDecodeError) -> str:
     except UnicodeDecodeError as other:
         worse = f"byte {other.start + 1} ({raw[other.start]:#04x})"
         raise TextError(f"no text in UTF-8 from {place} on, nor in Windows-1252, which lacks {worse}") from error
+
+
+class TextStream:
+    """A text that arrives in pieces of any size, as lines that ``decode_text`` reads one by one.
+
+    Line ends become line feeds. UTF-16 and UTF-32, which have bytes like them within characters, become UTF-8.
+    """
+
+    def __init__(self) -> None:
+        self._head = b""
+        self._source = self._target = ""
+        self._decoder: io.IncrementalNewlineDecoder | None = None
+
+    def feed(self, data: bytes, *, final: bool = False) -> bytes:
+        """What ``data`` adds. ``final``: nothing comes after it. Raises TextError."""
+        if self._decoder is None:
+            self._head += data
+            if len(self._head) < _TELLING_BYTES and not final:
+                return b""
+            data, told = self._head, json.detect_encoding(self._head)
+            # any byte is a character of Latin-1: the lines stay as they are
+            wide = told.startswith(("utf-16", "utf-32"))
+            self._source, self._target = (told, "utf-8") if wide else ("latin-1", "latin-1")
+            self._decoder = io.IncrementalNewlineDecoder(codecs.getincrementaldecoder(self._source)(), translate=True)
+        try:
+            return self._decoder.decode(data, final).encode(self._target)
+        except UnicodeError as error:
+            raise TextError(f"no text in {self._source.upper()}") from error
 
 
 def json_value(data: bytes | str, what: str = "", **how: Any) -> Any:

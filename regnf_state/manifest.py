@@ -42,6 +42,8 @@ ARTIFACTS: dict[str, str] = {
 """Names that an artifact can have, with its media type."""
 _FRAMES = {".png": "image/png", "-depth.png": "image/png", "-normal.png": "image/png", "-depth.npy": _BINARY}
 _FRAME = re.compile(rf"(?:frame|before)-[0-9]{{4}}(?P<what>{'|'.join(map(re.escape, _FRAMES))})")
+_MOST_RESULT_BYTES = 4 << 20
+"""A search among 512 candidates has 1 MB, a rendering of the most images less."""
 MEDIA_TYPES = frozenset({*ARTIFACTS.values(), *_FRAMES.values()})
 
 
@@ -179,12 +181,15 @@ def _is_sound(one: Artifact) -> bool:
 
 
 def read_result(blobs: BlobStore, manifest: Manifest) -> dict[str, Any]:
-    """The result document. Raises FileNotFoundError, UnreadableRecordError."""
+    """The result document. Raises FileNotFoundError, UnreadableRecordError, also for one larger than any can be."""
     with blobs.open(manifest.key("result.json")) as file:
-        try:
-            document = json.load(file)
-        except ValueError as error:
-            raise UnreadableRecordError(manifest.job_id, "its result is damaged") from error
+        text = file.read(_MOST_RESULT_BYTES + 1)
+    if len(text) > _MOST_RESULT_BYTES:
+        raise UnreadableRecordError(manifest.job_id, "its result is too large")
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise UnreadableRecordError(manifest.job_id, "its result is damaged") from error
     if not isinstance(document, dict):
         raise UnreadableRecordError(manifest.job_id, "its result is damaged")
     return document

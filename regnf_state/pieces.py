@@ -82,9 +82,13 @@ class Pieces:
             total -= oldest.bytes
             self._blobs.delete_prefix(oldest.folder)
 
+    def unfinished(self) -> list[Unfinished]:
+        """The uploads of all callers."""
+        return list(self._uploads(_TOP))
+
     def expire(self, now: float) -> int:
         """Uploads of all callers that did not go on for as long as they are kept go: how many."""
-        old = [one.folder for one in self._uploads(_TOP) if one.modified + self._kept_s <= now]
+        old = [one.folder for one in self.unfinished() if one.modified + self._kept_s <= now]
         for folder in old:
             self._blobs.delete_prefix(folder)
         return len(old)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from regnf_state.ownership import ANONYMOUS
+from regnf_state.records import JobRecord
 
 QUEUE_NAME = "regnf"
 IMPORT_QUEUE_NAME = "regnf-import"
@@ -62,6 +64,10 @@ class JobQueue(Protocol):
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
         """of_batch: it waits behind all that its owner has posted by itself, so that a batch holds nothing up."""
+        ...
+
+    def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
+        """The same for several accepted jobs, in one round trip, in their order."""
         ...
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:

@@ -9,7 +9,16 @@ from regnf_core.library_entries import EntryNotes
 from regnf_state.library import LibraryEntry
 from regnf_state.ownership import ANONYMOUS
 from regnf_state.pages import Page, Position
-from regnf_state.records import NO_QUOTA, FieldRecord, JobEvent, JobNews, JobRecord, Quota, UnreadableRecordError
+from regnf_state.records import (
+    NO_QUOTA,
+    FieldRecord,
+    JobEvent,
+    JobNews,
+    JobRecord,
+    Quota,
+    RecordError,
+    UnreadableRecordError,
+)
 
 
 class RecordStore(Protocol):
@@ -35,6 +44,12 @@ class RecordStore(Protocol):
         once if the job has finished. Atomic. Raises QueueFullError when ``max_active`` jobs are active already,
         QuotaError when the owner, or the job of webhooks, has as many as it may.
         """
+        ...
+
+    def create_jobs(
+        self, records: Sequence[JobRecord], max_active: int, quota: Quota = NO_QUOTA
+    ) -> list[tuple[JobRecord, bool] | RecordError]:
+        """The same for several, in a few round trips: a refusal takes the place of a job that is refused."""
         ...
 
     def get_job(self, job_id: str) -> JobRecord | None: ...

@@ -170,7 +170,7 @@ class Settings(BaseSettings):
     keep_pieces_bytes: int = Field(default=8192 * MIB, ge=0)
     """Of each caller's unfinished uploads; beyond this the oldest go."""
     storage_cap_bytes: int | None = Field(default=None, ge=1)
-    """Beyond this the oldest finished jobs and unused fields go, before their time."""
+    """Of all that is stored. Beyond this the oldest finished jobs, unused fields, batches and unfinished uploads go."""
     storage_url: str | None = Field(default=None, pattern=r"^s3://[^/\s]+(/\S*)?$")
     """An object store for several machines; unset: a folder below state_dir."""
     adopt_storage: str | None = None

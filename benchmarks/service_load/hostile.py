@@ -11,11 +11,11 @@ filters          a filter that finds nothing among a thousand fields; a status t
 results          results of a batch of 8,000 refused lines, by a status that none of them has
 unread meshes    meshes that are asked for and not read
 unread pages     the same of lists and of the contract
-library batches  batches whose every line names a library of 500
+library batches  batches whose every line names a library of 500: some are accepted and cancelled, some are too long
 batches          40 batches of fields that nobody has; others are posted, cancelled and deleted without a pause
 requests         searches among 400 candidates, in bodies that come slowly and whole
 webhooks         a receiver that sends a byte of its answer now and then, and one that never ends its head
-pieces           an upload in pieces that is finished again and again
+pieces           uploads in pieces that are put together and turn out to be others than they were said to be
 uploads          forms and files that are no field, as many as are taken
 """
 
@@ -83,9 +83,9 @@ class Alice:
         ]
         return "\r\n".join([*lines, *more, "", ""]).encode()
 
-    async def ask(self, method: str, path: str, body: bytes = b"", kind: str = "application/json") -> bytes:
+    async def ask(self, method: str, path: str, body: bytes = b"", kind: str = "application/json", *more: str) -> bytes:
         """One request on a connection of its own; what is answered."""
-        more = (f"Content-Type: {kind}", f"Content-Length: {len(body)}") if method != "GET" else ()
+        more += (f"Content-Type: {kind}", f"Content-Length: {len(body)}") if method != "GET" else ()
         reader, writer = await asyncio.open_connection("127.0.0.1", self.port)
         try:
             writer.write(self.head(method, path, "Connection: close", *more) + body)
@@ -164,12 +164,16 @@ async def unread_pages(alice: Alice) -> None:
 
 
 async def library_batches(alice: Alice) -> None:
-    async def batches(number: int) -> None:
-        for again in count():
-            request = {"scene": alice.told["scene"], "detection": _BOX, "candidates": {"library": {}}}
-            await alice.post_batch(request | {"seed": 10**6 * number + 10**4 * again + line} for line in range(2000))
+    request = {"scene": alice.told["scene"], "detection": _BOX, "candidates": {"library": {}}}
 
-    await alice.all_of(batches(number) for number in range(8))
+    async def batches(lines: int) -> None:
+        while True:
+            if batch := await alice.post_batch(request | {"seed": next(_numbers)} for _ in range(lines)):
+                await alice.ask("POST", f"/batches/{batch}/cancel")
+                await alice.ask("DELETE", f"/batches/{batch}")
+
+    # of the queue's thousand places a caller has half: a batch of 1,000 is read whole, then refused
+    await alice.all_of(batches(1000 if number % 2 else 100) for number in range(8))
 
 
 async def batches(alice: Alice) -> None:
@@ -246,24 +250,19 @@ async def webhooks(alice: Alice) -> None:
 
 
 async def pieces(alice: Alice) -> None:
-    """Of a file that is no field, but begins as one; half of it is one piece."""
+    """Of a file that begins as a field and has another digest: it is put together and hashed, and its pieces go."""
     header = json.dumps({"__metadata__": {"of": "pieces"}}).encode()
-    data = (len(header).to_bytes(8, "little") + header).ljust(200 << 20, b"\0")
-    name = hashlib.sha256(data).hexdigest()
-    for begin in range(0, len(data), 50 << 20):
-        piece = data[begin : begin + (50 << 20)]
-        reader, writer = await asyncio.open_connection("127.0.0.1", alice.port)
-        span = f"Content-Range: bytes {begin}-{begin + len(piece) - 1}/{len(data) + 1}"
-        writer.write(alice.head("PUT", f"/fields/{name}", span, f"Content-Length: {len(piece)}") + piece)
-        alice.answers[(await reader.read(1 << 16))[9:12].decode()] += 1
-        writer.close()
-    form = f'--b\r\nContent-Disposition: form-data; name="upload"\r\n\r\n{name}\r\n--b--\r\n'.encode()
+    data = (len(header).to_bytes(8, "little") + header).ljust(60 << 20, b"\0")
 
     async def finish() -> None:
         while True:
-            await alice.ask("POST", "/fields", form, "multipart/form-data; boundary=b")
+            name = hashlib.sha256(str(next(_numbers)).encode()).hexdigest()
+            for begin in range(0, len(data), 30 << 20):
+                piece = data[begin : begin + (30 << 20)]
+                span = f"Content-Range: bytes {begin}-{begin + len(piece) - 1}/{len(data)}"
+                await alice.ask("PUT", f"/fields/{name}", piece, "application/octet-stream", span)
 
-    await alice.all_of(finish() for _ in range(30))
+    await alice.all_of(finish() for _ in range(4))
 
 
 async def uploads(alice: Alice) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+Rows = list[list[float]]
 TOLERANCE = 1e-4
 """Largest Frobenius norm of M^T M / s^2 - I. ``Sim3.from_matrix`` accepts whatever passes here."""
 _MIN_SCALE = 1e-6
@@ -32,6 +33,28 @@ def similarity_fault(rows: Any) -> str | None:
     if _dot(_cross(x, y), z) < 0:
         return "it mirrors space"
     return None
+
+
+def inverse_rows(rows: Rows) -> Rows:
+    """The inverse of a similarity's 4x4: (s R)^T / s^2 and what takes the translation back."""
+    scale_squared = sum(float(value) ** 2 for row in rows[:3] for value in row[:3]) / 3
+    turned = [[float(rows[j][i]) / scale_squared for j in range(3)] for i in range(3)]
+    back = [-_dot(row, [float(each[3]) for each in rows[:3]]) + 0.0 for row in turned]
+    return [*([*row, t] for row, t in zip(turned, back, strict=True)), [0.0, 0.0, 0.0, 1.0]]
+
+
+def transform_rows(value: Any) -> Rows:
+    """The 4x4 T_object_scene in what people write: rows, an object with a ``matrix``, or a document with either under
+    the name T_object_scene, or with the inverse under T_scene_object. Raises ValueError."""
+    inverse = isinstance(value, Mapping) and "T_object_scene" not in value and "T_scene_object" in value
+    if isinstance(value, Mapping):
+        value = value["T_scene_object"] if inverse else value.get("T_object_scene", value)
+    rows: Any = value.get("matrix") if isinstance(value, Mapping) else value
+    fault = "no T_object_scene with a matrix" if rows is None else similarity_fault(rows)
+    if fault:
+        raise ValueError(fault)
+    plain = [[float(number) for number in row] for row in rows]
+    return inverse_rows(plain) if inverse else plain
 
 
 def _is_four_by_four(rows: Any) -> bool:

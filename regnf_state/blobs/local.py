@@ -172,7 +172,10 @@ class LocalBlobStore:
             writer.commit(key)
 
     def put_if_absent(self, key: str, data: bytes) -> bool:
-        self.path_of(key)
+        path = self.path_of(key)
+        if path.exists():
+            self.tried(lambda: _sync_folder(path.parent))  # whoever has written it may not have come so far
+            return False
         with self.writer() as writer:
             writer.write(data)
             return writer.commit_if_absent(key)

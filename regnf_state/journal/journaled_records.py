@@ -24,6 +24,7 @@ from regnf_state.records import (
     JobNews,
     JobRecord,
     Quota,
+    RecordError,
     UnreadableRecordError,
 )
 from regnf_state.redis.documents import Kind
@@ -61,17 +62,22 @@ class JournaledRecordStore(RedisRecordStore):
 
     # jobs
 
-    def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
-        if not self._redis.exists(JOB.key(record.id)) and not self.generation.is_current():
-            self.recall_job(record.id)  # one that Redis has lost: its attempts must not be counted from one again
-        job, created = super().create_job(record, max_active, quota)
-        if created and (names := fields_of(job)):
-            self._redis.zadd(_USED, dict.fromkeys(names, job.updated))
-        if job.status == "accepted":
-            self.journal.accept(job)  # also one known before: its first writer may have died before this line
-        if job.more_webhooks and not created:
-            self.journal.join(job)  # also those known before, for the same reason
-        return job, created
+    def create_jobs(
+        self, records: Sequence[JobRecord], max_active: int, quota: Quota = NO_QUOTA
+    ) -> list[tuple[JobRecord, bool] | RecordError]:
+        if not self.generation.is_current():
+            for record in records:
+                if not self._redis.exists(JOB.key(record.id)):
+                    self.recall_job(record.id)  # Redis has lost it: its attempts must not be counted from one again
+        answers = super().create_jobs(records, max_active, quota)
+        taken = [answer for answer in answers if not isinstance(answer, RecordError)]
+        used = {name: job.updated for job, created in taken if created for name in fields_of(job)}
+        if used:
+            self._redis.zadd(_USED, used)
+        # also those known before: their first writer may have died before these lines
+        self.journal.accept([job for job, _ in taken if job.status == "accepted"])
+        self.journal.join([job for job, created in taken if job.more_webhooks and not created])
+        return answers
 
     def get_job(self, job_id: str) -> JobRecord | None:
         found = super().get_job(job_id)

@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 from uuid import uuid4
 
 from redis import Redis
@@ -84,6 +84,16 @@ class Kind(Generic[_Record]):
         return f"{PREFIX}{self.name}:{name}"
 
 
+class Change(NamedTuple):
+    """One document's next version, with the commands around it: see ``_compare_and_set``."""
+
+    key: str
+    expected_version: int
+    commands: Sequence[Command]
+    record: JobRecord | FieldRecord | None = None
+    caps: Sequence[Cap] = ()
+
+
 class RedisDocuments:
     """Reads documents together with the server's clock, writes them together with their indexes, atomically."""
 
@@ -104,11 +114,8 @@ class RedisDocuments:
 
     def _read(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
         """The record, if there is one, and the time of reading. Raises UnreadableRecordError."""
-        with self._redis.pipeline(transaction=False) as pipeline:
-            ask(pipeline, kind.key(name))
-            pipeline.time()
-            answer, (seconds, microseconds) = pipeline.execute(raise_on_error=False)
-        return self._record(kind, name, stored_in(answer)), seconds + microseconds / 1e6
+        ((_, stored),), now = self._fetch_now(kind, [name])
+        return self._record(kind, name, stored), now
 
     def _read_each(self, kind: Kind[_Record], names: Sequence[str]) -> list[_Record | None]:
         """The record of each name, or None. One round trip. Raises UnreadableRecordError."""
@@ -120,23 +127,36 @@ class RedisDocuments:
         return [record for record in found if record is not None]
 
     def _read_to_create(self, kind: Kind[_Record], name: str) -> tuple[_Record | None, float]:
-        """The same before a record is made: a damaged one does not stand in its way.
+        """The same before a record is made. Raises as ``_before``."""
+        ((_, stored),), now = self._fetch_now(kind, [name])
+        return self._before(kind, name, stored), now
+
+    def _before(self, kind: Kind[_Record], name: str, stored: Stored | None) -> _Record | None:
+        """What there is before a record is made: a damaged one does not stand in its way.
 
         Raises UnreadableRecordError for one of a later release.
         """
         try:
-            return self._read(kind, name)
+            return self._record(kind, name, stored)
         except UnreadableRecordError as error:
             if error.newer:
                 raise
-            return None, self.now()
+            return None
 
     def _fetch(self, kind: Kind[Any], names: Sequence[str]) -> list[tuple[str, Stored | None]]:
+        return self._fetch_now(kind, names)[0]
+
+    def _fetch_now(self, kind: Kind[Any], names: Sequence[str]) -> tuple[list[tuple[str, Stored | None]], float]:
+        """What is held under each name, and the time of reading. One round trip."""
         with self._redis.pipeline(transaction=False) as pipeline:
             for name in names:
                 ask(pipeline, kind.key(name))
-            answers = pipeline.execute(raise_on_error=False)
-        return [(name, stored_in(answer)) for name, answer in zip(names, answers, strict=True)]
+            pipeline.time()
+            *answers, moment = pipeline.execute(raise_on_error=False)
+        if isinstance(moment, Exception):
+            raise moment
+        stored = [(name, stored_in(answer)) for name, answer in zip(names, answers, strict=True)]
+        return stored, moment[0] + moment[1] / 1e6
 
     def _fetch_in_portions(self, kind: Kind[Any], names: Sequence[str]) -> Iterator[tuple[str, int, Stored | None]]:
         """The same a few at a time, as they are asked for, with the bytes of each: at most PAGE_BYTES are held."""
@@ -234,7 +254,7 @@ class RedisDocuments:
 
     def _require_known(self, kind: Kind[Any], name: str) -> None:
         """Raises UnreadableRecordError for a record that is not there because it was set aside."""
-        if self.unreadable.names(kind.key(name)):
+        if self.unreadable.among([kind.key(name)]):
             raise UnreadableRecordError(name, "it was damaged")
 
     # writing
@@ -251,21 +271,30 @@ class RedisDocuments:
 
         Returns OK, CONFLICT, or the answer of the first of ``caps`` that would be exceeded.
         """
-        token = uuid4().hex
-        writes = list(commands)
-        if record is not None:
-            members = ("document", encoded(record), "version", str(record.version), "format", str(FORMAT))
-            writes.insert(0, ("HSET", key, *members, "token", token))
-        if expected_version == 0:
-            writes.append(("ZREM", UNREADABLE, key))
-        arguments: list[str | int] = [
-            token,
-            expected_version,
-            json.dumps(caps),
-            *(json.dumps(command) for command in writes),
-        ]
-        answer: bytes | str = self._write(keys=[key], args=arguments)
-        return answer.decode() if isinstance(answer, bytes) else answer
+        change = Change(key, expected_version, list(commands), record, caps)
+        answer: bytes | str = self._write(keys=[key], args=_arguments(change))
+        return text(answer)
+
+    def _compare_and_set_each(self, changes: Sequence[Change]) -> list[str]:
+        """The same for each, in one round trip: what one answers says nothing of the others."""
+        if len(changes) == 1:
+            return [self._compare_and_set(*changes[0])]
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for change in changes:
+                self._write(keys=[change.key], args=_arguments(change), client=pipeline)
+            return [text(answer) for answer in pipeline.execute()]
+
+
+def _arguments(change: Change) -> list[str | int]:
+    """What ``_WRITE`` is given."""
+    token = uuid4().hex
+    writes = list(change.commands)
+    if (record := change.record) is not None:
+        members = ("document", encoded(record), "version", str(record.version), "format", str(FORMAT))
+        writes.insert(0, ("HSET", change.key, *members, "token", token))
+    if change.expected_version == 0:
+        writes.append(("ZREM", UNREADABLE, change.key))
+    return [token, change.expected_version, json.dumps(change.caps), *(json.dumps(command) for command in writes)]
 
 
 def ask(pipeline: Any, key: str) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from redis import Redis
 from redis.exceptions import ResponseError
@@ -56,6 +56,15 @@ class Line:
     lead_s: float
 
 
+class Waiting(NamedTuple):
+    """Work that is to wait, with what RQ holds of it. of_batch: whether it is of a batch."""
+
+    work: Work
+    owner: str
+    payload: Mapping[str, Any]
+    of_batch: bool = False
+
+
 class FairQueue:
     """The waiting work of all callers. ``weights``: the shares of callers who have another one than 1. ``reserve_s``:
     how long after a caller's last request or result one worker stays free for it; 0: none does.
@@ -69,8 +78,11 @@ class FairQueue:
 
     def _step(self, step: str, name: str = "", *arguments: Any) -> int:
         """One step. Where the keys are damaged the queue begins anew, and the reaper queues what waited."""
+        return self._mended(lambda: int(self._run(self._redis, step, name, *arguments)))
+
+    def _run(self, client: Redis, step: str, name: str, *arguments: Any) -> Any:
         fixed: list[Any] = [step, name, _FIRST_COST_S, COUNTERS_KEY, _CREDIT_S, self._reserve_s]
-        return self._mended(lambda: int(self._script(keys=[_PREFIX], args=[*fixed, *arguments])))
+        return self._script(keys=[_PREFIX], args=[*fixed, *arguments], client=client)
 
     def _mended(self, do: Callable[[], _Value]) -> _Value:
         """What ``do`` returns, on an empty queue if the keys of this one are damaged."""
@@ -93,9 +105,31 @@ class FairQueue:
     def enqueue(self, work: Work, owner: str, payload: Mapping[str, Any], of_batch: bool = False) -> bool:
         """Put work at the end of its owner's line, or before the jobs of batches there; False when it waits or runs
         already."""
-        fields = [part for pair in payload.items() for part in pair]
-        given = owner, work.kind, self._weights.get(owner, 1.0), int(of_batch)
-        return bool(self._step("enqueue", work.name, *given, *fields))
+        return self.enqueue_each([Waiting(work, owner, payload, of_batch)])[0]
+
+    def enqueue_each(self, waiting: Iterable[Waiting]) -> list[bool]:
+        """The same for several, in their order and in one round trip."""
+        steps = [
+            (
+                one.work.name,
+                *(one.owner, one.work.kind, self._weights.get(one.owner, 1.0), int(one.of_batch)),
+                *(part for pair in one.payload.items() for part in pair),
+            )
+            for one in waiting
+        ]
+        return self._mended(lambda: self._enqueue(steps)) if steps else []
+
+    def _enqueue(self, steps: Sequence[tuple[Any, ...]]) -> list[bool]:
+        if len(steps) == 1:
+            return [bool(self._run(self._redis, "enqueue", *steps[0]))]
+        with self._redis.pipeline(transaction=False) as pipeline:
+            for step in steps:
+                self._run(pipeline, "enqueue", *step)
+            answers = pipeline.execute(raise_on_error=False)
+        for answer in answers:
+            if isinstance(answer, Exception):
+                raise answer
+        return [bool(answer) for answer in answers]
 
     def turn(self) -> None:
         """See to it that the next in turn lies where workers take from."""

@@ -28,12 +28,13 @@ from regnf_state.records import (
     QueueFullError,
     Quota,
     QuotaError,
+    RecordError,
     StaleAttemptError,
     UnreadableRecordError,
 )
 from regnf_state.redis import counters
 from regnf_state.redis import webhook_outbox as outbox
-from regnf_state.redis.documents import Cap, Command, Kind, ask, is_wrong_type, stored_in, text
+from regnf_state.redis.documents import Cap, Change, Command, Kind, ask, is_wrong_type, stored_in, text
 from regnf_state.redis.events import events_in, start_of
 from regnf_state.redis.keys import PREFIX
 from regnf_state.redis.library import RedisLibrary
@@ -70,6 +71,17 @@ def _created_keys(record: JobRecord) -> tuple[str, str]:
 
 def _active_key(owner: str) -> str:
     return f"{PREFIX}owner:{owner}:active"
+
+
+def _caps(owner: str, max_active: int, quota: Quota) -> list[Cap]:
+    """The bounds of a new job."""
+    caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
+    if quota.active_jobs is not None:
+        caps.append(("SCARD", _active_key(owner), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
+    elif quota.share_jobs:
+        # no more than stay free: one greedy owner gets half of all, two get a third each
+        caps.append(("SCARD", f"{_active_key(owner)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
+    return caps
 
 
 def _events_key(job_id: str) -> str:
@@ -162,29 +174,43 @@ class RedisRecordStore(RedisLibrary):
         return self._redis.zscore(f"{_CREATED}:{owner}", job_id) is not None
 
     def create_job(self, record: JobRecord, max_active: int, quota: Quota = NO_QUOTA) -> tuple[JobRecord, bool]:
-        caps: list[Cap] = [("SCARD", _ACTIVE, 1, max_active, "FULL")]
-        if quota.active_jobs is not None:
-            caps.append(("SCARD", _active_key(record.owner), 1, quota.active_jobs, "QUOTA_ACTIVE_JOBS"))
-        elif quota.share_jobs:
-            # no more than stay free: one greedy owner gets half of all, two get a third each
-            caps.append(("SCARD", f"{_active_key(record.owner)} {_ACTIVE}", 1, max_active, "QUOTA_ACTIVE_JOBS"))
-        while True:
-            known, now = self._read_to_create(JOB, record.id)
-            fresh = transitions.restarted_job(known, record, now) if known is not None else record
-            after = fresh or transitions.joined_job(cast(JobRecord, known), record)
-            if after is known:
-                return after, False
-            version = known.version if known is not None else 0
-            commands = self._commands(known, after)
-            answer = self._compare_and_set(JOB.key(record.id), version, commands, after, caps if fresh else ())
-            if answer == "FULL":
-                raise QueueFullError(f"{max_active} jobs are active already")
-            if answer == "QUOTA_ACTIVE_JOBS" and self._forget_ended(record.owner):
-                continue
-            if answer.startswith("QUOTA"):
-                raise QuotaError(answer)
-            if answer == "OK":
-                return after, fresh is not None
+        (answer,) = self.create_jobs([record], max_active, quota)
+        if isinstance(answer, RecordError):
+            raise answer
+        return answer
+
+    def create_jobs(
+        self, records: Sequence[JobRecord], max_active: int, quota: Quota = NO_QUOTA
+    ) -> list[tuple[JobRecord, bool] | RecordError]:
+        answers: dict[int, tuple[JobRecord, bool] | RecordError] = {}
+        while left := [place for place in range(len(records)) if place not in answers]:
+            stored, now = self._fetch_now(JOB, [records[place].id for place in left])
+            changes: dict[int, tuple[Change, tuple[JobRecord, bool]]] = {}
+            for place, (name, held) in zip(left, stored, strict=True):
+                record = records[place]
+                try:
+                    known = self._before(JOB, name, held)
+                    fresh = transitions.restarted_job(known, record, now) if known is not None else record
+                    after = fresh or transitions.joined_job(cast(JobRecord, known), record)
+                except RecordError as error:
+                    answers[place] = error
+                    continue
+                if after is known:
+                    answers[place] = after, False
+                    continue
+                version = known.version if known is not None else 0
+                caps = _caps(record.owner, max_active, quota) if fresh else ()
+                change = Change(JOB.key(name), version, self._commands(known, after), after, caps)
+                changes[place] = change, (after, fresh is not None)
+            said = self._compare_and_set_each([change for change, _ in changes.values()])
+            for (place, (_, done)), word in zip(changes.items(), said, strict=True):
+                if word == "OK":
+                    answers[place] = done
+                elif word == "FULL":
+                    answers[place] = QueueFullError(f"{max_active} jobs are active already")
+                elif word.startswith("QUOTA") and not self._forget_ended(records[place].owner):
+                    answers[place] = QuotaError(word)
+        return [answers[place] for place in range(len(records))]
 
     def _forget_ended(self, owner: str) -> bool:
         """Strike jobs off an owner's active ones that are not active: records that were set aside. Whether any was."""
@@ -204,16 +230,18 @@ class RedisRecordStore(RedisLibrary):
         return found
 
     def get_jobs(self, job_ids: Sequence[str]) -> list[JobRecord | UnreadableRecordError | None]:
-        return [self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)]
+        found = {name: self._held(name, stored) for name, stored in self._fetch(JOB, job_ids)}
+        damaged = self.unreadable.among([JOB.key(name) for name, held in found.items() if held is None])
+        for name in found:
+            if JOB.key(name) in damaged:
+                found[name] = UnreadableRecordError(name, "it was damaged")
+        return [found[name] for name in job_ids]
 
     def _held(self, job_id: str, stored: Stored | None) -> JobRecord | UnreadableRecordError | None:
         try:
-            found = self._record(JOB, job_id, stored)
-            if found is None:
-                self._require_known(JOB, job_id)
+            return self._record(JOB, job_id, stored)
         except UnreadableRecordError as error:
             return error
-        return found
 
     def active_among(self, job_ids: Sequence[str]) -> set[str]:
         return {name for name, held in zip(job_ids, self._are_active(job_ids), strict=True) if held}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from redis import Redis
@@ -11,9 +11,10 @@ from rq.worker_registration import WORKERS_BY_QUEUE_KEY
 
 from regnf_state.ownership import ANONYMOUS, owner_of
 from regnf_state.queue import QUEUE_NAME, Work
+from regnf_state.records import JobRecord
 from regnf_state.redis import payload
 from regnf_state.redis.documents import shown
-from regnf_state.redis.fair_queue import FairQueue, Line
+from regnf_state.redis.fair_queue import FairQueue, Line, Waiting
 
 
 class RqJobQueue:
@@ -33,13 +34,19 @@ class RqJobQueue:
         self.fair = FairQueue(redis, weights, reserve_s)
 
     def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
-        self._enqueue(Work("registration", job_id, attempt), owner, of_batch)
+        self._enqueue([(Work("registration", job_id, attempt), owner, of_batch)])
+
+    def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
+        self._enqueue([(Work("registration", job.id, job.attempt), job.owner, job.is_of_batch) for job in jobs])
 
     def enqueue_import(self, sha256: str, attempt: int = 1) -> None:
-        self._enqueue(Work("import", sha256, attempt), owner_of(sha256))
+        self._enqueue([(Work("import", sha256, attempt), owner_of(sha256), False)])
 
-    def _enqueue(self, work: Work, owner: str, of_batch: bool = False) -> None:
-        self.fair.enqueue(work, owner, payload.written(work, self._redis, self._key), of_batch)
+    def _enqueue(self, waiting: Sequence[tuple[Work, str, bool]]) -> None:
+        self.fair.enqueue_each(
+            Waiting(work, owner, payload.written(work, self._redis, self._key), of_batch)
+            for work, owner, of_batch in waiting
+        )
 
     def holds_registration(self, job_id: str, attempt: int) -> bool:
         return self.fair.holds(Work("registration", job_id, attempt).name)

@@ -7,7 +7,7 @@ sorted set names both, by the time when they were found; there are at most a tho
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,9 +75,10 @@ class UnreadableRecords:
             logger.error("%s; %s", error, where)
         return bool(answer)
 
-    def names(self, key: str) -> bool:
-        """Whether what is, or was, under this key is known to be unreadable."""
-        return self._ask(lambda: self._redis.zscore(UNREADABLE, key)) is not None
+    def among(self, keys: Sequence[str]) -> set[str]:
+        """Under which of these keys is, or was, what is known to be unreadable."""
+        scores = self._ask(lambda: self._redis.zmscore(UNREADABLE, list(keys))) if keys else None
+        return {key for key, score in zip(keys, scores or (), strict=False) if score is not None}
 
     def total(self) -> int:
         return int(self._ask(lambda: self._redis.zcard(UNREADABLE)) or 0)

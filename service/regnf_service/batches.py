@@ -16,18 +16,20 @@ from regnf_core.pair_result import short_result
 from regnf_service.budget import check_budget
 from regnf_service.fields.ingest import room_for_bytes
 from regnf_service.jobs.lookup import manifest_of, result_of
-from regnf_service.jobs.submit import check_fields, future_job_id, start
+from regnf_service.jobs.submit import FieldLookup, check_fields, future_job_id, start
 from regnf_service.problem import RETRY_LATER, Problem
 from regnf_service.services import Services
 from regnf_state.batches import Batch, Pair
 from regnf_state.problems import problem_document, whole_problem
-from regnf_state.records import ACTIVE, JobRecord, QuotaError, UnreadableRecordError
+from regnf_state.records import ACTIVE, JobRecord, QuotaError, RecordError, UnreadableRecordError
 from regnf_state.registration_request import RegistrationRequest
 
 COUNTED = ("registered", "ambiguous", "rejected", "failed", "refused")
 """How a pair can end: a verdict, an error of its job, or an error of its line."""
 _BATCH_ID = re.compile(r"[0-9a-f]{32}")
 _AT_ONCE = 100
+_NAMES_AT_ONCE = 2000
+"""That the lines have which are checked or started together: a megabyte of records of searches."""
 _LOOKED_AT = 500
 _PAGE_BYTES = 1 << 20
 """Of a page of results: pairs that it is chosen from, and bytes."""
@@ -62,16 +64,35 @@ class Posting:
         self._caller = caller
         self._batch_id = batch_id
         self.lines = lines
+        self._fields = FieldLookup(services, caller)
+
+    def portions(self) -> Iterator[Sequence[Line]]:
+        """A few lines at a time, so that other callers' requests are served in between."""
+        few: list[Line] = []
+        names = 0
+        for line in self.lines:
+            few.append(line)
+            names += 1 + len(_fields_of(line))
+            if names >= _NAMES_AT_ONCE or len(few) == _AT_ONCE:
+                yield few
+                few, names = [], 0
+        if few:
+            yield few
 
     def check(self, lines: Sequence[Line]) -> None:
         """Refuse what POST /register would refuse, and find out which jobs there are."""
         services, caller = self._services, self._caller
+        fields: FieldLookup | None = self._fields
+        try:
+            self._fields.read(name for line in lines for name in _fields_of(line))
+        except UnreadableRecordError:
+            fields = None  # each line reads its own: those that name the damaged one are refused, and no other
         for line in lines:
             if line.asked is None:
                 continue
             try:
-                check_fields(services, caller, line.asked, line.named)
-                line.job = future_job_id(services, caller, line.asked)
+                check_fields(services, caller, line.asked, line.named, fields)
+                line.job = future_job_id(services, caller, line.asked, fields)
             except Problem as problem:
                 line.error = problem.document()
             except UnreadableRecordError as error:
@@ -128,17 +149,18 @@ class Posting:
     def submit(self, lines: Sequence[Line]) -> None:
         """Start their jobs, as POST /register does. Raises what that raises, where it is not of one line alone."""
         self._services.room.make(self._caller)
-        for line in lines:
-            if line.asked is None or line.job is None or line.is_done:
-                continue
-            try:
-                start(self._services, self._caller, line.asked, line.job, self._batch_id)
-            except QuotaError as error:
-                if error.reason != "QUOTA_WEBHOOKS":
-                    raise
-                line.error, line.job = problem_document(error.reason), None
-            except UnreadableRecordError as error:
-                line.error, line.job = problem_document(error.reason), None
+        left = [
+            (line, line.job, line.asked)
+            for line in lines
+            if line.asked is not None and line.job is not None and not line.is_done
+        ]
+        started = start(self._services, self._caller, [(job, asked) for _, job, asked in left], self._batch_id)
+        for (line, _, _), answer in zip(left, started, strict=True):
+            match answer:
+                case UnreadableRecordError(reason=reason) | QuotaError(reason="QUOTA_WEBHOOKS" as reason):
+                    line.error, line.job = problem_document(reason), None
+                case RecordError():
+                    raise answer
 
     def keep(self) -> Batch:
         """Write the batch down. Raises OSError."""
@@ -149,6 +171,11 @@ class Posting:
     def _batch(self) -> Batch:
         pairs = tuple(Pair(line.number, line.key, line.job, line.error) for line in self.lines)
         return Batch(self._batch_id, self._caller, self._services.records.now(), pairs)
+
+
+def _fields_of(line: Line) -> list[str]:
+    asked = line.asked
+    return [] if asked is None else list(dict.fromkeys((asked.scene, *asked.objects, *line.named.values())))
 
 
 def _is_active(services: Services, caller: str, key: str) -> bool:

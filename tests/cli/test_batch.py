@@ -49,6 +49,20 @@ def results(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.with_suffix(".results.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.parametrize("member", ["initial_transform", "ground_truth"])
+def test_a_pose_may_be_said_in_either_direction(folder: Path, member: str) -> None:
+    into_scene = [[0.5, 0, 0, 1], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]
+    into_object = [[2.0, 0.0, 0.0, -2.0], [0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    (folder / "pose.json").write_text(json.dumps({"T_scene_object": into_scene}))
+    said = [into_object, {"T_object_scene": {"matrix": into_object}}, {"T_scene_object": into_scene}, "pose.json"]
+    path = write(folder, [pair(**{member: one}) for one in (*said, [1, 2])])
+    *read, wrong = read_pairs(path)
+    meant = into_object if member == "initial_transform" else {"T_object_scene": into_object}
+    assert [one.request[member] if one.request else one.error for one in read] == [meant] * len(said)
+    assert wrong.error is not None
+    assert wrong.error.reason == "INVALID_TRANSFORM"
+
+
 @pytest.mark.parametrize(
     ("member", "value", "reason"),
     [

@@ -87,7 +87,10 @@ def test_an_unknown_option_is_answered_with_the_one_that_was_meant(world: World)
         matrix((0, 0, 0), (1, 1, 0), (2, 2, 0)),
         {"T_object_scene": IDENTITY[:3]},
         {"T_object_scene": [row[:3] for row in IDENTITY]},
-        {"T_scene_object": IDENTITY},
+        {"T_scene_object": IDENTITY[:3]},
+        {"T_scene_object": None},
+        {"T_scene_object": IDENTITY, "T_object_scene": IDENTITY},
+        {},
         IDENTITY,
     ],
 )
@@ -129,7 +132,10 @@ def rows(*changes: tuple[int, int, Any]) -> Any:
         ({"matrix": IDENTITY, "rotation_quaternion_xyzw": [0, 0, 1, 0]}, "/initial_transform"),
         ({"matrix": IDENTITY, "rotation_quaternion_xyzw": [0, 0, 0, 0]}, "/initial_transform"),
         ({"matrix": IDENTITY, "more": 1}, "/initial_transform/more"),
-        ({"T_object_scene": IDENTITY}, "/initial_transform/matrix"),
+        ({"T_object_scene": IDENTITY[:3]}, "/initial_transform/T_object_scene"),
+        ({"T_scene_object": {"matrix": IDENTITY, "scale": 2}}, "/initial_transform/T_scene_object"),
+        ({"T_scene_object": IDENTITY, "T_object_scene": IDENTITY}, "/initial_transform"),
+        ({"T_scene_object": IDENTITY, "matrix": IDENTITY}, "/initial_transform/matrix"),
     ],
 )
 def test_initial_transforms(world: World, start: Any, pointer: str) -> None:

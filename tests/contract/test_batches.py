@@ -19,6 +19,7 @@ from regnf_state.queue import QUEUE_NAME, Work
 from tests.contract.asgi import client_of
 from tests.contract.batch_posts import NDJSON, body_of, document, pairs, post, posted, results, work
 from tests.contract.world import BOX, RESULT, TOKENS, World, assert_refused, field_bytes, sha256
+from tests.round_trips import counted_round_trips
 
 # from lines to results
 
@@ -409,17 +410,48 @@ def test_the_same_pairs_spelled_differently_and_posted_at_once_are_one_batch(
     assert [one["key"] for one in results(world, batch_id)] == [one["key"] for one in lines]
 
 
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be", "cp1252"]
+)
+def test_lines_as_another_editor_saves_them(world: World, encoding: str, ends: str) -> None:
+    lines = [one | {"key": f"für {number}, 10 Ċ" if encoding != "cp1252" else f"für {number}"} for number, one in
+             enumerate(pairs(world, 3))]  # fmt: skip
+    plain = posted(world, lines)
+    text = ends.join(["", *(json.dumps(one, ensure_ascii=False) for one in lines), ""])
+    data = text.encode(encoding)
+    pieces = (data[begin : begin + 7] for begin in range(0, len(data), 7))
+    answer = world.client.post("/batches", content=pieces, headers=NDJSON)
+    assert (answer.status_code, answer.json()["id"]) == (202, plain), answer.text
+
+
+def test_files_that_were_joined_keep_no_mark(world: World) -> None:
+    mark, lines = "\N{ZERO WIDTH NO-BREAK SPACE}", pairs(world, 2)
+    plain = posted(world, lines)
+    for encoding in ("utf-8", "utf-16"):
+        text = "\n".join(mark + json.dumps(one) for one in lines) + f"\n{mark}\n"
+        answer = world.client.post("/batches", content=text.encode(encoding), headers=NDJSON)
+        assert (answer.status_code, answer.json()["id"]) == (202, plain), answer.text
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe{\x00\n", '{"a": 1}\n'.encode("utf-16-le")[:-1] + b"\x00\xd8"])
+def test_a_body_that_is_no_text_is_refused_whole(world: World, data: bytes) -> None:
+    answer = world.client.post("/batches", content=data, headers=NDJSON)
+    assert_refused(answer, 400, "MALFORMED_JSON")
+    assert world.client.get("/batches").json()["batches"] == []
+
+
 class KilledError(Exception):
     """The process ends here."""
 
 
-@pytest.mark.parametrize("at", range(0, 9, 2))
+@pytest.mark.parametrize("at", range(6))
 def test_a_post_that_dies_midway_is_taken_up_by_the_next(
     world: World, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
     lines = pairs(world, 4)
     calls = iter(range(100))
-    for target, name in ((world.queue, "enqueue_registration"), (world.records.journal, "accept")):
+    for target, name in ((world.queue, "enqueue_jobs"), (world.records.journal, "_accept")):
         whole = getattr(target, name)
 
         def dying(*args: Any, whole: Any = whole) -> Any:
@@ -428,12 +460,20 @@ def test_a_post_that_dies_midway_is_taken_up_by_the_next(
             return whole(*args)
 
         monkeypatch.setattr(target, name, dying)
-    if at < 8:
+    if at < 5:
         assert post(world, lines).status_code == 500
         assert world.client.get("/batches").json()["batches"] == [], "no half batch"
     batch_id = posted(world, lines)
     assert len(work(world)) == len({one["job"] for one in results(world, batch_id)}) == 4
     assert {world.records.get_job(one["job"]).attempt for one in results(world, batch_id)} == {1}
+
+
+def test_many_lines_take_few_round_trips(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = pairs(world, 80)
+    posted(world, lines[:1])
+    sent = counted_round_trips(monkeypatch)
+    posted(world, lines)
+    assert len(sent) < len(lines)
 
 
 def test_a_lost_redis_loses_no_pair(world: World) -> None:

@@ -124,13 +124,14 @@ def test_a_wrong_range_is_refused(world: World, header: str, status: int, reason
     assert world.blobs.blobs == {}
 
 
-def test_settings_go_with_pieces(world: World) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_settings_go_with_pieces(world: World, encoding: str) -> None:
     wait = {"Upload-Complete": "?0"}
     put(world, 0, 700, headers=wait)
     assert put(world, 700, 2000, headers=wait).json()["offset"] == 2000
     files: dict[str, Any] = {
-        "upload": (None, NAME),
-        "description": (None, json.dumps({"label": "room"}), "application/json"),
+        "upload": (None, f"{NAME}\r\n".encode(encoding)),
+        "description": (None, json.dumps({"label": "room"}).encode(encoding), "application/json"),
         "settings": ("config.yml", b"method: neus"),
     }
     answer = world.client.post("/fields", files=files)

@@ -342,6 +342,29 @@ def test_a_one_shot_dry_run_keeps_nothing(world: World) -> None:
     assert world.blobs.blobs == {}
 
 
+_INTO_OBJECT = [[0.0, 2.0, 0.0, -2.0], [-2.0, 0.0, 0.0, 4.0], [0.0, 0.0, 2.0, -1.0], [0.0, 0.0, 0.0, 1.0]]
+_INTO_SCENE = [[0.0, -0.5, 0.0, 2.0], [0.5, 0.0, 0.0, 1.0], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("member", ["initial_transform", "ground_truth"])
+def test_a_pose_may_be_said_in_either_direction(world: World, member: str) -> None:
+    said = [
+        {"T_object_scene": _INTO_OBJECT},
+        {"T_scene_object": _INTO_SCENE},
+        {"T_scene_object": {"matrix": _INTO_SCENE, "scale": 0.5}},
+        *([_INTO_OBJECT, {"matrix": _INTO_OBJECT}] if member == "initial_transform" else []),
+    ]
+    requests = [world.valid_request() | {member: one} for one in said]
+    asked = [world.client.post("/register?dry_run=true", json=one).json() for one in requests]
+    meant: Any = _INTO_OBJECT if member == "initial_transform" else {"T_object_scene": _INTO_OBJECT}
+    assert [one["request"][member] for one in asked] == [meant] * len(said)
+    assert len({one["id"] for one in asked}) == 1
+    lines = "\n".join(map(json.dumps, requests))
+    answer = world.client.post("/batches", content=lines, headers={"Content-Type": "application/x-ndjson"})
+    assert (answer.status_code, answer.json()["active"]) == (202, len(said)), answer.text
+    assert [one["id"] for one in world.client.get("/jobs").json()["jobs"]] == [asked[0]["id"]]
+
+
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be", "utf-32", "cp1252"])
 def test_a_request_as_another_editor_saves_it(world: World, encoding: str) -> None:
     request = world.valid_request()

@@ -29,6 +29,11 @@ def test_the_result_lists_its_artifacts(world: World, job_id: str) -> None:
     assert listed["scene_points.ply"]["bytes"] == len(DATA)
 
 
+def test_a_result_larger_than_any_can_be_is_not_read_whole(world: World, job_id: str) -> None:
+    world.blobs.put(f"jobs/{job_id}/1/result.json", b'{"a": "' + b"x" * (4 << 20) + b'"}')
+    assert_refused(world.client.get(f"/jobs/{job_id}/result"), 503, "RECORD_UNREADABLE")
+
+
 def test_pictures_follow_the_result(world: World) -> None:
     job_id = world.submit(seed=1)
     world.succeed(job_id, pending=["preview.png"])

@@ -9,6 +9,7 @@ import httpx
 import pytest
 from starlette.types import Message, Receive, Scope, Send
 
+from regnf_service.http import write_limits
 from regnf_service.http.buckets import Buckets
 from regnf_service.http.write_limits import WriteGate
 from regnf_state.settings import Settings
@@ -169,3 +170,26 @@ def _exchange(service: Live, sent: bytes) -> bytes:
     with service.connect() as connection:
         connection.sendall(sent)
         return b"".join(iter(lambda: connection.recv(65536), b""))
+
+
+def test_refusals_that_come_too_often_are_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    held: list[float] = []
+
+    async def hold(seconds: float) -> None:
+        held.append(seconds)
+
+    async def nothing(*_given: object) -> None:
+        return None
+
+    monkeypatch.setattr("regnf_service.http.write_limits.asyncio.sleep", hold)
+    gate = WriteGate(nothing, Buckets(0.01, 1))
+    scope: Scope = {"type": "http", "method": "POST", "path": "/register", "headers": []}
+
+    def ask(caller: str) -> int:
+        asyncio.run(gate(scope | {"state": {"caller": caller}}, nothing, nothing))  # type: ignore[arg-type]
+        return len(held)
+
+    assert [ask("alice") for _ in range(21)][-1] == 0, "the first ones at once"
+    assert [ask("alice") for _ in range(3)] == [1, 2, 3]
+    assert [ask("bob") for _ in range(2)][-1] == 3, "another caller's are its own"
+    assert set(held) == {write_limits._HELD_S}

@@ -1,6 +1,6 @@
 """The API, with short waits unless in the whole version: `python -m tests.faults.api FD`, a socket it is handed.
 
-With REGNF_TEST_DIE it kills itself where a job would be queued.
+With REGNF_TEST_DIE=n it kills itself where jobs would be queued for the n-th time.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 
 import uvicorn
@@ -17,7 +18,7 @@ from regnf_service import app, lifespan
 from regnf_service.upkeep import reaper
 from regnf_state.blobs import object_store as object_blobs
 from regnf_state.logs import configure_logging
-from regnf_state.ownership import ANONYMOUS
+from regnf_state.records import JobRecord
 from regnf_state.redis.queue import RqJobQueue
 from regnf_state.settings import Settings
 from tests.faults.pace import REQUEST_TIMEOUT_S, pace
@@ -26,8 +27,13 @@ from tests.faults.pace import REQUEST_TIMEOUT_S, pace
 class DyingQueue(RqJobQueue):
     """A queue that the process does not reach."""
 
-    def enqueue_registration(self, job_id: str, attempt: int, owner: str = ANONYMOUS, of_batch: bool = False) -> None:
-        os.kill(os.getpid(), signal.SIGKILL)
+    _calls_left = int(os.environ.get("REGNF_TEST_DIE", "1"))
+
+    def enqueue_jobs(self, jobs: Sequence[JobRecord]) -> None:
+        self._calls_left -= 1
+        if not self._calls_left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        super().enqueue_jobs(jobs)
 
 
 def shorten_waits() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import httpx
 import pytest
 
 from regnf_state.queue import Work
+from tests.contract.batch_posts import NDJSON
 from tests.contract.world import field_bytes, sha256
 from tests.faults.house import House
 from tests.faults.promise import check_promise, fault, leftovers
@@ -176,6 +178,34 @@ def test_kill_of_the_api_between_a_job_s_record_and_its_queue(house: House) -> N
         assert dying.wait(20) == -signal.SIGKILL
         house.start_api()
         check_promise(house, [job_id])
+
+
+def test_kill_of_the_api_in_the_middle_of_a_batch(folder_house: House) -> None:
+    """The lines, posted again, are one batch with a job each; once it is accepted, Redis and the API may go."""
+    house = folder_house
+    first = house.start_api()
+    request = house.request()
+    lines = "\n".join(json.dumps(request | {"seed": seed}) for seed in range(250))
+    kill(first)
+    dying = house.start_api(REGNF_TEST_DIE="2")
+    with fault():
+        with pytest.raises(httpx.TransportError):
+            house.client.post("/batches", content=lines, headers=NDJSON)
+        assert dying.wait(20) == -signal.SIGKILL
+        accepted = [key for key in house.store.listing() if key.endswith("-accepted")]
+        assert 0 < len(accepted) < 250, "the middle"
+        second = house.start_api()
+        answer = house.client.post("/batches", content=lines, headers=NDJSON)
+        house.redis.flushall()
+        kill(second)
+        assert answer.status_code == 202
+        house.start_api()
+        path = f"/batches/{answer.json()['id']}"
+        eventually(lambda: house.client.get(path).json().get("active") == 250, house.log)
+        jobs = house.client.get("/jobs?limit=200").json()["jobs"]
+    assert {job["attempts"] for job in jobs} <= {1, 2}
+    names = [key.split("/")[2] for key in house.store.listing() if key.startswith("journal/jobs/")]
+    assert len(names) == len(set(names)) == 250, "no job twice"
 
 
 def test_two_workers_with_one_job(house: House) -> None:

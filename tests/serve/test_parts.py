@@ -1,10 +1,14 @@
 """The supervisor's small parts on their own."""
 
+import errno
 import os
 import re
 import subprocess
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -143,3 +147,31 @@ def test_a_guard_that_comes_too_late_runs_nothing() -> None:
     finally:
         os.close(lifeline)
         os.close(held)
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_folder_that_takes_nothing_is_refused_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
+    state = tmp_path / "made" / "here"
+    if full:
+        monkeypatch.setattr(os, "posix_fallocate", _refusing(errno.ENOSPC))
+        named, hint = state, "Make room on the disk"
+    else:
+        (state / "blobs" / ".tmp").mkdir(parents=True)
+        named, hint = state / "blobs" / ".tmp", "Give a folder that can be written"
+        usual: Any = tempfile.TemporaryFile
+        refuse = _refusing(errno.EROFS)
+        monkeypatch.setattr(tempfile, "TemporaryFile", lambda dir: refuse() if dir == named else usual(dir=dir))  # noqa: A006
+    with pytest.raises(StartError) as refused, StateLock(state):
+        pass
+    assert (refused.value.reason, str(named) in str(refused.value)) == ("STATE_DIR_UNUSABLE", True)
+    assert hint in (refused.value.hint or "")
+    assert list(tmp_path.iterdir()) == ([] if full else [tmp_path / "made"])
+
+
+def _refusing(number: int) -> Callable[..., Any]:
+    def refuse(*_given: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    return refuse

@@ -113,17 +113,17 @@ def test_rejected_fields_are_forgotten_after_a_while(world: World) -> None:
 
 
 def test_beyond_the_cap_the_oldest_go_and_the_youngest_stay(world: World) -> None:
-    a, b = world.add_field("a", 100), world.add_field("b", 100)
-    world.add_job("old", a, a, size=300)
+    a, b = world.add_field("a", 100_000), world.add_field("b", 100_000)
+    world.add_job("old", a, a, size=300_000)
     world.tidy()
     world.records.ahead_s += DAY_S / 2
-    world.add_job("new", b, b, size=300)
+    world.add_job("new", b, b, size=300_000)
     world.records.ahead_s += DAY_S / 2
-    removed = world.tidy(storage_cap_bytes=450)
+    removed = world.tidy(storage_cap_bytes=450_000)
     assert (removed.jobs, removed.fields) == (("old",), (a,))
     assert world.records.get_job("old") is None
-    assert sum(map(len, (data for key, data in world.blobs.blobs.items() if not key.startswith("journal/")))) == 400
-    world.add_job("fresh", b, b, size=300)
+    assert sum(map(len, (data for key, data in world.blobs.blobs.items() if not key.startswith("journal/")))) == 400_000
+    world.add_job("fresh", b, b, size=300_000)
     assert world.tidy(60.0, storage_cap_bytes=1).jobs == ("new",), "what is an hour old at most is not taken"
 
 
@@ -194,6 +194,25 @@ def test_a_batch_goes_when_its_time_is_over(world: World) -> None:
     world.blobs.put("batches/anyone/new", b"{}")
     world.tidy()
     assert list(world.blobs.list("batches")) == ["batches/anyone/new"]
+
+
+def test_pieces_and_journals_count_in_the_cap(world: World) -> None:
+    a = world.add_field("a", 10_000)
+    world.add_job("j", a, a, size=10_000)
+    pieces = [f"uploads/anyone/{letter * 64}/{0:015d}-20000" for letter in "bc"]
+    for number, key in enumerate(pieces):
+        world.blobs.put(key, bytes(10_000))
+        moment = world.records.now() - (3 - number) * DAY_S
+        os.utime(world.blobs.path_of(key), (moment, moment))
+    journal = sum(entry.bytes for entry in world.blobs.entries("journal"))
+    kept = {"keep_pieces_s": 100 * int(DAY_S)}
+    assert world.tidy(storage_cap_bytes=40_000 + journal, **kept) == Removed()
+    assert list(world.blobs.list("uploads")) == pieces
+    world.tidy(storage_cap_bytes=40_000 + journal - 1, **kept)
+    assert list(world.blobs.list("uploads")) == pieces[1:]
+    world.tidy(storage_cap_bytes=20_000 + journal, **kept)
+    assert list(world.blobs.list("uploads")) == []
+    assert world.records.get_job("j") is not None, "it is younger than an hour"
 
 
 def test_batches_count_in_the_cap_and_go_before_their_time(world: World) -> None:

@@ -42,7 +42,7 @@ class Intake:
     def __init__(self, services: Services, caller: str) -> None:
         self._services = services
         self._caller = caller
-        self._library = Library(services, caller)
+        self.library = Library(services, caller)
         self._lines: list[Line] = []
         self._keys: dict[str, int] = {}
         self._count = 0
@@ -62,7 +62,7 @@ class Intake:
         for line, text, spec in read:
             if spec is not None:
                 try:
-                    line.asked, line.named = asked_by_reference(self._library, spec)
+                    line.asked, line.named = asked_by_reference(self.library, spec)
                 except Problem as problem:
                     line.error = problem.document()
             if line.asked is not None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import AsyncIterator
 from typing import NamedTuple
+
+from regnf_core.texts import TextError, TextStream
+from regnf_service.problem import CLOSE, Problem
 
 LINE_BYTES = 64 * 1024
 """A search among 512 candidates takes 35,000."""
@@ -47,7 +51,7 @@ class LineReader:
     def _end(self, part: bytes) -> TextLine | None:
         self._add(part)
         self._number += 1
-        text, too_long = bytes(self._held).strip(), self._is_too_long
+        text, too_long = bytes(self._held).strip().lstrip(codecs.BOM_UTF8), self._is_too_long
         self._held.clear()
         self._is_too_long = False
         if too_long:
@@ -56,10 +60,13 @@ class LineReader:
 
 
 async def lines_of(chunks: AsyncIterator[bytes]) -> AsyncIterator[list[TextLine]]:
-    """The lines of a body, as many at a time as arrive together."""
-    reader = LineReader()
-    async for data in chunks:
-        if lines := reader.feed(data):
+    """The lines of a body in any encoding, as many at a time as arrive together. Raises Problem MALFORMED_JSON."""
+    reader, text = LineReader(), TextStream()
+    try:
+        async for data in chunks:
+            if lines := reader.feed(text.feed(data)):
+                yield lines
+        if lines := reader.feed(text.feed(b"", final=True)) + reader.finish():
             yield lines
-    if lines := reader.finish():
-        yield lines
+    except TextError as error:
+        raise Problem("MALFORMED_JSON", f"The body is {error}.", hint="Save it as UTF-8.", headers=CLOSE) from error

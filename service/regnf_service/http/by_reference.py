@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+from regnf_service.concurrency import in_thread
 from regnf_service.http.schemas.library import MAX_SELECTED, LibraryFilter, LibraryReference, LibrarySelection
 from regnf_service.http.schemas.registrations import RegisterRequest
 from regnf_service.problem import MAX_ERRORS, Problem
 from regnf_service.services import Services
 from regnf_state.library import LibraryEntry
 from regnf_state.ownership import sha256_of
-from regnf_state.pages import LOOKED_AT, Page, Position, all_of
-from regnf_state.records import FieldRecord
+from regnf_state.pages import LOOKED_AT, Position
 from regnf_state.registration_request import RegistrationRequest
 
 
@@ -22,7 +22,9 @@ class Library:
         self._records = services.records
         self._caller = caller
         self._named: dict[str, LibraryEntry | None] = {}
-        self._usable: list[tuple[str, frozenset[str]]] | None = None
+        self._usable: list[tuple[str, frozenset[str]]] = []
+        self._rest: Position | None = None
+        self._is_read = False
 
     def one(self, name: str, pointer: str) -> str:
         """SHA-256 of the entry's field. Raises as ``selected``."""
@@ -63,19 +65,29 @@ class Library:
 
     def _by_tags(self, tags: Sequence[str] | None) -> list[str]:
         """Of all entries with any of the tags; None: of all. Rejected ones are left out."""
-        if self._usable is None:
-            self._usable = list(self._read())
+        while self.read_more():
+            pass
         return [sha256 for sha256, has in self._usable if tags is None or not has.isdisjoint(tags)]
 
-    def _read(self) -> Iterator[tuple[str, frozenset[str]]]:
-        """Digest and tags of each entry that is not rejected."""
+    def read_more(self) -> bool:
+        """Read a page of the entries that tags are looked for among: whether another follows."""
+        if not self._is_read:
+            page = self._records.list_entries(self._caller, None, None, LOOKED_AT, self._rest)
+            self._usable += [
+                (sha256_of(field.sha256), frozenset(field.library["tags"]))
+                for field in page.records
+                if field.state != "rejected" and field.library is not None
+            ]
+            self._rest, self._is_read = page.rest, page.rest is None
+        return not self._is_read
 
-        def page(before: Position | None) -> Page[FieldRecord]:
-            return self._records.list_entries(self._caller, None, None, LOOKED_AT, before)
 
-        for field in all_of(page):
-            if field.state != "rejected" and field.library is not None:
-                yield sha256_of(field.sha256), frozenset(field.library["tags"])
+async def read_library(library: Library, specs: Iterable[RegisterRequest]) -> None:
+    """Read what these requests select by tag, a page at a time: other callers' requests go on in between."""
+    selected = [spec.candidates.library for spec in specs if isinstance(spec.candidates, LibrarySelection)]
+    if any(wanted.tags is not None or wanted.names is None for wanted in selected):
+        while await in_thread(library.read_more):
+            pass
 
 
 def asked_by_reference(library: Library, spec: RegisterRequest) -> tuple[RegistrationRequest, dict[str, str]]:

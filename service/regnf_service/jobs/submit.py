@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -15,7 +15,7 @@ from regnf_service.problem import Problem
 from regnf_service.services import Services
 from regnf_state.job_request import JobRequest, kind_of
 from regnf_state.ownership import ANONYMOUS, owner_of, reference_of
-from regnf_state.records import FieldRecord, JobRecord, UnreadableRecordError
+from regnf_state.records import FieldRecord, JobRecord, RecordError, UnreadableRecordError
 from regnf_state.rendering_request import RenderingRequest
 
 _KEY_LIFETIME_S = 24 * 3600
@@ -28,20 +28,49 @@ def check_idempotency_key(key: str | None) -> None:
         raise Problem("INVALID_IDEMPOTENCY_KEY")
 
 
-def check_fields(services: Services, caller: str, request: JobRequest, named: Mapping[str, str]) -> None:
+class FieldLookup:
+    """Records of fields for several requests of a caller: what they name is read in one round trip, each once."""
+
+    def __init__(self, services: Services, caller: str) -> None:
+        self._records = services.records
+        self._caller = caller
+        self._held: dict[str, FieldRecord | None] = {}
+
+    def read(self, names: Iterable[str]) -> None:
+        """Read these fields, by their SHA-256s, unless the call before has; forget all others."""
+        held = self._held
+        references = dict.fromkeys(reference_of(self._caller, name) for name in names)
+        new = [reference for reference in references if reference not in held]
+        found = dict(zip(new, self._records.get_fields(new) if new else (), strict=True))
+        self._held = {one: held[one] if one in held else found[one] for one in references}
+
+    def get(self, name: str) -> FieldRecord | None:
+        """One that was read."""
+        return self._held[reference_of(self._caller, name)]
+
+
+def check_fields(
+    services: Services,
+    caller: str,
+    request: JobRequest,
+    named: Mapping[str, str],
+    fields: FieldLookup | None = None,
+) -> None:
     """Refuse what can be refused now; a field that is still validating is waited for by the worker.
 
-    ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer.
+    ``named`` are the fields that the caller must have, by where the request names them, a JSON Pointer. ``fields``:
+    where these and the scene were read.
     Raises Problem OPTIONS_TOO_COSTLY, RENDER_TOO_LARGE, FIELD_NOT_FOUND, FIELD_REJECTED, DETECTION_OUTSIDE_SCENE,
     WEBHOOK_NOT_ALLOWED.
     """
     check_cost(services.settings, request)
     services.webhooks.check(caller, request.webhook)
-    asked = [request.scene, *named.values()]
-    scene, *found = services.records.get_fields([reference_of(caller, sha256) for sha256 in asked])
-    records = dict(zip(named, found, strict=True))
+    if fields is None:
+        fields = FieldLookup(services, caller)
+        fields.read([request.scene, *named.values()])
+    records = {pointer: fields.get(name) for pointer, name in named.items()}
     _require_usable(records)
-    bounds = _bounds(scene)
+    bounds = _bounds(fields.get(request.scene))
     if bounds is None:
         return
     for pointer, box in _boxes(request).items():
@@ -85,11 +114,13 @@ def _bounds(found: FieldRecord | None) -> Bounds | None:
     return None
 
 
-def future_job_id(services: Services, caller: str, asked: JobRequest) -> str:
-    """The id of the job for a caller's request, by what its fields are now."""
-    request = asked.owned_by(caller)
-    found = services.records.get_fields([request.scene, *request.objects])
-    return job_id_of(request, functions_of(found))
+def future_job_id(services: Services, caller: str, asked: JobRequest, fields: FieldLookup | None = None) -> str:
+    """The id of the job for a caller's request, by what its fields are now, or were when ``fields`` was read."""
+    names = [asked.scene, *asked.objects]
+    if fields is None:
+        fields = FieldLookup(services, caller)
+        fields.read(names)
+    return job_id_of(asked.owned_by(caller), functions_of(map(fields.get, names)))
 
 
 def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: str | None) -> JobRecord:
@@ -107,30 +138,37 @@ def submit(services: Services, caller: str, asked: JobRequest, idempotency_key: 
         if existing is not None:
             return existing
     _require_budget(services, caller, job_id)
-    return start(services, caller, asked, job_id)
+    (started,) = start(services, caller, [(job_id, asked)])
+    if isinstance(started, RecordError):
+        raise started
+    return started
 
 
-def start(services: Services, caller: str, asked: JobRequest, job_id: str, batch: str | None = None) -> JobRecord:
-    """The same once there is room, for a job whose id is known. batch: the id of the batch that starts it."""
-    request = asked.owned_by(caller)
+def start(
+    services: Services, caller: str, asked: Sequence[tuple[str, JobRequest]], batch: str | None = None
+) -> list[JobRecord | RecordError]:
+    """The same once there is room, for jobs whose ids are known, with the refusal in the place of one that is refused.
+
+    All of them are recorded together, then queued. batch: the id of the batch that starts them.
+    """
     now = services.records.now()
-    record, _ = services.records.create_job(
+    new = [
         JobRecord(
             id=job_id,
-            kind=kind_of(request),
+            kind=kind_of(one),
             status="accepted",
-            request=request.to_record(),
-            inputs=_inputs(asked) | ({} if batch is None else {"batch": batch}),
+            request=one.owned_by(caller).to_record(),
+            inputs=_inputs(one) | ({} if batch is None else {"batch": batch}),
             created=now,
             updated=now,
-        ),
-        services.settings.max_queued_jobs,
-        services.quota,
-    )
-    if record.status == "accepted":
-        # also for a job known before: mends one that was recorded but never queued
-        services.queue.enqueue_registration(record.id, record.attempt, record.owner, record.is_of_batch)
-    return record
+        )
+        for job_id, one in asked
+    ]
+    answers = services.records.create_jobs(new, services.settings.max_queued_jobs, services.quota)
+    started = [answer if isinstance(answer, RecordError) else answer[0] for answer in answers]
+    # also jobs known before: mends one that was recorded but never queued
+    services.queue.enqueue_jobs([job for job in started if isinstance(job, JobRecord) and job.status == "accepted"])
+    return started
 
 
 def _require_budget(services: Services, caller: str, job_id: str) -> None:

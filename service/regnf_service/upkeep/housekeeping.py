@@ -7,7 +7,7 @@ field is deleted first, and restored if a job has asked for the field in between
 from __future__ import annotations
 
 import logging
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +16,7 @@ from redis import Redis
 
 from regnf_service.upkeep.lease import Term
 from regnf_state.batches import Batches
-from regnf_state.blobs.base import BlobEntry, BlobStore
+from regnf_state.blobs.base import BlobStore
 from regnf_state.journal.journaled_records import JournaledRecordStore
 from regnf_state.pages import all_of
 from regnf_state.pieces import Pieces
@@ -91,11 +91,7 @@ class Housekeeper:
         dropped = [
             field.sha256 for used, field in fields if self._is_old(used, field, now) and self._drop_field(term, field)
         ]
-        total = 0
-        if self._cap is not None:
-            total = sum(kept.bytes for kept in self._folders().values())
-            total += sum(entry.bytes for entry in self._batches.entries())
-        more_jobs, more_fields = self._drop_beyond_cap(term, total, folders, now)
+        more_jobs, more_fields = ([], []) if self._cap is None else self._drop_beyond_cap(term, self._cap, now)
         return Removed((*dropped, *more_fields), tuple(more_jobs), orphans, temporary)
 
     def _is_old(self, used: float, field: FieldRecord, now: float) -> bool:
@@ -112,6 +108,16 @@ class Housekeeper:
                 kept = found[folder]
                 found[folder] = Kept(kept.bytes + entry.bytes, max(kept.modified, entry.modified))
         return found
+
+    def _sizes(self) -> Counter[str]:
+        """The bytes of everything that is stored: of jobs and fields with their journals, batches, pieces of uploads,
+        and the rest."""
+        sizes: Counter[str] = Counter()
+        for entry in self._blobs.entries(""):
+            top, *rest = entry.key.split("/")
+            path = rest if top == "journal" else [top, *rest]
+            sizes["/".join(path[:2] if path[0] in ("jobs", "fields") else path[:3])] += entry.bytes
+        return sizes
 
     def _forget_expired(self, term: Term) -> None:
         """Delete journal entries of jobs whose records expired while a process died."""
@@ -171,34 +177,36 @@ class Housekeeper:
         logger.info("field %s is deleted: it was not used for a long time", field.sha256)
         return True
 
-    def _drop_beyond_cap(
-        self, term: Term, total: int, folders: dict[str, Kept], now: float
-    ) -> tuple[list[str], list[str]]:
-        """Finished jobs, unused fields and batches, oldest first, until the rest is within the cap."""
+    def _drop_beyond_cap(self, term: Term, cap: int, now: float) -> tuple[list[str], list[str]]:
+        """Finished jobs, unused fields, batches and unfinished uploads, oldest first, until the rest is within the
+        cap."""
         jobs: list[str] = []
         fields: list[str] = []
-        if self._cap is None or total <= self._cap:
+        sizes = self._sizes()
+        total = sizes.total()
+        if total <= cap:
             return jobs, fields
         candidates: list[tuple[float, str, Any]] = [
             *((job.finished or 0.0, f"jobs/{job.id}", job) for job in self._finished_jobs()),
             *((used, f"fields/{field.sha256}", field) for used, field in self._unused_fields()),
-            *((entry.modified, entry.key, entry) for entry in self._batches.entries()),
+            *((entry.modified, entry.key, None) for entry in self._batches.entries()),
+            *((one.modified, one.folder, None) for one in self._pieces.unfinished()),
         ]
         for touched, folder, record in sorted(candidates, key=lambda one: one[:2]):
-            if total <= self._cap or touched + _UNTOUCHED_FOR_S > now:
+            if total <= cap or touched + _UNTOUCHED_FOR_S > now:
                 break
-            if isinstance(record, BlobEntry):  # a batch: its jobs stay
-                self._blobs.delete(record.key)
-                total -= record.bytes
-                continue
             if isinstance(record, FieldRecord):
                 if not self._drop_field(term, record):
                     continue
                 fields.append(record.sha256)
             else:
                 term.confirm()
-                self._records.delete_job(record.id)
-                self._blobs.delete_prefix(folder)
-                jobs.append(record.id)
-            total -= folders.get(folder, Kept()).bytes
+                if record is not None:
+                    self._records.delete_job(record.id)
+                    jobs.append(record.id)
+                if folder.startswith("batches/"):  # one blob; its jobs stay
+                    self._blobs.delete(folder)
+                else:
+                    self._blobs.delete_prefix(folder)
+            total -= sizes[folder]
         return jobs, fields

@@ -13,6 +13,7 @@ from regnf_service.concurrency import PARSING, blocking, in_thread
 from regnf_service.http import body
 from regnf_service.http.batch_intake import Intake, portions
 from regnf_service.http.batch_lines import lines_of
+from regnf_service.http.by_reference import read_library
 from regnf_service.http.dependencies import CallerDep, LimitQuery, PageTokenQuery, PrefixDep, ServicesDep, WaitQuery
 from regnf_service.http.pace import Pace
 from regnf_service.http.paging import decode_token, encode_token
@@ -29,7 +30,6 @@ from regnf_state.batches import Batch
 
 router = APIRouter(tags=["batches"])
 MEDIA_TYPE = "application/x-ndjson"
-_LINES_AT_ONCE = 20
 _MOST_LINES = 2**31 - 1
 """More than any batch has; what a query may ask for at most."""
 _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
@@ -51,6 +51,7 @@ _BODY = {"schema": FILE, "x-line-schema": reference(BatchPair)}
             "INVALID_QUERY",
             "INVALID_HEADER",
             "UNSUPPORTED_MEDIA_TYPE",
+            "MALFORMED_JSON",
             "REQUEST_TOO_LARGE",
             "TOO_MANY_PAIRS",
             "BATCH_EMPTY",
@@ -82,11 +83,10 @@ async def post_batch(request: Request, services: ServicesDep, caller: CallerDep,
     pace = Pace(services.settings)
     async with services.uploads.held(fair_key(request.scope, caller), pace):
         posting = await _read(request, services, Intake(services, caller), pace)
-        few = [posting.lines[start : start + _LINES_AT_ONCE] for start in range(0, len(posting.lines), _LINES_AT_ONCE)]
-        for lines in few:
+        for lines in posting.portions():
             await in_thread(posting.check, lines)
         await in_thread(posting.require_room)
-        for lines in few:
+        for lines in posting.portions():
             await in_thread(posting.submit, lines)
         batch = await in_thread(posting.keep)
     answer = await in_thread(_answer, services, batch, prefix, 202)
@@ -100,6 +100,7 @@ async def _read(request: Request, services: Services, intake: Intake, pace: Pace
     async for lines in lines_of(chunks):
         for few in portions(lines):
             read = await PARSING.run(intake.read, few)
+            await read_library(intake.library, [spec for _, _, spec in read if spec is not None])
             await in_thread(intake.take, read)
     return intake.finish()
 

@@ -14,7 +14,7 @@ from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, room_for_bytes, store_upload
 from regnf_service.fields.uploads import open_settings, open_upload, settings_limit
 from regnf_service.http import body
-from regnf_service.http.by_reference import Library, asked_by_reference
+from regnf_service.http.by_reference import Library, asked_by_reference, read_library
 from regnf_service.http.dependencies import CallerDep, PrefixDep, ServicesDep
 from regnf_service.http.multipart import boundary_of, read_parts
 from regnf_service.http.pace import Pace
@@ -133,7 +133,9 @@ async def _read(request: Request, services: Services, caller: str, keep: bool) -
 
 async def _by_reference(request: Request, services: Services, caller: str) -> RegistrationRequest:
     spec = await read_json(request, services, caller, RegisterRequest)
-    asked, named = await in_thread(asked_by_reference, Library(services, caller), spec)
+    library = Library(services, caller)
+    await read_library(library, [spec])
+    asked, named = await in_thread(asked_by_reference, library, spec)
     await in_thread(check_fields, services, caller, asked, named)
     return asked
 

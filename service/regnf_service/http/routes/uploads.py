@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.texts import TextError, decode_text
 from regnf_service.concurrency import in_thread
 from regnf_service.fields.ingest import Beside, StoredUpload, check_room, room_for_bytes, store_upload
 from regnf_service.fields.piecewise import finish_pieces
@@ -43,7 +44,8 @@ from regnf_service.services import Services
 router = APIRouter(tags=["fields"])
 DESCRIPTION_BYTES = 16 * 1024
 _BESIDE = ("settings", "cameras")
-_SHA256_DIGITS = 64
+_UPLOAD_BYTES = 4 * (64 + 4)
+"""A digest in any encoding, with a mark and the end of its line."""
 _HEADERS = {"Location": header("The field."), "ETag": header("Changes whenever the document does.")}
 _DIGEST = {"pattern": "^sha-256=:[A-Za-z0-9+/]{43}=:$"}
 _ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -216,7 +218,7 @@ async def _receive_parts(
     data = body.chunks(request, limit, pace)
     if digest is not None:
         data = _compared(data, digest)
-    texts = {"description": DESCRIPTION_BYTES, "upload": _SHA256_DIGITS}
+    texts = {"description": DESCRIPTION_BYTES, "upload": _UPLOAD_BYTES}
     files = {"file": upload, **beside}
     parts = await read_parts(data, boundary_of(request), files, texts)
     if ("file" in parts) == ("upload" in parts):
@@ -225,7 +227,10 @@ async def _receive_parts(
     settings, cameras = [await beside[part].received() for part in _BESIDE]
     if "file" in parts:
         return await upload.finish(), Beside(description, settings, cameras)
-    named = parts["upload"].decode("utf-8-sig", "replace").strip()
+    try:
+        named = decode_text(parts["upload"]).strip()
+    except TextError as error:
+        raise Problem("INVALID_DIGEST", f"The part upload is {error}.") from error
     if not is_sha256(named):
         raise Problem("INVALID_DIGEST")
     return named, Beside(description, settings, cameras)

@@ -32,6 +32,7 @@ _REASONS = {
 }
 _REASONS_WITHIN = {
     "T_object_scene": "INVALID_TRANSFORM",
+    "T_scene_object": "INVALID_TRANSFORM",
     "T_replacement_object": "INVALID_TRANSFORM",
     "T_scene_file": "INVALID_TRANSFORM",
     "detection": "INVALID_DETECTION",

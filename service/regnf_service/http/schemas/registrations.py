@@ -31,7 +31,7 @@ from regnf_service.http.schemas.library import (
     Named,
     Selected,
 )
-from regnf_service.http.schemas.transforms import Similarity, rows_of
+from regnf_service.http.schemas.transforms import ObjectPose, Start, start_rows
 from regnf_state.registration_request import RegistrationRequest, recorded_detection
 
 START_UNSUPPORTED = "initial_transform_unsupported"
@@ -72,12 +72,6 @@ OneObject = Annotated[Annotated[Reference, Tag(BY_DIGEST)] | Named, Choice]
 SeveralObjects = Annotated[Annotated[Candidates, Tag(BY_DIGEST)] | Selected, Choice]
 
 
-class GroundTruth(Incoming):
-    """The known transform, scene coordinates to object coordinates; the result's metrics then hold the errors."""
-
-    T_object_scene: Similarity
-
-
 class Webhook(Incoming):
     """Where to send a signed message once the job has ended."""
 
@@ -90,13 +84,12 @@ class RegistrationSpec(Incoming):
     detection: Detection = Field(description="Where in the scene the object is.")
     options: RegistrationOptions = Field(default_factory=RegistrationOptions)
     seed: Annotated[int, Field(ge=0, le=2**32 - 1, description="The same seed gives the same result.")] = 0
-    initial_transform: Similarity | None = Field(
+    initial_transform: Start | None = Field(
         None,
-        description="A T_object_scene to look at first; everything else is searched only if that is rejected "
-        "or less likely than 0.95. "
-        "For the preset `robust`.",
+        description="Where to look first: everything else is searched only if that is rejected or less likely than "
+        "0.95. A bare transform is a T_object_scene. For the preset `robust`.",
     )
-    ground_truth: GroundTruth | None = None
+    ground_truth: ObjectPose | None = Field(None, description="The known pose: the metrics then hold the errors.")
     webhook: Webhook | None = Field(
         None, description="Told of the job's end, at once if it has finished. Only hosts that the service allows."
     )
@@ -130,8 +123,8 @@ class RegistrationSpec(Incoming):
             detection=recorded_detection(self.detection.canonical()),
             options=self.options,
             seed=self.seed,
-            initial_transform=None if start is None else rows_of(start),
-            ground_truth=None if truth is None else rows_of(truth.T_object_scene),
+            initial_transform=None if start is None else start_rows(start),
+            ground_truth=None if truth is None else truth.rows,
             webhook=None if webhook is None else webhook.url,
             pictures=self.pictures,
         )

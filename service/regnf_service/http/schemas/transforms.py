@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
-from regnf_core.geometry.similarity_check import similarity_fault
+from regnf_core.geometry.similarity_check import Rows, inverse_rows, similarity_fault
 from regnf_core.rotations import normal_quaternion, rotation_columns
 from regnf_service.http.schemas.common import Coordinate, Incoming
 
-Rows = list[list[float]]
 _AGREE = 1e-4
 
 
@@ -80,9 +79,61 @@ Similarity = Annotated[
     Annotated[Matrix, Tag("matrix_rows")] | Annotated[TransformObject, Tag("transform_object")],
     Discriminator(_spelling),
 ]
-SPELLINGS = frozenset({"matrix_rows", "transform_object"})
+SPELLINGS = frozenset({"matrix_rows", "transform_object", "object_pose"})
 
 
 def rows_of(transform: Rows | TransformObject) -> Rows:
     """The 4x4 of either spelling."""
     return transform.matrix if isinstance(transform, TransformObject) else transform
+
+
+def _one_direction(schema: dict[str, Any]) -> None:
+    # within allOf, as in RegisterRequest
+    schema["allOf"] = [{"oneOf": [{"required": ["T_object_scene"]}, {"required": ["T_scene_object"]}]}]
+    for name in ("T_object_scene", "T_scene_object"):
+        schema["properties"][name].pop("default")
+
+
+class ObjectPose(Incoming):
+    """Where the object is, in one of two directions."""
+
+    model_config = ConfigDict(json_schema_extra=_one_direction)
+
+    T_object_scene: Similarity | None = Field(None, description="Scene coordinates to object coordinates.")
+    T_scene_object: Similarity | None = Field(
+        None, description="Object coordinates to scene coordinates, as results have it."
+    )
+
+    @model_validator(mode="after")
+    def _has_one(self) -> ObjectPose:
+        if (self.T_object_scene is None) == (self.T_scene_object is None):
+            raise ValueError("exactly one of `T_object_scene` and `T_scene_object` must be given")
+        return self
+
+    @property
+    def rows(self) -> Rows:
+        """The 4x4 T_object_scene."""
+        if self.T_object_scene is not None:
+            return rows_of(self.T_object_scene)
+        assert self.T_scene_object is not None, "one of both is given"
+        return inverse_rows(rows_of(self.T_scene_object))
+
+
+def _spelling_of_start(value: Any) -> str:
+    if isinstance(value, ObjectPose):
+        return "object_pose"
+    has_direction = isinstance(value, dict) and not value.keys().isdisjoint(ObjectPose.model_fields)
+    return "object_pose" if has_direction else _spelling(value)
+
+
+Start = Annotated[
+    Annotated[Matrix, Tag("matrix_rows")]
+    | Annotated[TransformObject, Tag("transform_object")]
+    | Annotated[ObjectPose, Tag("object_pose")],
+    Discriminator(_spelling_of_start),
+]
+
+
+def start_rows(start: Rows | TransformObject | ObjectPose) -> Rows:
+    """The 4x4 T_object_scene of any spelling."""
+    return start.rows if isinstance(start, ObjectPose) else rows_of(start)
