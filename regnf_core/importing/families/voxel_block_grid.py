@@ -71,9 +71,7 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     seen = blocks.weights > 0
     values, reasons, warnings = _distances(blocks, seen, overrides)
     fill_unseen(values, seen, blocks.voxel_size, overrides.sign or 1)
-    low, high = (
-        blocks.voxel_size * corner + (blocks.origin or [0.0] * 3) for corner in seen_extent(blocks.keys, seen)
-    )
+    low, high = (blocks.voxel_size * corner + (blocks.origin or [0.0] * 3) for corner in seen_extent(blocks.keys, seen))
     description = {
         "kind": "voxel_blocks",
         **entries_at(shared_entries(overrides, [low.tolist(), high.tolist()]), blocks.origin),

@@ -259,7 +259,5 @@ def test_a_map_far_from_the_origin_is_the_same_map(tmp_path: Path) -> None:
     near, far = fields
     shift = torch.from_numpy(blocks * (8 * SIZE))
     points = torch.from_numpy(CENTER + np.random.default_rng(0).uniform(-RADIUS, RADIUS, (500, 3)))
-    torch.testing.assert_close(
-        far.signed_distance(points + shift), near.signed_distance(points), atol=1e-6, rtol=0.0
-    )
+    torch.testing.assert_close(far.signed_distance(points + shift), near.signed_distance(points), atol=1e-6, rtol=0.0)
     torch.testing.assert_close(far.bounds, near.bounds + shift, atol=1e-6, rtol=0.0)
