@@ -141,7 +141,7 @@ def _checked_sight(
         if share > best + _ALIKE:
             best, told = share, name
     seeing = sum(_share_meeting([image]) >= _SEEING for image in images)
-    odds, sees = _odds(best) / _odds(own), 2 * seeing >= len(images)
+    odds, sees = _odds(best, len(images)) / _odds(own, len(images)), 2 * seeing >= len(images)
     if sees and odds < _DOUBTFUL:
         return None
     more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field, and {100 * best:.2g} % with {told}"
@@ -152,9 +152,12 @@ def _checked_sight(
     raise FieldFormatError(message, reason="CAMERAS_OF_ANOTHER_FRAME")
 
 
-def _odds(share: float) -> float:
-    """Of a share of rays; few rays are not told from none."""
-    return (share + _SEEING) / (1.0 - share + _SEEING)
+def _odds(share: float, cameras: int) -> float:
+    """That a ray ends at a surface, by the share of the rays of so many cameras: the fewer, the nearer to 1.
+
+    Rays of one camera are much alike. So they count as one.
+    """
+    return (cameras * share + 0.5) / (cameras * (1.0 - share) + 0.5)
 
 
 def _share_meeting(images: list[TracedDepths]) -> float:

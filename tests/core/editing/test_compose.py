@@ -301,12 +301,12 @@ def test_matter_that_nobody_saw_goes() -> None:
     assert isinstance(without_unseen(sphere(0.5)), AnalyticField)
 
 
-FAR = torch.tensor([448_262.25, 5_413_920.5, 112.0], dtype=torch.float64)
+UTM = torch.tensor([448_262.25, 5_413_920.5, 112.0], dtype=torch.float64)
 
 
 def far(field: SdfField) -> SdfField:
-    """The field at ``FAR``, as an import places it."""
-    return TransformedField(field, Sim3.from_translation(-FAR))
+    """The field at ``UTM``, as an import places it."""
+    return TransformedField(field, Sim3.from_translation(-UTM))
 
 
 def edits_at(shift: torch.Tensor) -> list[Edit]:
@@ -324,32 +324,32 @@ def observed_room() -> ObservedField:
 
 def test_a_scene_far_from_the_origin_is_edited_as_the_same_one_near_it(tmp_path: Path) -> None:
     scene = observed_room()
-    near, there = compose(scene, edits_at(torch.zeros(3).double())), compose(far(scene), edits_at(FAR))
+    near, there = compose(scene, edits_at(torch.zeros(3).double())), compose(far(scene), edits_at(UTM))
     points = free_points().double()
     distance, gradient = near.signed_distance_and_gradient(points)
-    moved, slope = there.signed_distance_and_gradient(points + FAR)
+    moved, slope = there.signed_distance_and_gradient(points + UTM)
     torch.testing.assert_close(moved, distance, atol=2e-6, rtol=0.0)
     assert ((slope - gradient).abs().amax(-1) < 1e-3).float().mean() > 0.99  # but for edges
-    assert torch.equal(there.part_at(points + FAR), near.part_at(points))
-    torch.testing.assert_close(there.places[1].center, near.places[1].center + FAR, atol=1e-8, rtol=0.0)
-    torch.testing.assert_close(there.bounds, near.bounds + FAR, atol=1e-8, rtol=0.0)
+    assert torch.equal(there.part_at(points + UTM), near.part_at(points))
+    torch.testing.assert_close(there.places[1].center, near.places[1].center + UTM, atol=1e-8, rtol=0.0)
+    torch.testing.assert_close(there.bounds, near.bounds + UTM, atol=1e-8, rtol=0.0)
     assert near.observation is not None
     assert there.observation is not None
-    assert torch.equal(there.observation.at(points + FAR), near.observation.at(points))
+    assert torch.equal(there.observation.at(points + UTM), near.observation.at(points))
     for field, name in ((near, "near"), (there, "far")):
         write_field(field, tmp_path / name, 40)
     stored, stored_far = open_field(tmp_path / "near"), open_field(tmp_path / "far")
     torch.testing.assert_close(
-        stored_far.signed_distance(points + FAR), stored.signed_distance(points), atol=2e-6, rtol=0
+        stored_far.signed_distance(points + UTM), stored.signed_distance(points), atol=2e-6, rtol=0
     )
     kept = observation_of(stored_far)
     assert kept is not None
-    assert torch.equal(kept.at(points + FAR), near.observation.at(points))
+    assert torch.equal(kept.at(points + UTM), near.observation.at(points))
 
 
 def test_an_edited_scene_far_from_the_origin_is_rendered_with_its_parts_and_edited_again() -> None:
     frames = []
-    for scene, shift in ((room(*STOOL), torch.zeros(3).double()), (far(room(*STOOL)), FAR)):
+    for scene, shift in ((room(*STOOL), torch.zeros(3).double()), (far(room(*STOOL)), UTM)):
         edited = compose(scene, edits_at(shift))
         again = compose(
             edited, [Insertion(sphere(0.1), Sim3.from_translation(-shift - torch.tensor([-0.4, -0.4, 0.1])))]
@@ -368,4 +368,4 @@ def test_matter_that_nobody_saw_goes_far_from_the_origin_as_well() -> None:
     scene = observed_room()
     points = free_points(500).double()
     expected = without_unseen(scene).signed_distance(points)
-    torch.testing.assert_close(without_unseen(far(scene)).signed_distance(points + FAR), expected, atol=2e-6, rtol=0.0)
+    torch.testing.assert_close(without_unseen(far(scene)).signed_distance(points + UTM), expected, atol=2e-6, rtol=0.0)
