@@ -146,7 +146,6 @@ HINTS: dict[str, str] = {
     "INITIAL_TRANSFORM_UNSUPPORTED": "Leave the initial transform out, or use the preset robust.",
     "NO_SURFACE_IN_SCENE": "Check the scene's bounds and its sign: positive outside, negative inside.",
     "NO_SURFACE_IN_TARGET": "Check that the box encloses the object.",
-    "TARGET_OUTSIDE_GRID": "Use a box within the field's bounds; `regnf inspect` shows them.",
     "NO_PICTURE": "Register with pictures, or draw one: `regnf inspect FILE --picture field.png`.",
     "OBJECT_MODEL_INVALID": "Delete it: it is made again when it is needed.",
     "FIELD_NOT_FINITE": "The training may have diverged: give an earlier checkpoint.",

@@ -106,4 +106,3 @@ def mesh_file(
     whole = _HEAD.size + len(text) + 8 + len(data)
     head = _HEAD.pack(_MAGIC, 2, whole, len(text), _JSON) + text + struct.pack("<2I", len(data), _BINARY)
     return head + data
-
