@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_core.importing.observing.trajectory import rolled_quaternions
 from regnf_data.posed_images import PosedImages
 
 Floats = NDArray[np.float64]
@@ -246,6 +247,9 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
             if inverted or not np.array_equal(axes, np.eye(3)):
                 changed = replace(views, poses=(inverse if inverted else views.poses) @ turn)
                 yield changed.because(*_of_axes(axes, inverted))
+    for step, wrong in ((-1, "quaternions written w first"), (1, "quaternions x y z w that were read w first")):
+        rolled = replace(views, poses=rolled_quaternions(views.poses, step))
+        yield rolled.because(wrong, "make the matrices of quaternions anew, in the order that they are written in")
     count = len(views.poses)
     by_name = np.argsort([str(number) for number in range(count)], kind="stable")
     orders = {
