@@ -38,6 +38,8 @@ _NO_DOUBT = 0.07
 """Of places that contradict: good recordings of random worlds, of two to sixty images, have up to so many."""
 _WARNED = 0.25
 """Of places that contradict, where no other convention makes them agree: several times as many as noise leaves."""
+_BEYOND = 100.0
+"""Times as large as the right depths: there shifts of the cameras count for nothing."""
 _TRIED = 6
 _MORE = 0.7
 """A second change is made where it leaves at most this share of what the first one left."""
@@ -129,7 +131,7 @@ def check_agreement(images: PosedImages) -> str | None:
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
     best, other = _search(stated, sample)
-    if best is not stated and _clearly_better(other, found):
+    if best is not stated and _clearly_better(other, found) and _tells_depth(best, other, sample):
         wrong, mend = best.told()
         raise DatasetError(
             f"the images contradict each other: {found.said()}. With {wrong}: {other.said()}",
@@ -139,6 +141,15 @@ def check_agreement(images: PosedImages) -> str | None:
     if found.places < _FEWEST or found.contradicting < _WARNED * found.places:
         return None
     return f"FRAMES_DISAGREE: {found.said()}: poses, intrinsics or depths are wrong, or things moved"
+
+
+def _tells_depth(views: _Views, agreement: Agreement, sample: _Sample) -> bool:
+    """Whether a factor above 1 is more than a way to be rid of the cameras' places: beside depths that are large
+    enough, shifts count for nothing, and images of one distant wall agree by their turns alone."""
+    if views.factor <= 1.0:
+        return True
+    farther = sample.agreement(replace(views, factor=_BEYOND * views.factor))
+    return agreement.disagreement <= _CLEAR * farther.disagreement
 
 
 def _clearly_better(other: Agreement, found: Agreement) -> bool:

@@ -129,6 +129,15 @@ def test_one_image_or_a_flat_wall_tells_nothing() -> None:
     assert check_agreement(flat) is None
 
 
+def test_images_that_share_nothing_tell_no_unit() -> None:
+    one = recording()
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 6.0  # beside the first, looking the same way at another part of a wall
+    apart = replace(one, depths=np.full((2, *SIZE), 2.0, np.float32), T_world_camera=poses,
+                    intrinsics=one.intrinsics[:2], colors=one.colors[:2])  # fmt: skip
+    assert check_agreement(apart) is None
+
+
 def test_poses_of_nowhere_are_warned_of() -> None:
     images = recording()
     rng = np.random.default_rng(0)
