@@ -38,6 +38,8 @@ _NO_DOUBT = 0.07
 """Of places that contradict: good recordings of random worlds, of two to sixty images, have up to so many."""
 _WARNED = 0.25
 """Of places that contradict, where no other convention makes them agree: several times as many as noise leaves."""
+_ENOUGH = 5
+"""Images that share nothing as they are: fewer agree by one of the many conventions and scales by chance."""
 _BEYOND = 100.0
 """Times as large as the right depths: there shifts of the cameras count for nothing."""
 _TRIED = 6
@@ -131,7 +133,7 @@ def check_agreement(images: PosedImages) -> str | None:
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
     best, other = _search(stated, sample)
-    if best is not stated and _clearly_better(other, found) and _tells_depth(best, other, sample):
+    if best is not stated and _clearly_better(other, found, len(images)) and _tells_depth(best, other, sample):
         wrong, mend = best.told()
         raise DatasetError(
             f"the images contradict each other: {found.said()}. With {wrong}: {other.said()}",
@@ -152,11 +154,13 @@ def _tells_depth(views: _Views, agreement: Agreement, sample: _Sample) -> bool:
     return agreement.disagreement <= _CLEAR * farther.disagreement
 
 
-def _clearly_better(other: Agreement, found: Agreement) -> bool:
+def _clearly_better(other: Agreement, found: Agreement, images: int) -> bool:
     """Whether images that agree as ``other`` says, by another convention, refute the one that ``found`` is of."""
     if other.agreeing < max(_FEWEST, found.agreeing) or other.disagreement > _MOST_LEFT:
         return False
     if found.places < _FEWEST:  # there is nothing to compare with: the other one must leave no doubt
+        if images < _ENOUGH:
+            return False
         return other.disagreement < _SUSPECT and other.contradicting < _NO_DOUBT * other.places
     less = other.contradicting / other.places <= _CLEAR * found.contradicting / found.places
     return less and other.disagreement <= _CLEAR * found.disagreement
