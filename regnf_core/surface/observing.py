@@ -43,9 +43,9 @@ _SEEING = 0.02
 _SLOPE = 0.2
 _SUSPECT = 0.8
 """Of all rays, that end at a surface: where more do, no other convention is tried."""
-_DOUBTFUL, _CLEAR = 3.0, 8.0
-"""Odds that a ray ends at a surface, by another convention over those by the stated one: with which one warns, and
-with which the latter is refuted. At most 4.6 by right cameras of random rooms, half of which were cut away."""
+_DOUBTFUL = 3.0
+"""Odds that a ray ends at a surface, by another convention over those by the stated one, with which one warns. Right
+cameras have such odds as well, where they look out of a field's open side: so nobody is refused for them."""
 _ALIKE = 0.03
 """Shares of rays that say nothing of which cameras are better; the first of such are taken."""
 
@@ -57,8 +57,7 @@ def observe_by_cameras(
 
     points: evaluations of the field, about; fewer make voxels larger, and images coarser · others: the same cameras by
     other conventions, each with what it is and what to do about it, the usual ones first. Deterministic.
-    Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most of them see nothing of the field, or much less of it
-    than by another convention.
+    Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most of them see nothing of the field.
     """
     rays = int(_RAYS_SHARE * points / _POINTS_A_RAY)
     chosen = cameras.evenly(max(1, min(_MOST_CAMERAS, rays // _RAYS_EACH)))
@@ -125,8 +124,8 @@ def _ends(cameras: PinholeCameras, images: list[TracedDepths]) -> Tensor:
 def _checked_sight(
     others: Sequence[tuple[str, PinholeCameras]], field: SdfField, images: list[TracedDepths], rays: int
 ) -> str | None:
-    """A warning where others see far more. Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where that is clear, or
-    most cameras see nothing.
+    """A warning where others see far more. Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most cameras see
+    nothing.
 
     The field was made of what its cameras saw. So they stood in free space, and before them is a surface. Others may
     see one as well, in a closed room; those that are right see one with nearly all of their rays.
@@ -145,7 +144,7 @@ def _checked_sight(
     if sees and odds < _DOUBTFUL:
         return None
     more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field, and {100 * best:.2g} % with {told}"
-    if sees and odds < _CLEAR:
+    if sees:
         return f"CAMERAS_DOUBTFUL: {more}"
     message = f"{len(images) - seeing} of {len(images)} cameras stand within matter or see no surface of the field"
     message += f"; {more}" if told else ": are they of the same scene, in the same frame?"

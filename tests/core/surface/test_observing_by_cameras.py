@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -197,9 +198,12 @@ def others(read: Trajectory) -> list[tuple[str, PinholeCameras]]:
 def test_the_convention_that_the_field_agrees_with_is_named(name: str) -> None:
     axes, change, told = MISREAD[name]
     read = trajectory(walk(9), axes, change)
-    with pytest.raises(FieldFormatError, match=told) as raised:
-        observe_by_cameras(room(), read.pinhole(), 100_000, others(read))
-    assert raised.value.reason == "CAMERAS_OF_ANOTHER_FRAME"
+    try:
+        _, said = observe_by_cameras(room(), read.pinhole(), 100_000, others(read))
+    except FieldFormatError as error:  # most of them see nothing
+        assert error.reason == "CAMERAS_OF_ANOTHER_FRAME"
+        said = str(error)
+    assert re.search(told, said or "")
 
 
 def test_quaternions_in_another_order_are_tried() -> None:
