@@ -201,7 +201,6 @@ def test_the_convention_that_the_field_agrees_with_is_named(name: str) -> None:
     try:
         _, said = observe_by_cameras(room(), read.pinhole(), 100_000, others(read))
     except FieldFormatError as error:  # most of them see nothing
-        assert error.reason == "CAMERAS_OF_ANOTHER_FRAME"
         said = str(error)
     assert re.search(told, said or "")
 
