@@ -39,7 +39,7 @@ def fit(
     source: a mesh file, any field, a mesh of trimesh or Open3D, or a folder of posed RGB-D images (docs/fitting.md) ·
     options: entries of FitOptions, or for images of ReconstructionOptions · extent: of a mesh file, the length of its
     longest edge after it has been moved to the origin.
-    Raises InvalidOptionsError, InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET ...).
+    Raises InvalidOptionsError, InvalidInputError (NO_SURFACE_IN_TARGET ...).
     """
     path, seed = _checked_output(Path(output)), seed_of(seed)
     if isinstance(source, SdfField):

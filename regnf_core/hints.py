@@ -150,7 +150,6 @@ HINTS: dict[str, str] = {
     "NO_SURFACE_IN_SCENE": "Check the scene's bounds and its sign: positive outside, negative inside.",
     "NO_SURFACE_IN_TARGET": "Give a mesh with triangles that have an area, or a field with a surface; "
     "`regnf inspect FILE` shows what a file holds.",
-    "TARGET_OUTSIDE_GRID": "Scale it: `regnf fit MESH FIELD --extent 1.0`; in Python `fit(..., extent=1.0)`.",
     "NO_PICTURE": "Convert the field to a grid, which is faster, and draw that: `regnf convert FILE grid.npz`.",
     "OBJECT_MODEL_INVALID": "Delete it: it is made again when it is needed.",
     "FIELD_NOT_FINITE": "The training may have diverged: give an earlier checkpoint.",

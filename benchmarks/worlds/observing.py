@@ -50,4 +50,4 @@ def cameras_of_walk(taken: Capture) -> PinholeCameras:
 
 def observation_of_cameras(field: SdfField, cameras: PinholeCameras) -> Observation:
     """What the cameras have seen of a field that was made of their images, in the same frame."""
-    return observe_by_cameras(field, cameras, _EVALUATIONS)
+    return observe_by_cameras(field, cameras, _EVALUATIONS)[0]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from regnf_core.editing.clearing import Clearing, clear_box, clear_thing
 from regnf_core.editing.edited_scene import EditedScene
@@ -18,6 +19,7 @@ from regnf_core.editing.standing import standing_alike
 from regnf_core.errors import InvalidInputError, NoSurfaceError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.observation import observation_of
+from regnf_core.fields.transformed import near_origin
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.surface.surface_bounds import surface_bounds
@@ -52,7 +54,8 @@ def compose(
     EDIT_OUTSIDE_SCENE, FIELD_NOT_FINITE; and NoSurfaceError (NO_SURFACE_IN_OBJECT).
     """
     surfaces: dict[int, OrientedBox] = {}
-    planned = [_planned(edit, number, surfaces) for number, edit in enumerate(edits)]
+    scene, origin = near_origin(scene)
+    planned = [_planned(_moved(edit, origin), number, surfaces) for number, edit in enumerate(edits)]
     for number, plan in enumerate(planned):
         _require_in_scene(scene, plan, number)
     require_apart([Occupied(plan.removed, plan.placed) for plan in planned])
@@ -74,11 +77,22 @@ def compose(
         else:
             parts.append(replace(before[0], name=plan.name))
     places = [plan.place for plan in planned]
-    edited = EditedScene(scene, clearings, objects, parts, places)
     known = observation_of(scene)
-    if known is None:
-        return edited
-    return EditedScene(scene, clearings, objects, parts, places, observation_after(known, edited))
+    if known is not None:
+        known = observation_after(known, EditedScene(scene, clearings, objects, parts, places))
+    return EditedScene(scene, clearings, objects, parts, places, known, origin)
+
+
+def _moved(edit: Edit, origin: Tensor) -> Edit:
+    """The edit of a scene from all of whose places ``origin`` (3,) was subtracted."""
+    if not origin.any():
+        return edit
+    T = None if edit.T_object_scene is None else edit.T_object_scene @ Sim3.from_translation(origin)
+    if isinstance(edit, Removal):
+        box = None if edit.detection is None else edit.detection.shifted(-origin)
+        return replace(edit, detection=box, T_object_scene=T)
+    assert T is not None
+    return replace(edit, T_object_scene=T)
 
 
 def _planned(edit: Edit, number: int, surfaces: dict[int, OrientedBox]) -> _Planned:

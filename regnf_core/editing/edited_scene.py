@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 
 _PLAIN = 0.8
 """Color of a part that has none, where another has."""
@@ -46,8 +47,9 @@ class EditedScene:
     """The scene less what was cleared, and the objects: as solids, so the smallest distance counts.
 
     clearings: places that the edits clear · objects: each with the number of its part · parts: the scene's, then one an
-    edit · places: the box of each edit's thing, scene frame · observation: of the edited scene; None where the scene
-    has none. Made by ``compose``.
+    edit · places: the box of each edit's thing · observation: of the edited scene; None where the scene has none ·
+    origin: (3,) float64, where the frame of all these begins in that of the field: single precision is enough in the
+    former alone. Made by ``compose``.
     """
 
     def __init__(
@@ -58,21 +60,53 @@ class EditedScene:
         parts: Sequence[Part],
         places: Sequence[OrientedBox] = (),
         observation: Observation | None = None,
+        origin: Tensor | None = None,
     ) -> None:
         self.scene = scene
         self.clearings = tuple(clearings)
         self.objects = tuple(objects)
-        self.parts = tuple(parts)
-        self.places = tuple(places)
-        self.observation = observation
-        if any(has_color(part.field) for part in self.parts):
+        self._parts = tuple(parts)
+        self._places = tuple(places)
+        self._observation = observation
+        self.origin = torch.zeros(3, dtype=torch.float64) if origin is None else origin
+        if any(has_color(part.field) for part in parts):
             self.color = self._color
+
+    def moved(self, shift: Tensor) -> EditedScene:
+        """The same where ``shift`` (3,) is subtracted from all places."""
+        return self._with(self.scene, self.objects, self._parts, self.origin - shift)
+
+    def _with(
+        self, scene: SdfField, objects: Sequence[tuple[int, PlacedObject]], parts: Sequence[Part], origin: Tensor
+    ) -> EditedScene:
+        return EditedScene(scene, self.clearings, objects, parts, self._places, self._observation, origin)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The scene's, then one an edit."""
+        if not self.origin.any():
+            return self._parts
+        shift = Sim3.from_translation(-self.origin)
+        moved = (shift if part.T_field_scene is None else part.T_field_scene @ shift for part in self._parts)
+        return tuple(replace(part, T_field_scene=T) for part, T in zip(self._parts, moved, strict=True))
+
+    @property
+    def places(self) -> tuple[OrientedBox, ...]:
+        """The box of each edit's thing."""
+        return tuple(box.shifted(self.origin) for box in self._places)
+
+    @property
+    def observation(self) -> Observation | None:
+        """Of the edited scene; None where the scene has none."""
+        if self._observation is None or not self.origin.any():
+            return self._observation
+        return self._observation.seen_in(Sim3.from_translation(-self.origin))
 
     @property
     def bounds(self) -> Tensor:
         """(2, 3) float64 on the CPU: the scene's, and what objects reach beyond them."""
         boxes = torch.stack([self.scene.bounds, *(thing.bounds for _, thing in self.objects)])
-        return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)])
+        return torch.stack([boxes[:, 0].amin(0), boxes[:, 1].amax(0)]) + self.origin
 
     @property
     def device(self) -> torch.device:
@@ -87,8 +121,12 @@ class EditedScene:
     def to(self, device: torch.device | str) -> EditedScene:
         """The same with all parameters on another device."""
         moved = [(number, thing.to(device)) for number, thing in self.objects]
-        parts = [Part(part.field.to(device), part.T_field_scene, part.tint, part.name) for part in self.parts]
-        return EditedScene(self.scene.to(device), self.clearings, moved, parts, self.places, self.observation)
+        parts = [replace(part, field=part.field.to(device)) for part in self._parts]
+        return self._with(self.scene.to(device), moved, parts, self.origin)
+
+    def _near(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the field's frame in that of its parts, single precision."""
+        return (points.to(self.device).double() - self.origin.to(self.device)).float()
 
     @torch.no_grad()
     def signed_distance(self, points: Tensor) -> Tensor:
@@ -110,12 +148,12 @@ class EditedScene:
         distance, _, part = self._evaluate(points, False)
         if isinstance(self.scene, PartedField):
             own = (part == SCENE_PART).nonzero().squeeze(-1)
-            part[own] = self.scene.part_at(points.to(part.device)[own])
+            part[own] = self.scene.part_at(self._near(points)[own])
         return distance, part
 
     def _evaluate(self, points: Tensor, with_gradient: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Distance (N,), gradient (N, 3), 0 unless it is asked for, and part (N,) at points (N, 3)."""
-        points = points.to(device=self.device, dtype=torch.float32)
+        points = self._near(points)
         asked = torch.ones(len(points), dtype=torch.bool, device=points.device)
         found = _Found.nothing_at(points)
         if self.clearings:
@@ -178,11 +216,11 @@ class EditedScene:
     @torch.no_grad()
     def _color(self, points: Tensor, directions: Tensor) -> Tensor:
         """Color (N, 3) of points (N, 3) seen along unit directions (N, 3): that of the nearest part."""
-        points, directions = (values.to(device=self.device, dtype=torch.float32) for values in (points, directions))
-        numbers = self.part_at(points)
+        numbers, points = self.part_at(points), self._near(points)
+        directions = directions.to(points)
         colors = torch.full_like(points, _PLAIN)
         for number in torch.unique(numbers).tolist():
-            part = self.parts[number]
+            part = self._parts[number]
             if has_color(part.field):
                 chosen = (numbers == number).nonzero().squeeze(-1)
                 at, along = points[chosen], directions[chosen]

@@ -11,7 +11,9 @@ from regnf_core.editing.region import GridDistance, RegionGrid
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import has_color, inverse_deviation_of
 from regnf_core.fields.observation import Observation, observation_of
+from regnf_core.fields.transformed import TransformedField, near_origin
 from regnf_core.geometry.box import OrientedBox
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.observation_grid import SURFACE
 
 _AROUND = 2
@@ -68,9 +70,15 @@ class MeasuredMatter:
 
 def without_unseen(scene: SdfField) -> SdfField:
     """The scene without unobserved matter; itself where it does not know what was observed."""
-    known = observation_of(scene)
-    if known is None:
+    if observation_of(scene) is None:
         return scene
+    near, origin = near_origin(scene)
+    measured = _measured(near, observation_of(near))
+    return TransformedField(measured, Sim3.from_translation(-origin)) if origin.any() else measured
+
+
+def _measured(scene: SdfField, known: Observation | None) -> MeasuredMatter:
+    assert known is not None
     shape = torch.tensor(known.states.shape, dtype=torch.float64)
     box = OrientedBox(known.low + known.voxel * shape / 2, known.voxel * shape, torch.eye(3, dtype=torch.float64))
     cell = known.voxel

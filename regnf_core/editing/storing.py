@@ -15,9 +15,11 @@ from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import ColoredField, has_color
 from regnf_core.fields.observation import observation_of
+from regnf_core.fields.transformed import near_origin
 from regnf_core.schema.color import COLOR, VALUES, ValueColor, color_tensors
 from regnf_core.schema.observation_grid import OBSERVATION
 from regnf_core.schema.safe_format import write_safe_field
+from regnf_core.schema.similarity import moved_box, shift_rows
 from regnf_core.surface.isosurface import Lattice
 
 _SLAB_POINTS = 1 << 18
@@ -34,6 +36,7 @@ def write_field(field: SdfField, path: Path, resolution: int) -> tuple[int, int,
     from straight before the surface.
     Raises InvalidInputError (INVALID_OPTIONS, FIELD_NOT_FINITE).
     """
+    field, origin = near_origin(field)
     lattice = Lattice.over(field, resolution)
     x, y, z = (int(n) for n in lattice.counts)
     if x * y * z > _MOST_NODES:
@@ -52,7 +55,7 @@ def write_field(field: SdfField, path: Path, resolution: int) -> tuple[int, int,
             colors[rows] = _colors(field, points, near).reshape(len(rows), y, z, 3)
     if not np.isfinite(values).all():
         raise InvalidInputError("the field gives values that are not finite", reason="FIELD_NOT_FINITE")
-    _write(field, path, lattice, values, colors)
+    _write(field, path, lattice, values, colors, origin.tolist())
     return x, y, z
 
 
@@ -69,8 +72,14 @@ def _colors(field: ColoredField, points: Tensor, chosen: Tensor) -> NDArray[np.f
 
 
 def _write(
-    field: SdfField, path: Path, lattice: Lattice, values: NDArray[np.float32], colors: NDArray[np.float16] | None
+    field: SdfField,
+    path: Path,
+    lattice: Lattice,
+    values: NDArray[np.float32],
+    colors: NDArray[np.float16] | None,
+    origin: list[float],
 ) -> None:
+    """origin: (3,), what was subtracted from all places."""
     top = lattice.low + lattice.step * (lattice.counts - 1)
     description: dict[str, Any] = {
         "kind": "voxel_grid",
@@ -78,9 +87,13 @@ def _write(
         "spacing": [lattice.step] * 3,
         "bounds": [lattice.low.tolist(), top.tolist()],
     }
+    if any(origin):
+        rows = shift_rows(origin)
+        description["placement"] = {"transform": rows, "bounds": description["bounds"]}
+        description["bounds"] = moved_box(rows, description["bounds"])
     tensors: dict[str, Any] = {"values": values}
     known = observation_of(field)
-    if known is not None and known.T_grid_frame is None:
+    if known is not None and (known := known.without_shift()).T_grid_frame is None:
         grid, words = known.stored()
         description["observation"] = {"low": list(grid.low), "voxel": grid.voxel, "counts": list(grid.counts)}
         tensors[OBSERVATION] = words

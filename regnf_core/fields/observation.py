@@ -61,6 +61,13 @@ class Observation:
         grid = ObservationGrid((low[0], low[1], low[2]), self.voxel, (counts[0], counts[1], counts[2]))
         return grid, grid.pack(self.states.numpy())
 
+    def without_shift(self) -> Observation:
+        """The same with its grid in the points' frame, where they differ by a shift alone; else itself."""
+        T = self.T_grid_frame
+        if T is None or float(T.scale) != 1.0 or not torch.equal(T.rotation, torch.eye(3).to(T.rotation)):
+            return self
+        return Observation(self.states, self.low - T.translation, self.voxel)
+
     def seen_in(self, T_frame_new: Sim3) -> Observation:
         """The same for points of a new frame, which ``T_frame_new`` carries to the present one."""
         T = T_frame_new if self.T_grid_frame is None else self.T_grid_frame @ T_frame_new

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol, runtime_checkable
+
 import torch
 from torch import Tensor
 
@@ -76,6 +78,15 @@ class TransformedField:
         return self.T_field_frame.apply(points.double())
 
 
+@runtime_checkable
+class Movable(Protocol):
+    """A field that can be moved itself, and loses nothing that a TransformedField would not pass on."""
+
+    def moved(self, shift: Tensor) -> SdfField:
+        """The same where ``shift`` (3,) float64 is subtracted from all places."""
+        ...
+
+
 def near_origin(field: SdfField) -> tuple[SdfField, Tensor]:
     """The field with its bounds near the origin, where float32 has digits enough, and what was subtracted.
 
@@ -86,4 +97,5 @@ def near_origin(field: SdfField) -> tuple[SdfField, Tensor]:
     if origin is None:
         return field, torch.zeros(3, dtype=torch.float64)
     shift = torch.tensor(origin, dtype=torch.float64)
-    return TransformedField(field, Sim3.from_translation(shift)), shift
+    moved = field.moved(shift) if isinstance(field, Movable) else TransformedField(field, Sim3.from_translation(shift))
+    return moved, shift

@@ -134,6 +134,10 @@ class OrientedBox:
         signs = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5], dtype=torch.float64)] * 3)  # (8, 3)
         return self.center + (signs * self.size) @ self.rotation.T
 
+    def shifted(self, shift: Tensor) -> OrientedBox:
+        """The same box, ``shift`` (3,) farther."""
+        return replace(self, center=self.center + shift)
+
     def to_local(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the scene in the box's own frame: each coordinate within ±size/2 for points inside."""
         rotation = self.rotation.to(points)

@@ -6,7 +6,7 @@ and what lies behind was not. Surface that a field has invented is behind what w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,17 +41,28 @@ _TRIES = 4
 _SEEING = 0.02
 """A camera sees the field where so large a share of its rays ends at a surface; half of the cameras have to."""
 _SLOPE = 0.2
+_SUSPECT = 0.8
+"""Of all rays, that end at a surface: where more do, no other convention is tried."""
+_DOUBTFUL = 3.0
+"""Odds that a ray ends at a surface, by another convention over those by the stated one, with which one warns. Right
+cameras have such odds as well, where they look out of a field's open side: so nobody is refused for them."""
+_ALIKE = 0.03
+"""Shares of rays that say nothing of which cameras are better; the first of such are taken."""
 
 
-def observe_by_cameras(field: SdfField, cameras: PinholeCameras, points: int) -> Observation:
-    """What the cameras, in the field's frame, observed within its bounds.
+def observe_by_cameras(
+    field: SdfField, cameras: PinholeCameras, points: int, others: Sequence[tuple[str, PinholeCameras]] = ()
+) -> tuple[Observation, str | None]:
+    """What the cameras, in the field's frame, observed within its bounds; and a warning where they may be others.
 
-    points: evaluations of the field, about; fewer make voxels larger, and images coarser. Deterministic.
+    points: evaluations of the field, about; fewer make voxels larger, and images coarser · others: the same cameras by
+    other conventions, each with what it is and what to do about it, the usual ones first. Deterministic.
     Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most of them see nothing of the field.
     """
     rays = int(_RAYS_SHARE * points / _POINTS_A_RAY)
     chosen = cameras.evenly(max(1, min(_MOST_CAMERAS, rays // _RAYS_EACH)))
     images = trace_depths(field, chosen, max(4, rays // len(chosen)))
+    doubt = _checked_sight(others, field, images, rays)
     ends = _ends(chosen, images)
     grid = _grid_round(ends, field.bounds, sum(points >= enough for enough in _POINTS_HALVED))
     states = torch.full(grid.counts, UNSEEN, dtype=torch.uint8).view(-1)
@@ -61,7 +72,7 @@ def observe_by_cameras(field: SdfField, cameras: PinholeCameras, points: int) ->
     states[near[cells.values < 0]] = UNSEEN
     states[near[_seen_surface(field, cells, chosen, images)]] = SURFACE
     states[grid.index(ends)] = SURFACE
-    return Observation(states.view(grid.counts), grid.low, grid.voxel)
+    return Observation(states.view(grid.counts), grid.low, grid.voxel), doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,19 +112,56 @@ def _grid_round(ends: Tensor, bounds: Tensor, halvings: int) -> _Grid:
 
 
 def _ends(cameras: PinholeCameras, images: list[TracedDepths]) -> Tensor:
-    """(M, 3) float64 where rays end at a surface. Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME)."""
+    """(M, 3) float64 where rays end at a surface."""
     found = []
     for camera, image in enumerate(images):
-        if float(image.meets.float().mean()) >= _SEEING:
+        if _share_meeting([image]) >= _SEEING:
             depths = image.free[image.meets].double()[:, None]
             found.append(cameras.positions[camera] + depths * cameras.directions(camera, image.places()[image.meets]))
-    if 2 * len(found) < len(images):
-        raise FieldFormatError(
-            f"{len(images) - len(found)} of {len(images)} cameras stand within matter or see no surface of the field:"
-            " are they of the same scene, in the same frame?",
-            reason="CAMERAS_OF_ANOTHER_FRAME",
-        )
     return torch.cat(found)
+
+
+def _checked_sight(
+    others: Sequence[tuple[str, PinholeCameras]], field: SdfField, images: list[TracedDepths], rays: int
+) -> str | None:
+    """A warning where others see far more. Raises FieldFormatError (CAMERAS_OF_ANOTHER_FRAME) where most cameras see
+    nothing.
+
+    The field was made of what its cameras saw. So they stood in free space, and before them is a surface. Others may
+    see one as well, in a closed room; those that are right see one with nearly all of their rays.
+    """
+    own = _share_meeting(images)
+    if own >= _SUSPECT:
+        return None
+    best, told = own, ""
+    for name, cameras in others:
+        tried = cameras.evenly(_MOST_CAMERAS // len(others))
+        share = _share_meeting(trace_depths(field, tried, max(4, rays // (len(others) * len(tried)))))
+        if share > best + _ALIKE:
+            best, told = share, name
+    seeing = sum(_share_meeting([image]) >= _SEEING for image in images)
+    odds, sees = _odds(best, len(images)) / _odds(own, len(images)), 2 * seeing >= len(images)
+    if sees and odds < _DOUBTFUL:
+        return None
+    more = f"{100 * own:.2g} % of the lines of sight end at a surface of the field, and {100 * best:.2g} % with {told}"
+    if sees:
+        return f"CAMERAS_DOUBTFUL: {more}"
+    message = f"{len(images) - seeing} of {len(images)} cameras stand within matter or see no surface of the field"
+    message += f"; {more}" if told else ": are they of the same scene, in the same frame?"
+    raise FieldFormatError(message, reason="CAMERAS_OF_ANOTHER_FRAME")
+
+
+def _odds(share: float, cameras: int) -> float:
+    """That a ray ends at a surface, by the share of the rays of so many cameras: the fewer, the nearer to 1.
+
+    Rays of one camera are much alike. So they count as one.
+    """
+    return (cameras * share + 0.5) / (cameras * (1.0 - share) + 0.5)
+
+
+def _share_meeting(images: list[TracedDepths]) -> float:
+    """Of all rays, from 0 to 1."""
+    return float(torch.stack([image.meets.float().mean() for image in images]).mean())
 
 
 def _looked_through(points: Tensor, cameras: PinholeCameras, images: list[TracedDepths], margin: float) -> Tensor:

@@ -11,6 +11,7 @@ import torch
 from regnf_core.errors import RegnfError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.color import has_color
+from regnf_core.fields.transformed import TransformedField
 from regnf_core.surface.isosurface import extract_surface
 from regnf_core.viewing.vertex_clustering import Floats, Triangles, at_most, used_alone
 
@@ -52,13 +53,17 @@ def display_meshes(field: SdfField, budget_s: float) -> DisplayMeshes:
 
 
 def _own_triangles(field: SdfField) -> Triangles | None:
-    """Those of a field that is a mesh; None of another field."""
+    """Those of a field that is a mesh, in its own frame or moved; None of another field."""
     from regnf_core.fields.mesh import MeshField  # loads libigl and trimesh: nearly two seconds
 
-    if not isinstance(field, MeshField):
+    mesh = field.field if isinstance(field, TransformedField) else field
+    if not isinstance(mesh, MeshField):
         return None
-    colors = None if field.colors is None else field.colors.astype(np.float64)
-    return used_alone(Triangles(field.vertices, field.faces, colors=colors))
+    vertices = mesh.vertices
+    if isinstance(field, TransformedField):
+        vertices = field.T_field_frame.inverse().apply(torch.from_numpy(vertices)).numpy()
+    colors = None if mesh.colors is None else mesh.colors.astype(np.float64)
+    return used_alone(Triangles(vertices, mesh.faces, colors=colors))
 
 
 def _extracted(field: SdfField, budget_s: float) -> DisplayMeshes:

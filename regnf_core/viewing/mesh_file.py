@@ -1,7 +1,8 @@
 """The meshes that people look at as GLB files of one fixed form.
 
-A file has one node, one primitive of triangles, positions, perhaps normals (without them it is flat), perhaps colors
-(as displays show them, like all meshes that regnf writes), indices of 32 bits.
+A file has one node (with a translation, where it lies far from the origin), one primitive of triangles, positions,
+perhaps normals (without them it is flat), perhaps colors (as displays show them, like all meshes that regnf writes),
+indices of 32 bits.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from regnf_core.schema.similarity import local_origin
 
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _BYTE, _INDEX = 5126, 5121, 5125
@@ -30,6 +33,7 @@ class _Form:
     colors: bool
     low: tuple[float, ...]
     high: tuple[float, ...]
+    origin: tuple[float, float, float] | None
 
     @property
     def sections(self) -> list[tuple[str, int]]:
@@ -55,7 +59,7 @@ class _Form:
             "asset": {"version": "2.0", "generator": "regnf"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
+            "nodes": [{"mesh": 0} if self.origin is None else {"mesh": 0, "translation": list(self.origin)}],
             "meshes": [{"primitives": [primitive]}],
             "accessors": accessors,
             "bufferViews": views,
@@ -82,9 +86,14 @@ def mesh_file(
     normals: NDArray[Any] | None = None,
     colors: NDArray[Any] | None = None,
 ) -> bytes:
-    """The GLB of a mesh. vertices, normals: (V, 3) · faces: (F, 3) · colors: (V, 3) in [0, 1]."""
-    points = np.ascontiguousarray(vertices, "<f4")
-    form = _form(points, len(faces), normals is not None, colors is not None)
+    """The GLB of a mesh. vertices, normals: (V, 3) · faces: (F, 3) · colors: (V, 3) in [0, 1].
+
+    Positions have single precision. So of vertices far from the origin the node's translation has the larger part.
+    """
+    origin = local_origin([vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()])
+    points = np.ascontiguousarray(vertices if origin is None else vertices - np.array(origin), "<f4")
+    low, high = (tuple(float(end) for end in ends) for ends in (points.min(axis=0), points.max(axis=0)))
+    form = _Form(len(points), len(faces), normals is not None, colors is not None, low, high, origin)
     parts = [points.tobytes()]
     if normals is not None:
         parts.append(np.ascontiguousarray(normals, "<f4").tobytes())
@@ -97,8 +106,3 @@ def mesh_file(
     whole = _HEAD.size + len(text) + 8 + len(data)
     head = _HEAD.pack(_MAGIC, 2, whole, len(text), _JSON) + text + struct.pack("<2I", len(data), _BINARY)
     return head + data
-
-
-def _form(points: NDArray[Any], triangles: int, normals: bool, colors: bool) -> _Form:
-    low, high = (tuple(float(end) for end in ends) for ends in (points.min(axis=0), points.max(axis=0)))
-    return _Form(len(points), triangles, normals, colors, low, high)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from regnf_core.errors import DatasetError
+from regnf_core.importing.observing.trajectory import rolled_quaternions
 from regnf_data.posed_images import PosedImages
 
 Floats = NDArray[np.float64]
@@ -37,6 +38,10 @@ _NO_DOUBT = 0.07
 """Of places that contradict: good recordings of random worlds, of two to sixty images, have up to so many."""
 _WARNED = 0.25
 """Of places that contradict, where no other convention makes them agree: several times as many as noise leaves."""
+_ENOUGH = 5
+"""Images that share nothing as they are: fewer agree by one of the many conventions and scales by chance."""
+_BEYOND = 100.0
+"""Times as large as the right depths: there shifts of the cameras count for nothing."""
 _TRIED = 6
 _MORE = 0.7
 """A second change is made where it leaves at most this share of what the first one left."""
@@ -128,7 +133,7 @@ def check_agreement(images: PosedImages) -> str | None:
     if found.places >= _FEWEST and found.disagreement < _SUSPECT:
         return None
     best, other = _search(stated, sample)
-    if best is not stated and _clearly_better(other, found):
+    if best is not stated and _clearly_better(other, found, len(images)) and _tells_depth(best, other, sample):
         wrong, mend = best.told()
         raise DatasetError(
             f"the images contradict each other: {found.said()}. With {wrong}: {other.said()}",
@@ -140,11 +145,22 @@ def check_agreement(images: PosedImages) -> str | None:
     return f"FRAMES_DISAGREE: {found.said()}: poses, intrinsics or depths are wrong, or things moved"
 
 
-def _clearly_better(other: Agreement, found: Agreement) -> bool:
+def _tells_depth(views: _Views, agreement: Agreement, sample: _Sample) -> bool:
+    """Whether a factor above 1 is more than a way to be rid of the cameras' places: beside depths that are large
+    enough, shifts count for nothing, and images of one distant wall agree by their turns alone."""
+    if views.factor <= 1.0:
+        return True
+    farther = sample.agreement(replace(views, factor=_BEYOND * views.factor))
+    return agreement.disagreement <= _CLEAR * farther.disagreement
+
+
+def _clearly_better(other: Agreement, found: Agreement, images: int) -> bool:
     """Whether images that agree as ``other`` says, by another convention, refute the one that ``found`` is of."""
     if other.agreeing < max(_FEWEST, found.agreeing) or other.disagreement > _MOST_LEFT:
         return False
     if found.places < _FEWEST:  # there is nothing to compare with: the other one must leave no doubt
+        if images < _ENOUGH:
+            return False
         return other.disagreement < _SUSPECT and other.contradicting < _NO_DOUBT * other.places
     less = other.contradicting / other.places <= _CLEAR * found.contradicting / found.places
     return less and other.disagreement <= _CLEAR * found.disagreement
@@ -246,6 +262,9 @@ def _other_poses(views: _Views) -> Iterator[_Views]:
             if inverted or not np.array_equal(axes, np.eye(3)):
                 changed = replace(views, poses=(inverse if inverted else views.poses) @ turn)
                 yield changed.because(*_of_axes(axes, inverted))
+    for step, wrong in ((-1, "quaternions written w first"), (1, "quaternions x y z w that were read w first")):
+        rolled = replace(views, poses=rolled_quaternions(views.poses, step))
+        yield rolled.because(wrong, "make the matrices of quaternions anew, in the order that they are written in")
     count = len(views.poses)
     by_name = np.argsort([str(number) for number in range(count)], kind="stable")
     orders = {

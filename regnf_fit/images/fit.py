@@ -29,7 +29,6 @@ from regnf_fit.images.color_export import stored_color
 from regnf_fit.images.coloring import SurfaceColor, fit_color
 from regnf_fit.images.held_out import evaluate
 from regnf_fit.images.held_out_images import held_out_images, likeness
-from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.map_distances import MapDistances, map_distances
 from regnf_fit.images.network import RadianceField
 from regnf_fit.images.observing import observe
@@ -37,6 +36,7 @@ from regnf_fit.images.options import ReconstructionOptions, ReconstructionReport
 from regnf_fit.images.preparation import PreparedImages, prepare
 from regnf_fit.images.sdfstudio_export import write_sdfstudio
 from regnf_fit.images.trainer import Trainer
+from regnf_fit.local_frame import LocalFrame
 from regnf_fit.network import GRID_RADIUS
 from regnf_fit.options import FitProgress
 
@@ -81,7 +81,7 @@ def reconstruct(
     rng = np.random.default_rng(seed)
     key = _key(images, options, seed)
     check_bounds(images.bounds)
-    frame = LocalFrame.in_grid(images, GRID_RADIUS)
+    frame = LocalFrame.in_grid(images.bounds, GRID_RADIUS)
     given, images = images, frame.enter(images)
     prepared = prepare(images, options.start, rng, given)
     options = suited(options, prepared)

@@ -20,12 +20,12 @@ from regnf_core.schema.safe_format import read_description, write_safe_field
 from regnf_data.fusing import Progress
 from regnf_data.posed_images import PosedImages
 from regnf_fit.images.checks import check_bounds
-from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.measured import ends_of, measured_rays
 from regnf_fit.images.measured_map import MapSize, map_grid, write_map
 from regnf_fit.images.observing import attach_observation
 from regnf_fit.images.preparation import prepare
 from regnf_fit.images.rays import PixelRays
+from regnf_fit.local_frame import LocalFrame
 
 _CHECKED = 20_000
 
@@ -68,7 +68,7 @@ def fuse_images(
     if images.depths is None:
         raise DatasetError("images without depths cannot be fused", reason="DATASET_DEPTH_MISSING")
     check_bounds(images.bounds)
-    frame = LocalFrame.near_origin(images)
+    frame = LocalFrame.near_origin(images.bounds)
     given, images = images, frame.enter(images)
     prepared = prepare(images, "auto", np.random.default_rng(0), given)
     rays = measured_rays(prepared)

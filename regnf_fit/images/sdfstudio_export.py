@@ -13,8 +13,8 @@ import yaml
 from torch import Tensor
 
 from regnf_core.files import atomic_path
-from regnf_fit.images.local_frame import LocalFrame
 from regnf_fit.images.network import RadianceField
+from regnf_fit.local_frame import LocalFrame
 from regnf_fit.network import POSITION_DEGREE
 
 _EMBEDDING = 32

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import os
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
+from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.safe_format import write_safe_field
+from regnf_fit.local_frame import LocalFrame
 from regnf_fit.mesh.options import FitOptions, FitReport
 from regnf_fit.mesh.samples import ExactSamples, diagonal, near_samples, padded_bounds, volume_samples
 from regnf_fit.network import GRID_RADIUS, StartShape, TrainableField, make_optimizer
@@ -34,22 +37,24 @@ def fit_field(
 ) -> FitReport:
     """Fit a field to ``target``, write it to ``path`` in the safe format, and say how well it agrees.
 
-    The target's frame is kept: its padded bounds must lie within [-2, 2]^3, the hash grid's cube. Deterministic for
-    ``seed`` on one machine. Raises InvalidInputError (TARGET_OUTSIDE_GRID, NO_SURFACE_IN_TARGET).
+    The target's frame is kept: where its padded bounds reach beyond [-2, 2]^3, the hash grid's cube, it is fitted in a
+    frame of its own, and placed. Deterministic for ``seed`` on one machine.
+    Raises InvalidInputError (NO_SURFACE_IN_TARGET).
     """
     options = options or FitOptions()
-    if padded_bounds(target, options.padding).abs().max() > GRID_RADIUS:
-        raise InvalidInputError(
-            "the target with its padding reaches beyond [-2, 2]: scale it down", reason="TARGET_OUTSIDE_GRID"
-        )
+    frame = LocalFrame.in_grid(padded_bounds(target, options.padding).numpy(), GRID_RADIUS)
+    T_target_local = Sim3.from_matrix(frame.T_world_local.tolist())
+    target = target if frame.same else TransformedField(target, T_target_local)
     started = time.monotonic()
     rng = np.random.default_rng(seed)
     near = near_samples(target, options.near_points, options.noise, rng)
     volume = volume_samples(target, options.volume_points, options.padding, rng)
     trained = _train(target, near, volume, options, seed, progress)
     description = trained.description(padded_bounds(target, options.margin), label, source or {})
-    write_safe_field(path, description, trained.tensors())
-    return measure_fit(open_field(path), target, options, seed + 1, time.monotonic() - started)
+    write_safe_field(path, frame.leave(description), trained.tensors())
+    field = open_field(path) if frame.same else TransformedField(open_field(path), T_target_local)
+    report = measure_fit(field, target, options, seed + 1, time.monotonic() - started)
+    return replace(report, diagonal=report.diagonal / frame.scale)
 
 
 def measure_fit(field: SdfField, target: SdfField, options: FitOptions, seed: int, seconds: float) -> FitReport:

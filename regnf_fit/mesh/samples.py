@@ -12,6 +12,7 @@ from torch import Tensor
 from regnf_core.errors import InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.composite import SurfaceSource
+from regnf_core.fields.transformed import TransformedField
 
 _PROJECTION_STEPS = 3
 
@@ -65,6 +66,10 @@ def _measure(target: SdfField, points: NDArray[np.float64]) -> ExactSamples:
 
 def _surface_points(target: SdfField, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Surface points (M, 3): the target's own, or else points of its bounds carried down its gradient."""
+    if isinstance(target, TransformedField) and isinstance(target.field, SurfaceSource):
+        points = torch.from_numpy(_surface_points(target.field, count, rng))
+        moved: NDArray[np.float64] = target.T_field_frame.inverse().apply(points).numpy()
+        return moved
     if isinstance(target, SurfaceSource):
         if not target.area > 0.0:
             raise InvalidInputError("the target's surface has no area", reason="NO_SURFACE_IN_TARGET")

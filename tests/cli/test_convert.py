@@ -123,3 +123,5 @@ def test_a_mesh_is_observed_from_where_its_cameras_stood(run: Run, tmp_path: Pat
         outcome = run("convert", tmp_path / "ball.glb", safe, *options)
         assert outcome.code != 0
         assert reason in outcome.stderr
+    turned = run("convert", tmp_path / "ball.glb", safe, *refusals["CAMERAS_OF_ANOTHER_FRAME"])
+    assert "say --camera-axes opencv" in " ".join(turned.stderr.split())

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from regnf_core.importing.arrays import Float32Array, tensor_error
+from regnf_core.schema.similarity import local_origin
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -42,6 +43,17 @@ def filled_nodes(values: Float32Array, seen: BoolArray, spacing: npt.NDArray[np.
     distance, nearest = ndimage.distance_transform_edt(~seen, sampling=tuple(spacing), return_indices=True)
     filled: Float32Array = values[tuple(nearest)] + np.float32(outward) * distance.astype(np.float32)
     return filled
+
+
+def near_blocks(blocks: IntArray, length: float) -> tuple[IntArray, list[float] | None]:
+    """Blocks (B, 3) of edge ``length`` with whole numbers subtracted where they lie far from the origin, and the place
+    that was subtracted; None: nothing."""
+    low, high = blocks.min(axis=0), blocks.max(axis=0) + 1
+    origin = local_origin([(length * corner).tolist() for corner in (low, high)])
+    if origin is None:
+        return blocks, None
+    steps = np.round(np.array(origin) / length).astype(np.int64)
+    return blocks - steps, (length * steps).tolist()
 
 
 def seen_extent(blocks: IntArray, seen: BoolArray) -> tuple[IntArray, IntArray]:

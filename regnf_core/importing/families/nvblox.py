@@ -11,9 +11,16 @@ from regnf_core.errors import FieldFormatError
 from regnf_core.importing.arrays import Float32Array, StoredArray, finite_float32, tensor_error
 from regnf_core.importing.containers.euclidean import PROJECTIVE, bound_by_surface
 from regnf_core.importing.containers.sqlite_source import TableSource
-from regnf_core.importing.containers.voxel_maps import BoolArray, IntArray, fill_unseen, seen_extent, stored_weights
+from regnf_core.importing.containers.voxel_maps import (
+    BoolArray,
+    IntArray,
+    fill_unseen,
+    near_blocks,
+    seen_extent,
+    stored_weights,
+)
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import entries_at, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "nvblox"
@@ -36,14 +43,15 @@ def convert_database(tables: TableSource, tensor_bytes: int, overrides: UploadDe
     refuse_other_entries(overrides, FAMILY)
     voxel_size = _block_size(tables, layer) / _EDGE
     blocks, values, weights = _read(tables, layer, tensor_bytes)
+    blocks, origin = near_blocks(blocks, _EDGE * voxel_size)
     seen: BoolArray = weights > 0
     projective = bound_by_surface(values, seen, blocks, voxel_size)
     fill_unseen(values, seen, voxel_size, overrides.sign or 1)
-    low, high = seen_extent(blocks, seen)
     middle = voxel_size / 2.0
+    low, high = (middle + voxel_size * corner + (origin or [0.0] * 3) for corner in seen_extent(blocks, seen))
     description = {
         "kind": "voxel_blocks",
-        **shared_entries(overrides, [(middle + voxel_size * corner).tolist() for corner in (low, high)]),
+        **entries_at(shared_entries(overrides, [low.tolist(), high.tolist()]), origin),
         "origin": [middle] * 3,
         "voxel_size": voxel_size,
         "source": {"family": FAMILY},

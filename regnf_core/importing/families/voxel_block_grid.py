@@ -21,13 +21,14 @@ from regnf_core.importing.containers.npz import ArraySource
 from regnf_core.importing.containers.voxel_maps import (
     IntArray,
     fill_unseen,
+    near_blocks,
     require_shape_of_blocks,
     seen_extent,
     stored_weights,
 )
 from regnf_core.importing.families.color.head import with_values
 from regnf_core.importing.families.converted import ConvertedField
-from regnf_core.importing.families.shared import refuse_other_entries, require_family, shared_entries
+from regnf_core.importing.families.shared import entries_at, refuse_other_entries, require_family, shared_entries
 from regnf_core.importing.upload_description import UploadDescription
 
 FAMILY = "open3d_voxel_block_grid"
@@ -44,7 +45,7 @@ _T = TypeVar("_T", bound=np.generic)
 
 @dataclass(frozen=True)
 class _Blocks:
-    """tsdf: (B, R, R, R), cut off at 1, and how much was seen of the voxels, both x first · keys: (B, 3)."""
+    """tsdf: (B, R, R, R), cut off at 1, and how much was seen of the voxels, both x first · keys: (B, 3), near 0."""
 
     tsdf: Float32Array
     weights: Float32Array
@@ -52,6 +53,8 @@ class _Blocks:
     voxel_size: float
     kept: npt.NDArray[np.bool_]
     """Which of the file's blocks they are."""
+    origin: list[float] | None
+    """What was subtracted from the file's places; None: nothing."""
 
 
 def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField | None:
@@ -68,10 +71,10 @@ def convert(arrays: ArraySource, overrides: UploadDescription) -> ConvertedField
     seen = blocks.weights > 0
     values, reasons, warnings = _distances(blocks, seen, overrides)
     fill_unseen(values, seen, blocks.voxel_size, overrides.sign or 1)
-    low, high = seen_extent(blocks.keys, seen)
+    low, high = (blocks.voxel_size * corner + (blocks.origin or [0.0] * 3) for corner in seen_extent(blocks.keys, seen))
     description = {
         "kind": "voxel_blocks",
-        **shared_entries(overrides, [(blocks.voxel_size * corner).tolist() for corner in (low, high)]),
+        **entries_at(shared_entries(overrides, [low.tolist(), high.tolist()]), blocks.origin),
         "voxel_size": blocks.voxel_size,
         "source": {"family": FAMILY},
     }
@@ -113,7 +116,8 @@ def _read(arrays: ArraySource) -> _Blocks:
     kept = (weights > 0).any(axis=(1, 2, 3))
     if not kept.any():
         raise tensor_error("no voxel was ever seen: all weights are zero", "TENSOR_SHAPE")
-    return _Blocks(tsdf[kept], weights[kept], keys[kept], voxel_size, np.asarray(kept))
+    near, origin = near_blocks(keys[kept], edge * voxel_size)
+    return _Blocks(tsdf[kept], weights[kept], near, voxel_size, np.asarray(kept), origin)
 
 
 def _distances(

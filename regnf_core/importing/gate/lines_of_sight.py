@@ -24,7 +24,6 @@ from regnf_core.schema.observation_grid import OBSERVATION, ObservationGrid
 from regnf_core.schema.parsing import parse_description
 from regnf_core.surface.observing import observe_by_cameras
 
-Observed = tuple[ObservationGrid, npt.NDArray[np.int32]]
 _SHARE = 0.5
 """Of the seconds that the checks may take; as many again may go into this."""
 _MOST_POINTS, _LEAST_POINTS = 5_000_000, 60_000
@@ -37,19 +36,23 @@ def observed_by_cameras(
     trajectory: Trajectory,
     said: UploadDescription,
     limits: ImportLimits,
-) -> Observed:
-    """What the cameras saw of the field of ``description``, as its file keeps it, within an estimated time.
+) -> tuple[ObservationGrid, npt.NDArray[np.int32], str | None]:
+    """What the cameras saw of the field of ``description``, as its file keeps it, within an estimated time; a warning.
 
     Raises FieldFormatError: CAMERAS_OF_ANOTHER_FRAME, IMPORT_TOO_COSTLY, FIELD_NOT_FINITE.
     """
     own = {name: array for name, array in tensors.items() if name != OBSERVATION}
     points = _points(description, own, limits)
     field = _own_field(description, own)
-    cameras = trajectory.pinhole().moved(torch.from_numpy(_into_function(description, trajectory, said)))
+    T_function_file = torch.from_numpy(_into_function(description, trajectory, said))
+    others = [
+        (f"{name}: {mend}", other.pinhole().moved(T_function_file)) for name, mend, other in trajectory.otherwise()
+    ]
     try:
-        return observe_by_cameras(field, cameras, points).stored()
+        seen, doubt = observe_by_cameras(field, trajectory.pinhole().moved(T_function_file), points, others)
     except InvalidInputError as error:
         raise FieldFormatError(str(error), reason=error.reason) from error
+    return (*seen.stored(), doubt)
 
 
 def _points(description: Mapping[str, Any], tensors: Mapping[str, StoredArray], limits: ImportLimits) -> int:

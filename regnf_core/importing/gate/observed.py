@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from regnf_core.errors import FieldFormatError
@@ -50,5 +51,9 @@ def _by_cameras(
     from regnf_core.importing.gate.plausibility import without_new_code  # loads torch
 
     with without_new_code():
-        found = observed_by_cameras(converted.description, converted.tensors, cameras, read.description, limits)
-    return observed_field(converted, *found, f"by lines of sight from {len(cameras)} cameras")
+        grid, words, doubt = observed_by_cameras(
+            converted.description, converted.tensors, cameras, read.description, limits
+        )
+    if doubt is not None:
+        converted = replace(converted, warnings=(*converted.warnings, doubt))
+    return observed_field(converted, grid, words, f"by lines of sight from {len(cameras)} cameras")

@@ -122,7 +122,7 @@ def _of_arrays(name: str, arrays: ArraySource, said: CamerasDescription) -> Traj
         intrinsics.append(Intrinsics(K[0, 0], K[1, 1], K[0, 2], K[1, 2], width, height))
     if not poses:
         return None
-    return trajectory_of(name, np.stack(poses), _said(said) or intrinsics, "opencv", np.eye(4))
+    return trajectory_of(name, np.stack(poses), _said(said) or intrinsics, None, np.eye(4))
 
 
 def _said(said: CamerasDescription) -> Intrinsics | None:

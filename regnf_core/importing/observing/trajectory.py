@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Axes = Literal["opencv", "opengl"]
 """opencv: x right, y down, z forward. opengl: x right, y up, z backward."""
+_TURNS: dict[Axes, Array] = {"opencv": np.eye(4), "opengl": np.diag([1.0, -1.0, -1.0, 1.0])}
+BODY: Array = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""From a camera to the body that holds it, whose x is forward and z up."""
 MOST_CAMERAS = 20_000
 _FARTHEST = 1e8
 """Geodetic coordinates reach ten million meters; poses are kept in double precision."""
@@ -40,13 +44,15 @@ class Intrinsics:
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """poses: (N, 4, 4), camera to the file's world, opencv · focal, middle: (N, 2), over the image's width and height ·
-    aspect: (N,) · T_dataset_file: (4, 4), from the file's world to the dataset's, where they differ."""
+    aspect: (N,) · T_dataset_file: (4, 4), from the file's world to the dataset's, where they differ · axes: by which
+    the file's matrices were read; None where the file itself tells the axes."""
 
     poses: Array
     focal: Array
     middle: Array
     aspect: Array
     T_dataset_file: Array | None = None
+    axes: Axes | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -60,12 +66,34 @@ class Trajectory:
         parts = (self.poses[:, :3, 3], self.poses[:, :3, :3], self.focal, self.middle, self.aspect)
         return PinholeCameras(*(torch.from_numpy(np.ascontiguousarray(part)) for part in parts))
 
+    def otherwise(self) -> Iterator[tuple[str, str, Trajectory]]:
+        """Other conventions that the file may follow, the usual ones first: each what it is, what to do about it, and
+        the cameras by it."""
+        if self.axes is None:
+            return
+        stated, other = _TURNS[self.axes], _TURNS["opengl" if self.axes == "opencv" else "opencv"]
+        matrices = self.poses @ stated  # a half turn undoes itself
+        inverse = np.linalg.inv(matrices)
+        name = "along z (OpenCV's axes)" if self.axes == "opengl" else "against z (OpenGL's axes)"
+        flag = "opencv" if self.axes == "opengl" else "opengl"
+        say, invert = f"say --camera-axes {flag} (in a description: cameras.axes)", "invert the matrices of the file"
+        looking, inverted = f"cameras that look {name}", "poses from the world to the camera"
+        wrong = {
+            looking: (say, matrices @ other),
+            inverted: (invert, inverse @ stated),
+            f"{inverted} and {looking}": (f"{invert}, and {say}", inverse @ other),
+            "quaternions written w first": ("write quaternions as x y z w", rolled_quaternions(matrices, -1) @ stated),
+            "cameras that look along x (a robot's body)": ("turn the cameras' axes: z is forward", matrices @ BODY),
+        }
+        for words, (mend, poses) in wrong.items():
+            yield words, mend, replace(self, poses=poses)
+
 
 def trajectory_of(
     name: str,
     poses: Array,
     intrinsics: list[Intrinsics] | Intrinsics,
-    axes: Axes,
+    axes: Axes | None,
     T_dataset_file: Array | None = None,
 ) -> Trajectory:
     """Checked. poses: (N, 4, 4), by ``axes``; those with numbers that are not finite, of lost cameras, are left out.
@@ -77,8 +105,7 @@ def trajectory_of(
     poses = poses[kept].copy()
     if not len(poses):
         raise malformed(f"{name} holds no camera's pose")
-    if axes == "opengl":
-        poses[:, :, 1:3] *= -1.0
+    poses = poses @ _TURNS[axes or "opencv"]
     _require_rigid(name, poses)
     K = np.array([[one.fx, one.fy, one.cx, one.cy, one.width, one.height] for one in each], np.float64)[kept]
     size = K[:, 4:6]
@@ -89,7 +116,17 @@ def trajectory_of(
     sound &= (np.abs(middle - 0.5) <= 1.0).all(1) & (aspect > 0.05) & (aspect < 20.0)
     if not sound.all():
         raise malformed(f"{name}: the intrinsics of camera {int(np.flatnonzero(~sound)[0])} are no camera's")
-    return Trajectory(poses, focal, middle, aspect, T_dataset_file)
+    return Trajectory(poses, focal, middle, aspect, T_dataset_file, axes)
+
+
+def rolled_quaternions(poses: Array, step: int) -> Array:
+    """Poses (N, 4, 4) of quaternions x y z w whose numbers stand in another order. step: -1, they were written as
+    w x y z; 1, they were taken for that."""
+    from scipy.spatial.transform import Rotation
+
+    rolled, quaternions = poses.copy(), Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    rolled[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, step, axis=1)).as_matrix()
+    return rolled
 
 
 def _require_rigid(name: str, poses: Array) -> None:

@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
-from regnf_core import Camera, Insertion, Removal, RenderOptions, Replacement, Sim3, Substitution, compose, render
+from regnf_core import (
+    Camera,
+    Insertion,
+    Removal,
+    RenderOptions,
+    Replacement,
+    Sim3,
+    Substitution,
+    compose,
+    open_field,
+    render,
+)
+from regnf_core.editing.edits import Edit
 from regnf_core.editing.measured_matter import without_unseen
 from regnf_core.editing.parts import SCENE_PART
 from regnf_core.editing.standing import standing_alike
+from regnf_core.editing.storing import write_field
 from regnf_core.errors import NoSurfaceError, RegnfError
-from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import Observation, ObservedField, observation_of
+from regnf_core.fields.transformed import TransformedField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.schema.observation_grid import SURFACE
 from tests.core.analytic import AnalyticField, boxes, sphere, union
@@ -282,3 +299,73 @@ def test_matter_that_nobody_saw_goes() -> None:
     assert torch.allclose(distance, torch.tensor([-0.02, 0.02]), atol=1e-4)
     assert (gradient[:, 2] > 0.99).all()
     assert isinstance(without_unseen(sphere(0.5)), AnalyticField)
+
+
+UTM = torch.tensor([448_262.25, 5_413_920.5, 112.0], dtype=torch.float64)
+
+
+def far(field: SdfField) -> SdfField:
+    """The field at ``UTM``, as an import places it."""
+    return TransformedField(field, Sim3.from_translation(-UTM))
+
+
+def edits_at(shift: torch.Tensor) -> list[Edit]:
+    """A removal and an insertion in the room of ``room``, from whose places ``shift`` was added."""
+    back = Sim3.from_translation(-shift)
+    gone = OrientedBox.from_corners([-0.22, -0.22, -0.01], [0.22, 0.22, 0.38]).shifted(shift)
+    T = turned() @ Sim3.from_translation(torch.tensor([-0.5, 0.4, 0.0], dtype=torch.float64)) @ back
+    return [Removal(detection=gone), Insertion(stool(turned()), T, tint=(0.9, 0.1, 0.1))]
+
+
+def observed_room() -> ObservedField:
+    states = torch.full((20, 20, 11), SURFACE, dtype=torch.uint8)
+    return ObservedField(room(*STOOL), Observation(states, torch.tensor([-1.0, -1.0, -0.1]).double(), 0.1))
+
+
+def test_a_scene_far_from_the_origin_is_edited_as_the_same_one_near_it(tmp_path: Path) -> None:
+    scene = observed_room()
+    near, there = compose(scene, edits_at(torch.zeros(3).double())), compose(far(scene), edits_at(UTM))
+    points = free_points().double()
+    distance, gradient = near.signed_distance_and_gradient(points)
+    moved, slope = there.signed_distance_and_gradient(points + UTM)
+    torch.testing.assert_close(moved, distance, atol=2e-6, rtol=0.0)
+    assert ((slope - gradient).abs().amax(-1) < 1e-3).float().mean() > 0.99  # but for edges
+    assert torch.equal(there.part_at(points + UTM), near.part_at(points))
+    torch.testing.assert_close(there.places[1].center, near.places[1].center + UTM, atol=1e-8, rtol=0.0)
+    torch.testing.assert_close(there.bounds, near.bounds + UTM, atol=1e-8, rtol=0.0)
+    assert near.observation is not None
+    assert there.observation is not None
+    assert torch.equal(there.observation.at(points + UTM), near.observation.at(points))
+    for field, name in ((near, "near"), (there, "far")):
+        write_field(field, tmp_path / name, 40)
+    stored, stored_far = open_field(tmp_path / "near"), open_field(tmp_path / "far")
+    torch.testing.assert_close(
+        stored_far.signed_distance(points + UTM), stored.signed_distance(points), atol=2e-6, rtol=0
+    )
+    kept = observation_of(stored_far)
+    assert kept is not None
+    assert torch.equal(kept.at(points + UTM), near.observation.at(points))
+
+
+def test_an_edited_scene_far_from_the_origin_is_rendered_with_its_parts_and_edited_again() -> None:
+    frames = []
+    for scene, shift in ((room(*STOOL), torch.zeros(3).double()), (far(room(*STOOL)), UTM)):
+        edited = compose(scene, edits_at(shift))
+        again = compose(
+            edited, [Insertion(sphere(0.1), Sim3.from_translation(-shift - torch.tensor([-0.4, -0.4, 0.1])))]
+        )
+        place = torch.tensor([0.9, -0.9, 0.7]).double() + shift
+        camera = Camera.look_at(place, shift + torch.tensor([0.2, -0.2, 0.2]), (48, 36), 60.0)
+        frames.append(render(again, camera, RenderOptions(tints=True, cut_away=True)))
+    near, there = frames
+    assert len(np.unique(near.part)) >= 3
+    assert (near.part == there.part).mean() > 0.99
+    assert np.median(np.abs(near.depth - there.depth)) < 1e-5
+    assert (np.abs(near.color.astype(int) - there.color).max(-1) < 4).mean() > 0.98
+
+
+def test_matter_that_nobody_saw_goes_far_from_the_origin_as_well() -> None:
+    scene = observed_room()
+    points = free_points(500).double()
+    expected = without_unseen(scene).signed_distance(points)
+    torch.testing.assert_close(without_unseen(far(scene)).signed_distance(points + UTM), expected, atol=2e-6, rtol=0.0)

@@ -110,7 +110,7 @@ SEEN = np.tile(np.array([0.1, 1.0], "<f4"), 512).tobytes()
         ([(0, 0, 0, None)], 0.4, "TENSOR_SHAPE"),
         ([(0, 0, 0.5, SEEN)], 0.4, "TENSOR_SHAPE"),
         ([(1 << 40, 0, 0, SEEN)], 0.4, "TENSOR_SHAPE"),
-        ([(1 << 25, 0, 0, SEEN)], 0.4, "FIELD_INDEX_INVALID"),
+        ([(0, 0, 0, SEEN), (1 << 25, 0, 0, SEEN)], 0.4, "FIELD_INDEX_INVALID"),
         ([(0, 0, 0, np.tile(np.array([np.nan, 1.0], "<f4"), 512).tobytes())], 0.4, "TENSOR_NOT_FINITE"),
         ([(0, 0, 0, SEEN)], 0.4, "NO_ZERO_LEVEL"),
         ([(0, 0, 0, bytes(2 << 20))], 0.4, "SQLITE_MALFORMED"),
@@ -246,3 +246,18 @@ def test_damage_anywhere_is_refused_or_does_no_harm(tmp_path: Path) -> None:
         except FieldFormatError:
             refused += 1
     assert 10 < refused < 150
+
+
+def test_a_map_far_from_the_origin_is_the_same_map(tmp_path: Path) -> None:
+    blocks = np.array([1_250_000, -9_000_001, 300])
+    far_rows = [(*(int(i) for i in blocks + row[:3]), row[3]) for row in ball_blocks()]
+    fields = []
+    for name, rows in (("near", ball_blocks()), ("far", far_rows)):
+        (tmp_path / name).mkdir()
+        convert_file(write_map(tmp_path / name / "map.nvblx", rows), tmp_path / name, None, ImportLimits())
+        fields.append(open_field(tmp_path / name / FIELD_NAME))
+    near, far = fields
+    shift = torch.from_numpy(blocks * (8 * SIZE))
+    points = torch.from_numpy(CENTER + np.random.default_rng(0).uniform(-RADIUS, RADIUS, (500, 3)))
+    torch.testing.assert_close(far.signed_distance(points + shift), near.signed_distance(points), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(far.bounds, near.bounds + shift, atol=1e-6, rtol=0.0)

@@ -305,3 +305,23 @@ def test_colors_are_kept(tmp_path: Path) -> None:
     (tmp_path / "black").mkdir()
     converted(tmp_path / "black", ball())
     assert not has_color(open_field(tmp_path / "black" / FIELD_NAME))
+
+
+FAR = np.array([1_250_000, -9_000_001, 300])
+"""Blocks: half a million meters, and more."""
+
+
+def test_a_map_far_from_the_origin_is_the_same_map(tmp_path: Path) -> None:
+    near_folder, far_folder = tmp_path / "near", tmp_path / "far"
+    near_folder.mkdir()
+    far_folder.mkdir()
+    converted(near_folder, ball())
+    converted(far_folder, ball() | {"key": ball()["key"] + FAR.astype(np.int32)})
+    near, far = (open_field(folder / FIELD_NAME) for folder in (near_folder, far_folder))
+    shift = torch.from_numpy(FAR * EDGE * float(np.float32(SIZE)))
+    points = torch.from_numpy(near_surface(500))
+    distance, gradient = near.signed_distance_and_gradient(points)
+    moved, slope = far.signed_distance_and_gradient(points + shift)
+    torch.testing.assert_close(moved, distance, atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(slope, gradient, atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(far.bounds, near.bounds + shift, atol=1e-6, rtol=0.0)

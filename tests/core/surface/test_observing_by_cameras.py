@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.composite import BoxField, UnionField
 from regnf_core.fields.observation import Observation
 from regnf_core.geometry.pinhole import PinholeCameras
+from regnf_core.importing.observing.trajectory import Array, Axes, Intrinsics, Trajectory, trajectory_of
 from regnf_core.schema.observation_grid import FREE, SURFACE, UNSEEN
 from regnf_core.surface.observing import observe_by_cameras
 
@@ -68,7 +73,7 @@ def slowly_free(field: UnionField, cameras: PinholeCameras, points: Tensor, clos
 
 @pytest.fixture(scope="module")
 def observation() -> Observation:
-    return observe_by_cameras(room(), walk(9), POINTS)
+    return observe_by_cameras(room(), walk(9), POINTS)[0]
 
 
 def middles(observation: Observation, index: Tensor) -> Tensor:
@@ -119,14 +124,14 @@ def test_surface_that_a_line_of_sight_leads_to_is_observed(observation: Observat
 
 
 def test_fewer_evaluations_make_larger_voxels(observation: Observation) -> None:
-    coarse = observe_by_cameras(room(), walk(9), 100_000)
+    coarse, _ = observe_by_cameras(room(), walk(9), 100_000)
     assert coarse.voxel > 1.5 * observation.voxel
     points = middles(coarse, drawn(coarse, FREE, 150))
     assert float(slowly_free(room(), walk(9), points, 0.0).float().mean()) >= 0.97
 
 
 def test_the_same_cameras_observe_the_same() -> None:
-    first, second = (observe_by_cameras(room(), walk(4), 100_000) for _ in range(2))
+    first, second = (observe_by_cameras(room(), walk(4), 100_000)[0] for _ in range(2))
     assert torch.equal(first.states, second.states)
     assert torch.equal(first.low, second.low)
 
@@ -155,3 +160,59 @@ def test_a_similarity_moves_cameras_as_it_moves_points() -> None:
     assert torch.allclose(2.5 * depth, moved_depth)
     rays = cameras.directions(1, places)
     assert torch.allclose(cameras.positions[1] + depth[:, None] * rays, points)
+
+
+def trajectory(cameras: PinholeCameras, axes: Axes, change: Callable[[Array], Array]) -> Trajectory:
+    """The cameras of a file that was read by ``axes``, and whose matrices are those of ``cameras`` but for a change."""
+    poses = np.tile(np.eye(4), (len(cameras), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = cameras.axes.numpy(), cameras.positions.numpy()
+    K = Intrinsics(float(cameras.focal[0, 0]), float(cameras.focal[0, 1]), 0.5, 0.5, 1.0, 1.0)
+    return trajectory_of("poses", change(poses), K, axes)
+
+
+def as_w_first(poses: Array) -> Array:
+    """What poses become whose quaternions are written as w x y z and read as x y z w."""
+    changed = poses.copy()
+    w_first = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    changed[:, :3, :3] = Rotation.from_quat(w_first).as_matrix()
+    return changed
+
+
+HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+FORWARD_X = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+MISREAD: dict[str, tuple[Axes, Callable[[Array], Array], str]] = {
+    "OpenGL": ("opencv", lambda T: T @ HALF_TURN, "against z.*say --camera-axes opengl"),
+    "OpenCV": ("opengl", lambda T: T, "along z.*say --camera-axes opencv"),
+    "inverted": ("opencv", np.linalg.inv, "world to the camera: invert the matrices"),
+    "inverted, OpenGL": ("opengl", lambda T: np.linalg.inv(T @ HALF_TURN), "world to the camera: invert the matrices"),
+    "inverted, OpenGL read as OpenCV": ("opencv", lambda T: np.linalg.inv(T @ HALF_TURN), "invert.*and say --camera"),
+    "a body": ("opencv", lambda T: T @ FORWARD_X, "along x .*turn the cameras' axes"),
+}
+
+
+def others(read: Trajectory) -> list[tuple[str, PinholeCameras]]:
+    return [(f"{name}: {mend}", other.pinhole()) for name, mend, other in read.otherwise()]
+
+
+@pytest.mark.parametrize("name", list(MISREAD))
+def test_the_convention_that_the_field_agrees_with_is_named(name: str) -> None:
+    axes, change, told = MISREAD[name]
+    read = trajectory(walk(9), axes, change)
+    try:
+        _, said = observe_by_cameras(room(), read.pinhole(), 100_000, others(read))
+    except FieldFormatError as error:  # most of them see nothing
+        said = str(error)
+    assert re.search(told, said or "")
+
+
+def test_quaternions_in_another_order_are_tried() -> None:
+    right, read = walk(9), trajectory(walk(9), "opencv", as_w_first)
+    mended = dict(others(read))["quaternions written w first: write quaternions as x y z w"]
+    torch.testing.assert_close(mended.axes, right.axes, atol=1e-9, rtol=0.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_right_cameras_are_taken_without_a_word(count: int) -> None:
+    read = trajectory(walk(count), "opengl", lambda T: T @ HALF_TURN)
+    _, doubt = observe_by_cameras(room(), read.pinhole(), 100_000, others(read))
+    assert doubt is None

@@ -6,9 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from regnf_core.fields.base import SdfField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.viewing.display_mesh import (
     COARSE_TRIANGLES,
     FINE_TRIANGLES,
@@ -84,3 +88,19 @@ def test_files_are_read_by_others(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.vertices, ball.vertices, atol=1e-6)
     assert (np.asarray(read.faces) == ball.faces).all()
     assert read.visual.vertex_colors[0].tolist() == [255, 128, 0, 255]
+
+
+@pytest.mark.parametrize("own_triangles", [True, False])
+def test_a_mesh_far_from_the_origin_keeps_its_digits(own_triangles: bool, tmp_path: Path) -> None:
+    shift = np.array([448_262.25, 5_413_920.5, 112.0])
+    near: SdfField = sphere(0.4)
+    if own_triangles:
+        ball = trimesh.creation.icosphere(3, radius=0.4)
+        near = MeshField(ball.vertices, ball.faces)
+    placed = TransformedField(near, Sim3.from_translation(-torch.from_numpy(shift)))
+    here, there = (display_meshes(field, budget_s=1e3).fine for field in (near, placed))
+    assert len(there.faces) == len(here.faces)
+    path = tmp_path / "mesh.glb"
+    path.write_bytes(mesh_file(there.vertices, there.faces))
+    read = trimesh.load_scene(path).to_geometry()
+    np.testing.assert_allclose(read.vertices - shift, here.vertices, atol=1e-5)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from regnf_core.errors import DatasetError
 from regnf_data.posed_images import PosedImages
@@ -67,6 +68,13 @@ def with_depths(change: Callable[[Floats], Floats]) -> Callable[[PosedImages], P
     return lambda images: replace(images, depths=np.asarray(change(images.depths), np.float32))
 
 
+def reordered(poses: Floats, order: list[int]) -> Floats:
+    """What poses become whose quaternions are read in another order than they were written in."""
+    read = poses.copy()
+    read[:, :3, :3] = Rotation.from_quat(Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, order]).as_matrix()
+    return read
+
+
 FAR = np.zeros((4, 4))
 FAR[:3, 3] = 448_262.0, 5_413_920.0, 112.0
 LENGTHS = np.linalg.norm(rays(), axis=-1)
@@ -85,6 +93,8 @@ WRONG: dict[str, tuple[Callable[[PosedImages], PosedImages], str]] = {
     "turned": (lambda images: replace(images, intrinsics=images.intrinsics[:, [1, 0, 2]][:, :, [1, 0, 2]]), "pixels"),
     "reversed": (with_poses(lambda T: T[::-1]), "each frame's own camtoworld"),
     "one off": (with_poses(lambda T: np.roll(T, 1, axis=0)), "each frame's own camtoworld"),
+    "w first": (with_poses(lambda T: reordered(T, [3, 0, 1, 2])), "quaternions anew"),
+    "w last": (with_poses(lambda T: reordered(T, [1, 2, 3, 0])), "quaternions anew"),
     "mirrored": (with_depths(lambda depths: depths[:, :, ::-1]), "Mirror the depth images"),
     "far from the origin": (with_poses(lambda T: T @ OPENGL + FAR), "opengl"),
 }  # fmt: skip
@@ -117,6 +127,15 @@ def test_one_image_or_a_flat_wall_tells_nothing() -> None:
     flat = replace(one, depths=np.full((6, *SIZE), 2.0, np.float32), T_world_camera=wall, intrinsics=one.intrinsics[:6],
                    colors=one.colors[:6])  # fmt: skip
     assert check_agreement(flat) is None
+
+
+def test_images_that_share_nothing_tell_no_unit() -> None:
+    one = recording()
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 6.0  # beside the first, looking the same way at another part of a wall
+    apart = replace(one, depths=np.full((2, *SIZE), 2.0, np.float32), T_world_camera=poses,
+                    intrinsics=one.intrinsics[:2], colors=one.colors[:2])  # fmt: skip
+    assert check_agreement(apart) is None
 
 
 def test_poses_of_nowhere_are_warned_of() -> None:

@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from regnf_core.errors import CancelledError, InvalidInputError
 from regnf_core.fields.base import SdfField
 from regnf_core.fields.build import open_field
 from regnf_core.fields.composite import BoxField
 from regnf_core.fields.mesh import MeshField
+from regnf_core.fields.transformed import TransformedField
+from regnf_core.geometry.sim3 import Sim3
 from regnf_core.schema.hash_grid_config import HashGridConfig
 from regnf_core.schema.safe_format import read_description
 from regnf_fit.mesh.fit import fit_field
@@ -85,7 +88,6 @@ def test_progress_may_stop_the_fit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("target", "reason"),
     [
-        (sphere(3.0, bounds=[[-3.0] * 3, [3.0] * 3]), "TARGET_OUTSIDE_GRID"),
         (AnalyticField(lambda points: 1.0 + 0.0 * points.sum(-1), [[-0.5] * 3, [0.5] * 3]), "NO_SURFACE_IN_TARGET"),
         (MeshField(np.zeros((3, 3)), [[0, 1, 2]]), "NO_SURFACE_IN_TARGET"),
     ],
@@ -94,3 +96,21 @@ def test_targets_that_cannot_be_fitted(target: SdfField, reason: str, tmp_path: 
     with pytest.raises(InvalidInputError) as caught:
         fit_field(target, tmp_path / "field", OPTIONS)
     assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize("target", ["function", "mesh"])
+def test_a_target_that_is_large_and_far_away_is_fitted_where_it_lies(target: str, tmp_path: Path) -> None:
+    shift = torch.tensor([448_262.25, 5_413_920.5, 112.0], dtype=torch.float64)
+    large: SdfField = sphere(3.0, bounds=[[-3.0] * 3, [3.0] * 3])
+    if target == "mesh":
+        round_mesh = trimesh.creation.icosphere(3, radius=3.0)
+        large = MeshField(round_mesh.vertices, round_mesh.faces)
+    placed = TransformedField(large, Sim3.from_translation(-shift))
+    report = fit_field(placed, tmp_path / "field", OPTIONS, seed=1)
+    assert report.diagonal == pytest.approx(6.0 * 3**0.5, rel=1e-3)
+    assert report.mean_error < 0.004
+    assert report.mean_normal_cosine > 0.98
+    field = open_field(tmp_path / "field")
+    torch.testing.assert_close(field.bounds.mean(0), shift, rtol=0, atol=0.01)
+    points = torch.tensor([[0.0, 3.0, 0.0], [2.0, 0.0, 2.0], [-3.0, 0.0, 0.0]]).double() + shift
+    torch.testing.assert_close(field.signed_distance(points), torch.tensor([0.0, -0.17, 0.0]), rtol=0, atol=0.08)
