@@ -102,6 +102,11 @@ def known_sha256(field: FieldLike) -> str | None:
     return str(field) if is_name and not Path(str(field)).exists() else None
 
 
+def size_of(field: FieldLike, role: Role | None = None) -> int:
+    """Bytes of the file; 0 for what the service has. Raises what ``find_source`` does."""
+    return 0 if known_sha256(field) is not None else source_of(_path(field), role=role).file.stat().st_size
+
+
 def upload(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
     """The field at the service, once its import has ended; its bytes are sent only if the service lacks them.
 

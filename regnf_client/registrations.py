@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from regnf_client.fields import Asking, FieldLike, known_sha256, upload
+from regnf_client.fields import Asking, FieldLike, known_sha256, size_of, upload
 from regnf_client.jobs import id_of, rendering, result, submit, wait
 from regnf_client.models import BatchOutcome, Entry, Job, Rendering, Result
 from regnf_client.steps import Flow
 from regnf_core.detections.objects import BoxLike, detection_of
 from regnf_core.errors import InvalidInputError, RegnfError
+from regnf_core.field_source import Role
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 
@@ -46,9 +47,11 @@ class Request:
 def submit_registration(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Job]:
     """Upload what the service lacks, then ask for the registration."""
     body = request.body()
-    place = yield from upload(asking, scene, "scene")
-    thing = yield from upload(asking, obj, "object")
-    return (yield from submit(asking, "/register", {"scene": place.sha256, "object": thing.sha256, **body}))
+    given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
+    sent = {}
+    for role in sorted(given, key=lambda role: size_of(given[role], role)):  # what is refused is refused soon
+        sent[role] = (yield from upload(asking, given[role], role)).sha256
+    return (yield from submit(asking, "/register", {**sent, **body}))
 
 
 def register(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Result]:

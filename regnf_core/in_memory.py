@@ -26,6 +26,7 @@ HINT = (
     'Give a path such as "chair.glb", a mesh or a cloud of trimesh or Open3D, what open_field returns, an object with'
     " SdfField's members, or what from_mesh, from_points, from_grid or from_function make."
 )
+_NUMBERS = "Give an array, a tensor or a list of real numbers, all rows of one length."
 _SIGN = (
     "Values are distances, positive in free space. If they are negative there, say sign=-1 (from_grid:"
     ' description={"sign": -1}). Do the bounds hold the surface, and a little free space round it?'
@@ -55,8 +56,9 @@ def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said =
 def from_points(points: Any, normals: Any, description: Said = None) -> SdfField:
     """The field of a cloud of points with normals that point to free space: of its screened Poisson surface.
 
-    points, normals: (N, 3), as ``from_mesh`` takes vertices. Raises FieldFormatError: MESH_INVALID,
-    POINT_CLOUD_WITHOUT_NORMALS, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
+    points, normals: (N, 3), as ``from_mesh`` takes vertices; rows that are not finite or have a zero normal are left out.
+    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, POINT_CLOUD_TOO_SMALL,
+    POINT_CLOUD_NORMALS_DISAGREE, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
     """
     from regnf_core.importing.families.point_cloud import convert_cloud
     from regnf_core.importing.meshes.geometry import Geometry, require_room
@@ -220,11 +222,12 @@ def _array(name: str, values: Any, reason: str) -> npt.NDArray[Any]:
     try:
         array = np.asarray(values)
     except Exception as error:  # rows of several lengths, or an object of another library
-        raise FieldFormatError(f"{name} is no array of numbers: {error}", reason=reason) from error
+        raise FieldFormatError(f"{name} is no array of numbers: {error}", reason=reason, hint=_NUMBERS) from error
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise FieldFormatError(f"{name} has masked entries", reason=reason, hint="Leave them out, or fill them.")
     if array.dtype.kind not in "fiu":
-        raise FieldFormatError(f"{name} holds {array.dtype.name}; real numbers are needed", reason=reason)
+        what = "nothing" if values is None else array.dtype.name
+        raise FieldFormatError(f"{name} holds {what}; real numbers are needed", reason=reason, hint=_NUMBERS)
     return array
 
 

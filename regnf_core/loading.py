@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,6 +83,15 @@ def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
         if (notes := _safe_field_notes(source)) is not None:
             return SafeField(source.file, notes)
         return _imported(source, cache_dir or default_cache_dir())
+
+
+def import_smallest_first(sources: Iterable[FieldSource]) -> None:
+    """Import several files, so that one that is refused is not refused only after a large one's import.
+
+    Raises as ``safe_field`` does.
+    """
+    for source in sorted(sources, key=lambda one: one.file.stat().st_size):
+        safe_field(source)
 
 
 def default_cache_dir() -> Path:

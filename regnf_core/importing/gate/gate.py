@@ -165,10 +165,16 @@ def _values_of(outcome: ChildOutcome, work: Path, limits: ImportLimits, seconds:
         return values
     if not isinstance(reason, str) or not _REASON.fullmatch(reason):
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
-    detail = "".join(c for c in str(values.get("detail"))[:_MAX_DETAIL] if c.isprintable())
+    detail, hint = (_printable(values.get(name)) for name in ("detail", "hint"))
     if reason == "STORAGE_FULL":
         raise OSError(errno.ENOSPC, detail)
-    raise FieldFormatError(detail, reason=reason, candidates=read_candidates(values.get("candidates"), work))
+    raise FieldFormatError(
+        detail, reason=reason, hint=hint or None, candidates=read_candidates(values.get("candidates"), work)
+    )
+
+
+def _printable(text: Any) -> str:
+    return "".join(c for c in str(text or "")[:_MAX_DETAIL] if c.isprintable())
 
 
 def _parse(stdout: bytes) -> dict[str, Any] | None:
