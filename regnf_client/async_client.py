@@ -78,7 +78,7 @@ class AsyncClient:
 
     async def upload(
         self,
-        field: str | Path,
+        field: FieldLike,
         description: Mapping[str, Any] | None = None,
         settings: SettingsChoice = None,
         role: Role | None = None,

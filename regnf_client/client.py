@@ -77,7 +77,7 @@ class Client:
 
     def upload(
         self,
-        field: str | Path,
+        field: FieldLike,
         description: Mapping[str, Any] | None = None,
         settings: SettingsChoice = None,
         role: Role | None = None,

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from regnf_client.fields import Asking, FieldLike, known_sha256, size_of, upload
+from regnf_client.fields import Asking, FieldLike, known_sha256, smallest_first, upload
 from regnf_client.jobs import id_of, rendering, result, submit, wait
 from regnf_client.models import BatchOutcome, Entry, Job, Rendering, Result
 from regnf_client.steps import Flow
 from regnf_core.detections.objects import BoxLike, detection_of
 from regnf_core.errors import InvalidInputError, RegnfError
-from regnf_core.field_source import Role
 from regnf_core.options import OptionsLike, options_of
 from regnf_core.pairs import pairs_of
 
@@ -47,10 +47,9 @@ class Request:
 def submit_registration(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Job]:
     """Upload what the service lacks, then ask for the registration."""
     body = request.body()
-    given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
     sent = {}
-    for role in sorted(given, key=lambda role: size_of(given[role], role)):  # what is refused is refused soon
-        sent[role] = (yield from upload(asking, given[role], role)).sha256
+    for role, one in smallest_first({"scene": scene, "object": obj}):
+        sent[role] = (yield from upload(asking, one, role)).sha256
     return (yield from submit(asking, "/register", {**sent, **body}))
 
 
@@ -188,4 +187,6 @@ def _several(objects: Sequence[FieldLike]) -> list[FieldLike]:
 def _named(field: FieldLike) -> str:
     if isinstance(field, Entry):
         return field.name
+    if not isinstance(field, str | os.PathLike) and not hasattr(field, "named"):
+        return type(field).__name__
     return known_sha256(field) or str(getattr(field, "named", field))

@@ -7,38 +7,15 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import Role, find_source
 from regnf_core.fields.base import SdfField
-from regnf_core.in_memory import FieldWarning, field_of
+from regnf_core.in_memory import FieldWarning, HasGeometry, HasPoints, HasVertices, field_of
 from regnf_core.loading import import_smallest_first, load_field
 
-
-class _HasVertices(Protocol):
-    """A mesh of trimesh or Open3D."""
-
-    @property
-    def vertices(self) -> Any: ...
-
-
-class _HasPoints(Protocol):
-    """A cloud of Open3D."""
-
-    @property
-    def points(self) -> Any: ...
-
-
-class _HasGeometry(Protocol):
-    """A scene of trimesh."""
-
-    @property
-    def geometry(self) -> Any: ...
-
-
-FieldLike = SdfField | str | os.PathLike[str] | _HasVertices | _HasPoints | _HasGeometry
+FieldLike = SdfField | str | os.PathLike[str] | HasVertices | HasPoints | HasGeometry
 """An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
 :func:`regnf_core.in_memory.field_of`."""
 

@@ -116,7 +116,7 @@ def test_a_function_is_a_field(function: Callable[[Tensor], Any], sign: int) -> 
         (lambda: regnf.from_mesh(V, F[:0]), "MESH_INVALID", "(0, 3)"),
         (lambda: regnf.from_mesh(V + 1j, F), "MESH_INVALID", "complex128"),
         (lambda: regnf.from_mesh([[0, 0, 0], [1]], F), "MESH_INVALID", "vertices"),
-        (lambda: regnf.from_mesh(None, F), "MESH_INVALID", "object"),
+        (lambda: regnf.from_mesh(None, F), "MESH_INVALID", "nothing"),
         (lambda: regnf.from_mesh(V * np.nan, F), "MESH_INVALID", "finite"),
         (lambda: regnf.from_mesh(V * [1, 0, 0], F), "MESH_INVALID", "no triangle of the mesh has an area"),
         (lambda: regnf.from_points(V, None), "POINT_CLOUD_WITHOUT_NORMALS", "estimate_normals"),
