@@ -122,6 +122,7 @@ HINTS: dict[str, str] = {
     "service (REGNF_IMPORT_WORK_S).",
     "IMPORT_OUT_OF_MEMORY": "Make the file smaller (a coarser mesh or grid), use a machine with more memory, or set a "
     "higher limit for the service (REGNF_IMPORT_MEMORY_BYTES).",
+    "TENSOR_TOO_LARGE": "Make it smaller: a coarser grid, or fewer levels of the table.",
     "IMPORT_OUTPUT_TOO_LARGE": "Make the field smaller: a coarser mesh or grid.",
     "IMPORT_CRASHED": "Try it once more. If it ends so again, the service's log has the last words of the import.",
     "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",

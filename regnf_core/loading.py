@@ -110,7 +110,7 @@ def _safe_field_notes(source: FieldSource) -> FieldNotes | None:
 
 
 def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
-    from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+    from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 
     name = _digest(source)
     kept, report = cache_dir / f"{name}.safetensors", cache_dir / f"{name}.json"
@@ -119,7 +119,7 @@ def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
     cache_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_dir) as folder, source.packed_settings() as settings:
         said = source.description or None
-        made = import_field(source.file, Path(folder), said, ImportLimits(), settings=settings)
+        made = import_field(source.file, Path(folder), said, settings=settings)
         notes = FieldNotes.of_report(made.to_dict())
         with atomic_path(report) as path:
             path.write_text(json.dumps(notes.to_dict()), encoding="utf-8")

@@ -68,10 +68,12 @@ def import_field(
     one file or an archive of several. cameras: where those stood whose images the field was made from, likewise.
     The upload may be an archive of a whole run; then it brings its settings along.
 
+    limits: None takes those of the machine.
+
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
-    limits = limits or ImportLimits()
+    limits = limits or ImportLimits.of_the_machine()
     shown = {"picture": picture, "ask_by_picture": picture or ask_by_picture}
     request = _request(description, limits, shown, settings, cameras)
     files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]

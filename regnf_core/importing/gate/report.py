@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,13 @@ class ImportLimits:
     """All tensors of the field together, as float32; then TENSOR_TOO_LARGE."""
     file_bytes: int = 4096 * MIB
     """Largest file the import may write; then IMPORT_OUTPUT_TOO_LARGE."""
+
+    @classmethod
+    def of_the_machine(cls) -> ImportLimits:
+        """Those of a person's own file on the person's own machine: no time, and all of its memory, 8 GiB at least;
+        tensors and files of half of it."""
+        memory = max(cls.memory_bytes, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return cls(memory_bytes=memory, tensor_bytes=memory // 2, file_bytes=memory // 2)
 
     @property
     def longest_s(self) -> float:
