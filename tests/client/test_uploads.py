@@ -16,6 +16,8 @@ import trimesh
 
 import regnf
 from regnf_client import Client, ServiceError, UnreachableError
+from regnf_client.batches import BatchReader
+from regnf_client.fields import Deadline
 from regnf_core.importing.meshes.ply import read_ply
 from tests.client.transports import Counted
 from tests.contract.asgi import AppTransport
@@ -208,6 +210,10 @@ def test_scene_and_object_may_lie_in_memory(world: World, transport: AppTranspor
     for name in (room, thing):
         imported(world, name)
     assert one.submit(*balls, BOX).id == one.submit(room, thing, BOX).id
+    reader = BatchReader(one._connection.asking(), [], Deadline(None))
+    assert repr(balls[0]) == repr(balls[1])
+    sent = [one._driver.run(reader._upload(ball, role)) for ball, role in zip(balls, ("scene", "scene"), strict=True)]
+    assert sent == [room, thing], "told apart, although they are shown alike"
 
 
 @pytest.mark.parametrize("thing", [{"a": 1}, np.zeros((3, 3)), None, 7, trimesh.Trimesh])
