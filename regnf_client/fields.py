@@ -27,7 +27,8 @@ from regnf_core.field_source import FieldSource, Role, SettingsChoice, assumed_r
 from regnf_core.importing.upload_description import UploadDescription
 from regnf_core.in_memory import HasGeometry, HasPoints, HasVertices
 
-FieldLike = str | Path | Field | Entry | FieldSource | HasVertices | HasPoints | HasGeometry
+Sendable = str | Path | FieldSource | HasVertices | HasPoints | HasGeometry
+FieldLike = Sendable | Field | Entry
 """A file, a training run's folder or an archive of one; the SHA-256 of a field that the service has; or a Field or an
 Entry of its library; or a mesh or a cloud of trimesh or Open3D, or a mesh that regnf has opened."""
 Report = Callable[[str, float], None]
@@ -79,7 +80,7 @@ class Deadline:
 
 
 def source_of(
-    field: str | Path | FieldSource | HasVertices | HasPoints | HasGeometry,
+    field: Sendable,
     description: Mapping[str, Any] | None = None,
     settings: SettingsChoice = None,
     role: Role | None = None,
@@ -197,7 +198,7 @@ def ready(asking: Asking, field: Field) -> Flow[Field]:
     return field
 
 
-def _path(field: FieldLike) -> str | Path | FieldSource | HasVertices | HasPoints | HasGeometry:
+def _path(field: FieldLike) -> Sendable:
     assert not isinstance(field, Field | Entry)
     return field
 

@@ -47,7 +47,7 @@ class Request:
 def submit_registration(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Job]:
     """Upload what the service lacks, then ask for the registration."""
     body = request.body()
-    sent = {}
+    sent: dict[str, str] = {}
     for role, one in smallest_first({"scene": scene, "object": obj}):
         sent[role] = (yield from upload(asking, one, role)).sha256
     return (yield from submit(asking, "/register", {**sent, **body}))
