@@ -72,7 +72,7 @@ def _check(output: Path, images: Path | None, cameras: Path | None) -> None:
 
 
 def _to_safe_field(source: FieldSource, output: Path, images: Path | None, cameras: Path | None, opengl: bool) -> None:
-    from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+    from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".convert-") as scratch:
         with (
@@ -82,7 +82,7 @@ def _to_safe_field(source: FieldSource, output: Path, images: Path | None, camer
             _packed(cameras) as stood,
         ):
             said = source.description or None
-            report = import_field(source.file, Path(scratch), said, ImportLimits(), settings=settings, cameras=stood)
+            report = import_field(source.file, Path(scratch), said, settings=settings, cameras=stood)
         if images is not None:
             with err.status("recording which parts the cameras observed"):
                 _keep_what_was_seen(Path(scratch) / FIELD_NAME, images, opengl)

@@ -48,14 +48,14 @@ def inspect(
     """
     require("engine")
     _check(picture, candidates)
-    from regnf_core.importing.gate.gate import ImportLimits, import_field
+    from regnf_core.importing.gate.gate import import_field
     from regnf_core.importing.gate.picture import PICTURE_NAME
 
     source = source_of(field, description, choice_of(config, no_config))
     drawn = picture is not None or candidates is not None
     with tempfile.TemporaryDirectory() as folder:
         with _asked(candidates), source.naming(), source.packed_settings() as settings:
-            made = import_field(source.file, Path(folder), description, ImportLimits(), drawn, settings)
+            made = import_field(source.file, Path(folder), description, None, drawn, settings)
             report = made.to_dict()
         if picture is not None:
             _keep(Path(folder) / PICTURE_NAME, picture)

@@ -131,7 +131,7 @@ def _register_here(
 ) -> dict[str, Any]:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.geometry.sim3 import Sim3
-    from regnf_core.loading import load_field
+    from regnf_core.loading import import_smallest_first, load_field
     from regnf_core.registration import WarmStart
     from regnf_core.registration import register as run
     from regnf_core.viewing import result_document
@@ -143,6 +143,7 @@ def _register_here(
     files.check()
     with phase_progress() as bar:
         task = bar.add_task("loading", total=1.0)
+        import_smallest_first((scene, object_))
         opened, obj = open_scene(scene, detection), load_field(object_)
         result = run(
             opened.field,

@@ -39,7 +39,9 @@ def register_remotely(
     """
 
     def upload(report: Report) -> dict[str, Any]:
-        return {"scene": _sent(service, scene, report), "object": _sent(service, object_, report)}
+        named = {"scene": scene, "object": object_}
+        smallest_first = sorted(named, key=lambda role: named[role].file.stat().st_size)  # a refusal comes soon
+        return {role: _sent(service, named[role], report) for role in smallest_first}
 
     return _exchange(service, upload, request, delivery)
 

@@ -150,7 +150,7 @@ def _search_here(
 ) -> dict[str, Any]:
     from regnf_core.geometry.box import OrientedBox
     from regnf_core.library import search_library
-    from regnf_core.loading import safe_field
+    from regnf_core.loading import import_smallest_first, safe_field
     from regnf_core.viewing import ranking_document, result_document
 
     options = RegistrationOptions.from_dict(request["options"])
@@ -158,6 +158,7 @@ def _search_here(
     Files(output).check()
     with phase_progress() as bar:
         task = bar.add_task("library", total=1.0)
+        import_smallest_first((scene, *objects))
         opened = open_scene(scene, detection)
         library, unusable = _modeled(objects, options.robust, lambda share: bar.update(task, completed=share))
         found = search_library(

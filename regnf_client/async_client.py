@@ -20,7 +20,7 @@ from regnf_client.batches import BatchReader, PairLike, PairResult
 from regnf_client.connection import ADDRESS, WORKER_TIMEOUT_S, Connection
 from regnf_client.errors import unreachable
 from regnf_client.events import EventReader
-from regnf_client.fields import FieldLike, Report
+from regnf_client.fields import FieldLike, Report, Sendable
 from regnf_client.jobs import JobLike, id_of
 from regnf_client.lists import delete_field, list_fields, list_jobs
 from regnf_client.models import BatchOutcome, Event, Field, Job, Rendering, Result
@@ -78,7 +78,7 @@ class AsyncClient:
 
     async def upload(
         self,
-        field: str | Path,
+        field: Sendable,
         description: Mapping[str, Any] | None = None,
         settings: SettingsChoice = None,
         role: Role | None = None,

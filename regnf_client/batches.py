@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -19,7 +20,7 @@ from regnf_client.steps import Flow, Pause, call
 from regnf_client.worker_watch import look
 from regnf_core.detections.objects import BoxLike
 from regnf_core.errors import InvalidInputError, RegnfError
-from regnf_core.field_source import Role
+from regnf_core.field_source import FieldSource, Role
 from regnf_core.options import OptionsLike
 
 PAIRS_AT_ONCE = 500
@@ -112,6 +113,7 @@ class BatchReader:
         self._requests = enumerate(requests)
         self._deadline = deadline
         self._sent: dict[tuple[str, str], str | RegnfError] = {}
+        self._in_memory: list[FieldLike] = []
         self._lines: list[tuple[int, bytes]] = []
         """Lines that are not posted yet, with the places of their requests."""
         self._indexes: list[int] = []
@@ -200,7 +202,8 @@ class BatchReader:
         known = known_sha256(one)
         if known is not None:
             return known  # pairs of fields that the service lacks fail one by one
-        name = (str(getattr(one, "named", one)), role)
+        in_memory = not isinstance(one, str | os.PathLike | FieldSource)
+        name = (f"{id(one)}" if in_memory else str(getattr(one, "named", one)), role)
         if name not in self._sent:
             try:
                 self._sent[name] = (yield from upload(self._asking, one, role)).sha256
@@ -208,6 +211,7 @@ class BatchReader:
                 if getattr(error, "unavailable", False):
                     raise
                 self._sent[name] = error
+            self._in_memory += [one] if in_memory else []  # as long as it is there, no other has its number
         found = self._sent[name]
         if isinstance(found, RegnfError):
             raise found

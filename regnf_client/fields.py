@@ -8,10 +8,12 @@ import math
 import os
 import re
 import time
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from regnf_client.answers import checked, parsed, refusal, service_error
@@ -20,14 +22,15 @@ from regnf_client.models import Entry, Field
 from regnf_client.patience import Patience
 from regnf_client.steps import Flow, call, work
 from regnf_client.worker_watch import WorkerWatch, look
-from regnf_core.errors import InvalidInputError
 from regnf_core.field_candidates import Said
-from regnf_core.field_source import FieldSource, Role, SettingsChoice, find_source
+from regnf_core.field_source import FieldSource, Role, SettingsChoice, assumed_role, find_source
 from regnf_core.importing.upload_description import UploadDescription
+from regnf_core.in_memory import HasGeometry, HasPoints, HasVertices
 
-FieldLike = str | Path | Field | Entry | FieldSource
+Sendable = str | Path | FieldSource | HasVertices | HasPoints | HasGeometry
+FieldLike = Sendable | Field | Entry
 """A file, a training run's folder or an archive of one; the SHA-256 of a field that the service has; or a Field or an
-Entry of its library."""
+Entry of its library; or a mesh or a cloud of trimesh or Open3D, or a mesh that regnf has opened."""
 Report = Callable[[str, float], None]
 """Called with a phase and the share of it that is done, 0..1."""
 PIECE_BYTES = 8 << 20
@@ -77,19 +80,31 @@ class Deadline:
 
 
 def source_of(
-    field: str | Path | FieldSource,
+    field: Sendable,
     description: Mapping[str, Any] | None = None,
     settings: SettingsChoice = None,
     role: Role | None = None,
 ) -> FieldSource:
-    """What a path stands for. Raises what ``find_source`` does: InvalidInputError, FieldFormatError."""
+    """What a path stands for, or a mesh or a cloud in memory, of which a file is made for as long as it is needed.
+
+    Raises what ``find_source`` does, InvalidInputError and FieldFormatError.
+    """
     if isinstance(field, FieldSource):
         return field
-    if not isinstance(field, str | os.PathLike):
-        hint = "The service takes files: write a mesh as .ply, .glb, .obj or .stl, a grid by numpy.savez."
-        message = f"the field is of the type {type(field).__name__}, expected a path"
-        raise InvalidInputError(message, reason="NO_FIELD", hint=hint)
-    return find_source(Path(field), description, settings, role)
+    if isinstance(field, str | os.PathLike):
+        return find_source(Path(field), description, settings, role)
+    from regnf_core.importing.meshes.ply import ply_bytes
+    from regnf_core.in_memory import geometry_of
+
+    data = ply_bytes(geometry_of(field, role))
+    folder = TemporaryDirectory(prefix="regnf-")
+    file = Path(folder.name) / f"{type(field).__name__}.ply"
+    file.write_bytes(data)
+    said = dict(description or {})
+    use = assumed_role(said, "ply", role).get("as")
+    source = FieldSource(Path(file.name), file, None, None, said, use, role)
+    weakref.finalize(source, folder.cleanup)
+    return source
 
 
 def known_sha256(field: FieldLike) -> str | None:
@@ -100,6 +115,21 @@ def known_sha256(field: FieldLike) -> str | None:
         return field.field
     is_name = isinstance(field, str) and _SHA256.fullmatch(field) is not None
     return str(field) if is_name and not Path(str(field)).exists() else None
+
+
+def smallest_first(given: Mapping[Role, FieldLike]) -> list[tuple[Role, FieldLike]]:
+    """What the service has, then the files, the smallest first: what is refused is refused soon.
+
+    Raises what ``source_of`` does.
+    """
+    sized: list[tuple[int, Role, FieldLike]] = []
+    for role, field in given.items():
+        if known_sha256(field) is not None:
+            sized.append((0, role, field))
+        else:
+            source = source_of(_path(field), role=role)
+            sized.append((source.file.stat().st_size, role, source))
+    return [(role, field) for _, role, field in sorted(sized, key=lambda one: one[0])]
 
 
 def upload(asking: Asking, field: FieldLike, role: Role | None = None) -> Flow[Field]:
@@ -168,7 +198,7 @@ def ready(asking: Asking, field: Field) -> Flow[Field]:
     return field
 
 
-def _path(field: FieldLike) -> str | Path | FieldSource:
+def _path(field: FieldLike) -> Sendable:
     assert not isinstance(field, Field | Entry)
     return field
 

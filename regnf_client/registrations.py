@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from regnf_client.fields import Asking, FieldLike, known_sha256, upload
+from regnf_client.fields import Asking, FieldLike, known_sha256, smallest_first, upload
 from regnf_client.jobs import id_of, rendering, result, submit, wait
 from regnf_client.models import BatchOutcome, Entry, Job, Rendering, Result
 from regnf_client.steps import Flow
@@ -47,9 +48,10 @@ class Request:
 def submit_registration(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Job]:
     """Upload what the service lacks, then ask for the registration."""
     body = request.body()
-    place = yield from upload(asking, scene, "scene")
-    thing = yield from upload(asking, obj, "object")
-    return (yield from submit(asking, "/register", {"scene": place.sha256, "object": thing.sha256, **body}))
+    sent: dict[str, str] = {}
+    for role, one in smallest_first({"scene": scene, "object": obj}):
+        sent[role] = (yield from upload(asking, one, role)).sha256
+    return (yield from submit(asking, "/register", {**sent, **body}))
 
 
 def register(asking: Asking, scene: FieldLike, obj: FieldLike, request: Request) -> Flow[Result]:
@@ -186,4 +188,6 @@ def _several(objects: Sequence[FieldLike]) -> list[FieldLike]:
 def _named(field: FieldLike) -> str:
     if isinstance(field, Entry):
         return field.name
+    if not isinstance(field, str | os.PathLike) and not hasattr(field, "named"):
+        return type(field).__name__
     return known_sha256(field) or str(getattr(field, "named", field))

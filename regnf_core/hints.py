@@ -38,6 +38,9 @@ HINTS: dict[str, str] = {
     " docs/import-gate.md lists what is taken.",
     "POINT_CLOUD_WITHOUT_NORMALS": "In Open3D: cloud.estimate_normals(), then"
     " orient_normals_consistent_tangent_plane(30); or give the mesh.",
+    "POINT_CLOUD_NORMALS_DISAGREE": "Orient them all to free space, in Open3D: cloud.orient_normals_consistent_tangent"
+    "_plane(30); or say accept_implausible in a description to take them as they are.",
+    "POINT_CLOUD_TOO_SMALL": "Give more points of the surface, or the mesh.",
     "MESH_INVALID": "Open it in a viewer, and export it again as .glb, .ply, .obj or .stl.",
     "FORMAT_NOT_SUPPORTED": "docs/import-gate.md lists the files that are taken.",
     "FIELD_NOT_RECOGNIZED": "docs/import-gate.md lists the networks that are taken, and what a description may add.",
@@ -122,6 +125,7 @@ HINTS: dict[str, str] = {
     "service (REGNF_IMPORT_WORK_S).",
     "IMPORT_OUT_OF_MEMORY": "Make the file smaller (a coarser mesh or grid), use a machine with more memory, or set a "
     "higher limit for the service (REGNF_IMPORT_MEMORY_BYTES).",
+    "TENSOR_TOO_LARGE": "Make it smaller: a coarser grid, or fewer levels of the table.",
     "IMPORT_OUTPUT_TOO_LARGE": "Make the field smaller: a coarser mesh or grid.",
     "IMPORT_CRASHED": "Try it once more. If it fails again, the service's log has the end of the import's output.",
     "FIELD_IMPORT_TIMEOUT": "Wait until the field is ready, then post the same request again.",

@@ -8,30 +8,52 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from regnf_core.errors import FieldFormatError, InvalidInputError
-from regnf_core.fields.base import SdfField
 
 if TYPE_CHECKING:
     from regnf_core.field_source import Role
+    from regnf_core.fields.base import SdfField
     from regnf_core.fields.user_fields import PointFunction
     from regnf_core.importing.families.converted import ConvertedField
-    from regnf_core.importing.meshes.geometry import Float64Array, Int64Array
+    from regnf_core.importing.meshes.geometry import Float64Array, Geometry, Int64Array
 
 HINT = (
     'Give a path such as "chair.glb", a mesh or a cloud of trimesh or Open3D, what open_field returns, an object with'
     " SdfField's members, or what from_mesh, from_points, from_grid or from_function make."
 )
+_NUMBERS = "Give an array, a tensor or a list of real numbers, all rows of one length."
 _SIGN = (
     "Values are distances, positive in free space. If they are negative there, say sign=-1 (from_grid:"
     ' description={"sign": -1}). Do the bounds hold the surface, and a little free space round it?'
 )
 Said = Mapping[str, Any] | None
 """What ``open_field`` takes as a description: up_axis, world_scale, sign, as ..."""
+
+
+class HasVertices(Protocol):
+    """A mesh of trimesh or Open3D."""
+
+    @property
+    def vertices(self) -> Any: ...
+
+
+class HasPoints(Protocol):
+    """A cloud of Open3D."""
+
+    @property
+    def points(self) -> Any: ...
+
+
+class HasGeometry(Protocol):
+    """A scene of trimesh."""
+
+    @property
+    def geometry(self) -> Any: ...
 
 
 class FieldWarning(UserWarning):
@@ -55,8 +77,9 @@ def from_mesh(vertices: Any, faces: Any, colors: Any = None, description: Said =
 def from_points(points: Any, normals: Any, description: Said = None) -> SdfField:
     """The field of a cloud of points with normals that point to free space: of its screened Poisson surface.
 
-    points, normals: (N, 3), as ``from_mesh`` takes vertices. Raises FieldFormatError: MESH_INVALID,
-    POINT_CLOUD_WITHOUT_NORMALS, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
+    points, normals: (N, 3), as ``from_mesh`` takes vertices; rows that are not finite, or of no normal, are left out.
+    Raises FieldFormatError: MESH_INVALID, POINT_CLOUD_WITHOUT_NORMALS, POINT_CLOUD_TOO_SMALL,
+    POINT_CLOUD_NORMALS_DISAGREE, NO_ZERO_LEVEL, INVALID_DESCRIPTION.
     """
     from regnf_core.importing.families.point_cloud import convert_cloud
     from regnf_core.importing.meshes.geometry import Geometry, require_room
@@ -125,24 +148,40 @@ def field_of(thing: Any, role: Role | None = None, description: Said = None) -> 
 
     Raises InvalidInputError (NO_FIELD) for what is none, and what the functions above raise.
     """
+    from regnf_core.fields.base import SdfField
+
     said = dict(description or {})
     if role is not None and "as" not in said:
         said["as"] = role
+    if isinstance(thing, SdfField) and not isinstance(thing, type):
+        return _users(thing)
+    geometry = geometry_of(thing, role)
+    if len(geometry.faces) == 0:
+        return from_points(geometry.vertices, geometry.normals, said)
+    return _mesh(geometry.vertices, geometry.faces, geometry.colors, said)
+
+
+def geometry_of(thing: Any, role: Role | None = None) -> Geometry:
+    """The triangles or the points of an object of another library, or of a mesh that was opened here. Torch-free.
+
+    Raises InvalidInputError (NO_FIELD) for what has none, FieldFormatError (MESH_INVALID).
+    """
+    from regnf_core.importing.meshes.geometry import Geometry
+
     if isinstance(thing, type):
         raise _no_field(f"the class {thing.__name__}", role)
-    if isinstance(thing, SdfField):
-        return _users(thing)
     if callable(getattr(thing, "dump", None)) and hasattr(thing, "geometry"):  # trimesh.Scene
-        return _scene(thing, said, role)
+        return _scene(thing, role)
     vertices = _first(thing, "vertices", "vertex.positions")
     faces = _first(thing, "faces", "triangles", "triangle.indices")
     if vertices is not None and faces is not None:
         places = _rows("vertices", vertices, "MESH_INVALID")
-        return _mesh(places, _faces(faces, len(places)), _vertex_colors(thing, len(places)), said)
+        return Geometry(places, _faces(faces, len(places)), colors=_vertex_colors(thing, len(places)))
     points = _first(thing, "points", "point.positions")
     if points is not None:
         normals = _first(thing, "normals", "point.normals")
-        return from_points(points, None if normals is None or len(normals) == 0 else normals, said)
+        given = None if normals is None or len(normals) == 0 else _rows("normals", normals, "MESH_INVALID")
+        return Geometry(_rows("points", points, "MESH_INVALID"), np.zeros((0, 3), np.int64), given)
     raise _no_field(_kind(thing), role, _missing_members(thing))
 
 
@@ -164,15 +203,17 @@ def _mesh(places: Float64Array, corners: Int64Array, painted: Float64Array | Non
     return _field(mesh_field(geometry, "a mesh in memory", _said(description)), description)
 
 
-def _scene(scene: Any, said: Said, role: Role | None) -> SdfField:
+def _scene(scene: Any, role: Role | None) -> Geometry:
     """All triangle meshes of a trimesh scene at their poses."""
+    from regnf_core.importing.meshes.geometry import Geometry
+
     meshes = [one for one in scene.dump() if hasattr(one, "faces") and hasattr(one, "vertices")]
     if not meshes:
         raise _no_field(f"{_kind(scene)} without triangles", role)
     places = [_rows("vertices", one.vertices, "MESH_INVALID") for one in meshes]
     starts = np.cumsum([0, *map(len, places)])
     corners = [_faces(one.faces, len(at)) + start for one, at, start in zip(meshes, places, starts, strict=False)]
-    return _mesh(np.concatenate(places), np.concatenate(corners), None, said)
+    return Geometry(np.concatenate(places), np.concatenate(corners))
 
 
 def _field(converted: ConvertedField, description: Said) -> SdfField:
@@ -220,11 +261,12 @@ def _array(name: str, values: Any, reason: str) -> npt.NDArray[Any]:
     try:
         array = np.asarray(values)
     except Exception as error:  # rows of several lengths, or an object of another library
-        raise FieldFormatError(f"{name} is no array of numbers: {error}", reason=reason) from error
+        raise FieldFormatError(f"{name} is no array of numbers: {error}", reason=reason, hint=_NUMBERS) from error
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise FieldFormatError(f"{name} has masked entries", reason=reason, hint="Leave them out, or fill them.")
     if array.dtype.kind not in "fiu":
-        raise FieldFormatError(f"{name} holds {array.dtype.name}; real numbers are needed", reason=reason)
+        what = "nothing" if values is None else array.dtype.name
+        raise FieldFormatError(f"{name} holds {what}; real numbers are needed", reason=reason, hint=_NUMBERS)
     return array
 
 

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,6 +87,15 @@ def safe_field(source: FieldSource, cache_dir: Path | None = None) -> SafeField:
         return _imported(source, cache_dir or default_cache_dir())
 
 
+def import_smallest_first(sources: Iterable[FieldSource]) -> None:
+    """Import several files, so that one that is refused is not refused only after a large one's import.
+
+    Raises as ``safe_field`` does.
+    """
+    for source in sorted(sources, key=lambda one: one.file.stat().st_size):
+        safe_field(source)
+
+
 def default_cache_dir() -> Path:
     """Where imported checkpoints are kept between runs: under XDG_CACHE_HOME or ~/.cache."""
     base = os.environ.get("XDG_CACHE_HOME")
@@ -103,7 +112,7 @@ def _safe_field_notes(source: FieldSource) -> FieldNotes | None:
 
 
 def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
-    from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
+    from regnf_core.importing.gate.gate import FIELD_NAME, import_field
 
     name = _digest(source)
     kept, report = cache_dir / f"{name}.safetensors", cache_dir / f"{name}.json"
@@ -112,7 +121,7 @@ def _imported(source: FieldSource, cache_dir: Path) -> SafeField:
     cache_dir.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=cache_dir) as folder, source.packed_settings() as settings:
         said = source.description or None
-        made = import_field(source.file, Path(folder), said, ImportLimits(), settings=settings)
+        made = import_field(source.file, Path(folder), said, settings=settings)
         notes = FieldNotes.of_report(made.to_dict())
         with atomic_path(report) as path:
             path.write_text(json.dumps(notes.to_dict()), encoding="utf-8")

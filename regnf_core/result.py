@@ -96,7 +96,7 @@ class ObjectSymmetry:
     continuous: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RegistrationResult:
     """The outcome of one registration. The object's pose in the scene is ``T_scene_object``."""
 

@@ -7,38 +7,15 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
 from regnf_core.field_source import Role, find_source
 from regnf_core.fields.base import SdfField
-from regnf_core.in_memory import FieldWarning, field_of
-from regnf_core.loading import load_field
+from regnf_core.in_memory import FieldWarning, HasGeometry, HasPoints, HasVertices, field_of
+from regnf_core.loading import import_smallest_first, load_field
 
-
-class _HasVertices(Protocol):
-    """A mesh of trimesh or Open3D."""
-
-    @property
-    def vertices(self) -> Any: ...
-
-
-class _HasPoints(Protocol):
-    """A cloud of Open3D."""
-
-    @property
-    def points(self) -> Any: ...
-
-
-class _HasGeometry(Protocol):
-    """A scene of trimesh."""
-
-    @property
-    def geometry(self) -> Any: ...
-
-
-FieldLike = SdfField | str | os.PathLike[str] | _HasVertices | _HasPoints | _HasGeometry
+FieldLike = SdfField | str | os.PathLike[str] | HasVertices | HasPoints | HasGeometry
 """An open field; the path of a file, a training run's folder or an archive of one; or a mesh or a cloud in memory, see
 :func:`regnf_core.in_memory.field_of`."""
 
@@ -60,6 +37,19 @@ def opened(field: FieldLike, role: Role | None = None) -> Opened:
             warnings.warn(f"{field}: {warning}", FieldWarning, stacklevel=4)
         return Opened(loaded.field, str(field), loaded.notes)
     return Opened(field_of(field, role))
+
+
+def opened_pair(scene: FieldLike, obj: FieldLike) -> tuple[Opened, Opened]:
+    """Both; what is refused is refused before a large file is imported. Raises what ``open_field`` does."""
+    given: dict[Role, FieldLike] = {"scene": scene, "object": obj}
+    sources = {
+        role: find_source(Path(one), role=role) for role, one in given.items() if isinstance(one, str | os.PathLike)
+    }
+    found = {role: opened(one, role) for role, one in given.items() if role not in sources}
+    import_smallest_first(sources.values())
+    for role in sources:
+        found[role] = opened(given[role], role)
+    return found["scene"], found["object"]
 
 
 def opened_several(fields: Sequence[FieldLike], role: Role) -> list[Opened]:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
 
 from regnf_core.errors import InvalidInputError
 from regnf_core.field_notes import FieldNotes
@@ -27,7 +30,31 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 
-@dataclass(frozen=True, repr=False)
+class ArrayTensor(Tensor):
+    """A tensor of which ``numpy.array`` makes a copy: torch's own does not know the argument, and numpy warns of it."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray[Any, Any]:
+        return np.array(self.detach().cpu().numpy(), dtype=dtype, copy=copy)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ArrayTensor:
+        copied: ArrayTensor = memo.setdefault(id(self), self.clone())
+        return copied
+
+
+def _for_numpy(value: Any) -> Any:
+    """The same with such tensors."""
+    if isinstance(value, Tensor):
+        return value.as_subclass(ArrayTensor)
+    if isinstance(value, list | tuple):
+        return type(value)(map(_for_numpy, value))
+    if isinstance(value, Mapping):
+        return {name: _for_numpy(one) for name, one in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{one.name: _for_numpy(getattr(value, one.name)) for one in fields(value)})
+    return value
+
+
+@dataclass(frozen=True, repr=False, eq=False)
 class Registered(RegistrationResult):
     """The outcome of one registration, with what is needed to show it.
 
@@ -48,8 +75,8 @@ class Registered(RegistrationResult):
         detection: OrientedBox | None = None,
     ) -> Registered:
         """The engine's result."""
-        values = {one.name: getattr(result, one.name) for one in fields(RegistrationResult)}
-        return cls(**values, object_name=object_name, notes=notes, detection=detection)
+        values = {one.name: _for_numpy(getattr(result, one.name)) for one in fields(RegistrationResult)}
+        return cls(**values, object_name=object_name, notes=notes, detection=_for_numpy(detection))
 
     @property
     def scale(self) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import regnf_core.batch as engine_batch
 import regnf_core.registration as engine
-from regnf_core.api.fields import FieldLike, Opened, notes_of, opened, opened_several
+from regnf_core.api.fields import FieldLike, Opened, notes_of, opened, opened_pair, opened_several
 from regnf_core.api.registered import Registered
 from regnf_core.batch import ModeledObject
 from regnf_core.detections.objects import BoxLike, detection_of
@@ -55,7 +55,7 @@ def register(
     FIELD_NOT_FINITE), NoSurfaceError, InitializationError.
     """
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
-    place, thing = opened(scene, "scene"), opened(obj, "object")
+    place, thing = opened_pair(scene, obj)
     result = engine.register(place.field, thing.field, box, chosen, seed, progress, warm_start, clouds)
     return Registered.of(result, thing.name, notes_of(place, thing), box)
 

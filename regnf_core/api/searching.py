@@ -13,11 +13,11 @@ from regnf_core.api.registered import Registered
 from regnf_core.api.registering import box_of
 from regnf_core.detections.objects import BoxLike
 from regnf_core.errors import InvalidInputError, NoSurfaceError
-from regnf_core.field_source import FieldSource, find_source
+from regnf_core.field_source import FieldSource, Role, find_source
 from regnf_core.fields.base import SdfField
 from regnf_core.library import Candidate, LibraryObject, model_object, search_library
 from regnf_core.library_files import library_files
-from regnf_core.loading import load_field
+from regnf_core.loading import import_smallest_first, load_field
 from regnf_core.object_models import object_model
 from regnf_core.options import OptionsLike, RobustOptions, options_of, seed_of
 from regnf_core.result import ProgressCallback
@@ -57,6 +57,13 @@ def search(
     chosen, box, seed = options_of(options), box_of(detection), seed_of(seed)
     chosen.require_robust("searches a library", reason="LIBRARY_SEARCH_UNSUPPORTED")
     named = _named(objects)
+    given: list[tuple[FieldLike | LibraryObject, Role]] = [
+        (scene, "scene"),
+        *((one, "object") for one in named.values()),
+    ]
+    import_smallest_first(
+        find_source(Path(one), role=role) for one, role in given if isinstance(one, str | os.PathLike)
+    )
     place = opened(scene, "scene")
     library, unusable = [], {}
     for name, one in named.items():

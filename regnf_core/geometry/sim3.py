@@ -192,7 +192,7 @@ class Sim3:
 
     def matrix(self) -> Tensor:
         """(..., 4, 4) homogeneous matrices."""
-        M = torch.zeros(*self.scale.shape, 4, 4, dtype=self.scale.dtype, device=self.scale.device)
+        M = self.scale.new_zeros(*self.scale.shape, 4, 4)
         M[..., :3, :3] = self.scale[..., None, None] * self.rotation
         M[..., :3, 3] = self.translation
         M[..., 3, 3] = 1.0

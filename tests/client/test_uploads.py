@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import httpx
+import numpy as np
+import open3d
 import pytest
+import trimesh
 
+import regnf
 from regnf_client import Client, ServiceError, UnreachableError
+from regnf_client.batches import BatchReader
+from regnf_client.fields import Deadline
+from regnf_core.importing.meshes.ply import read_ply
 from tests.client.transports import Counted
 from tests.contract.asgi import AppTransport
 from tests.contract.world import BOX, World, field_bytes, sha256
@@ -119,7 +129,7 @@ def test_nothing_is_sent_of_what_the_service_has(world: World, transport: AppTra
     job = client(counted).submit(room, chair, BOX)
     assert job.status == "accepted"
     assert counted.bytes < 2000
-    assert [method for method, _ in counted.requests] == ["GET", "GET", "PATCH", "POST"]
+    assert [method for method, _ in counted.requests] == ["GET", "PATCH", "GET", "POST"], "the smaller file first"
     assert [one.label for one in client(transport).fields()] == ["chair.safetensors", "room.safetensors"]
 
 
@@ -158,3 +168,71 @@ def test_lists_have_every_page(world: World, transport: AppTransport, monkeypatc
     assert [one.sha256 for one in client(transport).fields()] == names[::-1]
     client(transport).delete_field(names[0])
     assert len(client(transport).fields()) == 4
+
+
+def things() -> list[tuple[Any, bytes]]:
+    """Meshes and clouds in memory, and the family of the file that is made of each."""
+    ball = trimesh.creation.icosphere(subdivisions=0)
+    points = open3d.utility.Vector3dVector(ball.vertices)
+    mesh = open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(ball.faces))
+    cloud = open3d.geometry.PointCloud(points)
+    cloud.normals = points
+    opened = regnf.from_mesh(ball.vertices, ball.faces)
+    tensor = open3d.t.geometry.TriangleMesh.from_legacy(mesh)
+    return [(one, b"face") for one in (ball, trimesh.Scene(ball), mesh, tensor, opened)] + [(cloud, b"double nx")]
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_what_lies_in_memory_is_sent_as_a_file(world: World, transport: AppTransport, number: int) -> None:
+    thing, says = things()[number]
+    one = client(transport)
+    with pytest.raises(Exception, match="has not ended"):
+        one.upload(thing, {"label": "ball"}, timeout_s=0.0)
+    (field,) = one.fields()
+    data = world.blobs.blobs[next(key for key in world.blobs.blobs if field.sha256 in key)]
+    assert says in data
+    read = read_ply(memoryview(data))
+    np.testing.assert_allclose(np.linalg.norm(read.vertices, axis=1), 1.0, atol=1e-6)
+    assert len(read.faces) == (0 if says == b"double nx" else 20)
+    assert (field.label, field.description.get("as")) == ("ball", None)
+    with pytest.raises(Exception, match="has not ended"):
+        one.upload(thing, {"label": "ball"}, timeout_s=0.0)
+    assert len(one.fields()) == 1, "the same mesh is the same file"
+
+
+def test_scene_and_object_may_lie_in_memory(world: World, transport: AppTransport) -> None:
+    balls = [trimesh.creation.icosphere(subdivisions=0, radius=radius) for radius in (1.0, 2.0)]
+    one = client(transport)
+    for ball, role in zip(balls, ("scene", "object"), strict=True):
+        with pytest.raises(Exception, match="has not ended"):
+            one.upload(ball, role=role, timeout_s=0.0)
+    thing, room = (field.sha256 for field in one.fields())
+    for name in (room, thing):
+        imported(world, name)
+    assert one.submit(*balls, BOX).id == one.submit(room, thing, BOX).id
+    reader = BatchReader(one._connection.asking(), [], Deadline(None))
+    assert repr(balls[0]) == repr(balls[1])
+    sent = [one._driver.run(reader._upload(ball, role)) for ball, role in zip(balls, ("scene", "scene"), strict=True)]
+    assert sent == [room, thing], "told apart, although they are shown alike"
+
+
+@pytest.mark.parametrize("thing", [{"a": 1}, np.zeros((3, 3)), None, 7, trimesh.Trimesh])
+def test_what_is_no_mesh_is_refused_before_anything_is_sent(transport: AppTransport, thing: Any) -> None:
+    with pytest.raises(regnf.RegnfError, match="expected a field or its path") as caught:
+        client(transport).upload(thing)
+    assert caught.value.reason == "NO_FIELD"
+
+
+def test_a_mesh_in_memory_loads_no_torch() -> None:
+    program = """
+import sys, numpy as np
+from types import SimpleNamespace
+from regnf_client.fields import source_of
+mesh = SimpleNamespace(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+source = source_of(mesh, role="object")
+file = source.file
+assert file.read_bytes().startswith(b"ply") and source.description == {"as": "object"}
+del source
+assert not file.parent.exists() and "torch" not in sys.modules and "scipy" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=100)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.importing.cost.budget import require_within
 from regnf_core.importing.cost.mesh_work import mesh_seconds
 from regnf_core.importing.families.color.head import with_values
@@ -26,6 +27,7 @@ from regnf_core.schema.similarity import local_origin
 _MARGIN = 0.05
 """How far the bounds reach beyond the mesh, in its diagonals: free space from which its surface can be seen."""
 _LARGEST = 1e30
+_SHORTEST = 1e-16
 _BLUNT = 1e-6
 """Of the diagonal: steps between single-precision numbers that are longer are said."""
 _DOUBLED = 0.5
@@ -104,6 +106,7 @@ def solid_of(geometry: Geometry, asked: Asked = None, work_s: float = math.inf) 
     corners = geometry.vertices[np.unique(given)]
     box = [corners.min(axis=0).tolist(), corners.max(axis=0).tolist()]
     origin = local_origin(box)
+    require_extent(math.dist(*box))
     near = geometry.vertices if origin is None else geometry.vertices - np.array(origin)
     vertices, faces, kept, dropped = _welded(near, given)
     require_within(mesh_seconds(vertices, faces, 3 * SAMPLES + PLACES), work_s)
@@ -111,6 +114,13 @@ def solid_of(geometry: Geometry, asked: Asked = None, work_s: float = math.inf) 
     lost = [f"GEOMETRY_IGNORED: not read: {', '.join(geometry.not_applied)}"] if geometry.not_applied else []
     warnings = (*facing.warnings, *lost, *_blunt(corners, box), *_scattered(vertices, facing.faces))
     return Solid(vertices, origin, kept, facing, (*ignored, *dropped), warnings)
+
+
+def require_extent(diagonal: float) -> None:
+    """Raise FieldFormatError (MESH_INVALID) for lengths whose squares single precision cannot hold."""
+    if not _SHORTEST <= diagonal <= 1.0 / _SHORTEST:
+        message = f"its diagonal is {diagonal:.3g}, expected {_SHORTEST:g} to {1.0 / _SHORTEST:g}"
+        raise FieldFormatError(message, reason="MESH_INVALID", hint="Give it in another unit, or without stray points.")
 
 
 def _oriented(vertices: Float64Array, faces: Int64Array, asked: Asked) -> Facing:

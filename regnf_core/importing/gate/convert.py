@@ -262,7 +262,7 @@ def run(
         asked = [{"name": one.name, "description": one.say} for one in error.asked]
         return {"reason": error.reason, "detail": str(error), "candidates": asked}
     except FieldFormatError as error:
-        return {"reason": error.reason, "detail": str(error)}
+        return {"reason": error.reason, "detail": str(error), "hint": error.hint}
     except MemoryError:
         return {"reason": "IMPORT_OUT_OF_MEMORY", "detail": limits.no_memory()}
     except OSError as error:

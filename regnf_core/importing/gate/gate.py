@@ -68,10 +68,12 @@ def import_field(
     one file or an archive of several. cameras: where those stood whose images the field was made from, likewise.
     The upload may be an archive of a whole run; then it brings its settings along.
 
+    limits: None takes those of the machine.
+
     Raises FieldFormatError with the reason (docs/import-gate.md lists them), FileNotFoundError without an upload, and
     OSError when the disk is full.
     """
-    limits = limits or ImportLimits()
+    limits = limits or ImportLimits.of_the_machine()
     shown = {"picture": picture, "ask_by_picture": picture or ask_by_picture}
     request = _request(description, limits, shown, settings, cameras)
     files = [path.resolve(strict=True) for path in (upload, settings, cameras) if path is not None]
@@ -165,10 +167,16 @@ def _values_of(outcome: ChildOutcome, work: Path, limits: ImportLimits, seconds:
         return values
     if not isinstance(reason, str) or not _REASON.fullmatch(reason):
         raise FieldFormatError("the import ended without a result", reason="IMPORT_CRASHED")
-    detail = "".join(c for c in str(values.get("detail"))[:_MAX_DETAIL] if c.isprintable())
+    detail, hint = (_printable(values.get(name)) for name in ("detail", "hint"))
     if reason == "STORAGE_FULL":
         raise OSError(errno.ENOSPC, detail)
-    raise FieldFormatError(detail, reason=reason, candidates=read_candidates(values.get("candidates"), work))
+    raise FieldFormatError(
+        detail, reason=reason, hint=hint or None, candidates=read_candidates(values.get("candidates"), work)
+    )
+
+
+def _printable(text: Any) -> str:
+    return "".join(c for c in str(text or "")[:_MAX_DETAIL] if c.isprintable())
 
 
 def _parse(stdout: bytes) -> dict[str, Any] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,13 @@ class ImportLimits:
     """All tensors of the field together, as float32; then TENSOR_TOO_LARGE."""
     file_bytes: int = 4096 * MIB
     """Largest file the import may write; then IMPORT_OUTPUT_TOO_LARGE."""
+
+    @classmethod
+    def of_the_machine(cls) -> ImportLimits:
+        """Those of a person's own file on the person's own machine: no time, and all of its memory, 8 GiB at least;
+        tensors and files of half of it."""
+        memory = max(cls.memory_bytes, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        return cls(memory_bytes=memory, tensor_bytes=memory // 2, file_bytes=memory // 2)
 
     @property
     def longest_s(self) -> float:
@@ -55,7 +63,8 @@ _WORDS_OF_THE_FILE = """
     LEGACY_MALFORMED LEGACY_TORCH_FILE MESH_EXTERNAL_REFERENCE MESH_INVALID MESH_TOO_LARGE NO_ZERO_LEVEL
     NPY_MALFORMED NPY_OBJECT_ARRAY ONNX_EXTERNAL_DATA ONNX_GRAPH_INVALID ONNX_MALFORMED ONNX_NOT_SUPPORTED
     PICKLE_INTEGER_TOO_LARGE PICKLE_MALFORMED PICKLE_OPCODE_NOT_ALLOWED PICKLE_PROTOCOL PICKLE_STRING_TOO_LARGE
-    PICKLE_TOO_COMPLEX PICKLE_TOO_DEEP PICKLE_TOO_LARGE PICKLE_TRAILING_DATA POINT_CLOUD_WITHOUT_NORMALS
+    PICKLE_TOO_COMPLEX PICKLE_TOO_DEEP PICKLE_TOO_LARGE PICKLE_TRAILING_DATA POINT_CLOUD_NORMALS_DISAGREE
+    POINT_CLOUD_TOO_SMALL POINT_CLOUD_WITHOUT_NORMALS
     RAW_PICKLE RUN_TOO_LARGE RUN_WITHOUT_CHECKPOINT SAFETENSORS_DUPLICATE_KEY SAFETENSORS_HEADER_MALFORMED
     SAFETENSORS_HEADER_TOO_LARGE SAFETENSORS_LAYOUT SAFETENSORS_TOO_MANY_TENSORS SAFE_FORMAT_INVALID
     SAFE_FORMAT_VERSION SETTINGS_CONTRADICT_TENSORS SETTINGS_MALFORMED SETTINGS_NOT_RECOGNIZED

@@ -88,3 +88,24 @@ def _index_property(element: Element) -> str:
     if len(found) != 1:
         raise malformed("PLY faces or strips without one list of vertex indices")
     return found[0]
+
+
+def ply_bytes(geometry: Geometry) -> bytes:
+    """A binary file of the geometry, places as they are in float64, that ``read_ply`` reads."""
+    columns = [("x", geometry.vertices[:, 0], "<f8"), ("y", geometry.vertices[:, 1], "<f8")]
+    columns.append(("z", geometry.vertices[:, 2], "<f8"))
+    if geometry.normals is not None:
+        columns += [(name, geometry.normals[:, axis], "<f8") for axis, name in enumerate(("nx", "ny", "nz"))]
+    if geometry.colors is not None:
+        levels = np.rint(255.0 * geometry.colors)
+        columns += [(name, levels[:, axis], "u1") for axis, name in enumerate(_COLOR_NAMES[0])]
+    rows = np.empty(len(geometry.vertices), [(name, kind) for name, _, kind in columns])
+    for name, values, _ in columns:
+        rows[name] = values
+    faces = np.empty(len(geometry.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, geometry.faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {'double' if kind == '<f8' else 'uchar'} {name}" for name, _, kind in columns]
+    if len(faces):
+        header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    return "\n".join([*header, "end_header", ""]).encode() + rows.tobytes() + faces.tobytes()

@@ -15,6 +15,7 @@ import trimesh
 from torch import Tensor
 
 import regnf
+from regnf_core import loading
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 V, F = np.asarray(BALL.vertices), np.asarray(BALL.faces)
@@ -115,7 +116,7 @@ def test_a_function_is_a_field(function: Callable[[Tensor], Any], sign: int) -> 
         (lambda: regnf.from_mesh(V, F[:0]), "MESH_INVALID", "(0, 3)"),
         (lambda: regnf.from_mesh(V + 1j, F), "MESH_INVALID", "complex128"),
         (lambda: regnf.from_mesh([[0, 0, 0], [1]], F), "MESH_INVALID", "vertices"),
-        (lambda: regnf.from_mesh(None, F), "MESH_INVALID", "object"),
+        (lambda: regnf.from_mesh(None, F), "MESH_INVALID", "nothing"),
         (lambda: regnf.from_mesh(V * np.nan, F), "MESH_INVALID", "finite"),
         (lambda: regnf.from_mesh(V * [1, 0, 0], F), "MESH_INVALID", "no triangle of the mesh has an area"),
         (lambda: regnf.from_points(V, None), "POINT_CLOUD_WITHOUT_NORMALS", "estimate_normals"),
@@ -208,3 +209,33 @@ def test_a_box_s_file_is_read_or_said_why_not(tmp_path: Path) -> None:
         with pytest.raises(regnf.RegnfError) as caught:
             regnf.register(BALL, BALL, box)
         assert caught.value.reason == reason
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda room, cloud, box: regnf.register(room, cloud, box),
+        lambda room, cloud, box: regnf.register(cloud, room, box),
+        lambda room, cloud, box: regnf.register(room, {"points": cloud}, box),
+        lambda room, cloud, box: regnf.search(room, [cloud], box),
+    ],
+)
+def test_what_is_refused_is_refused_before_a_large_file_is_imported(
+    ask: Callable[..., object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    imported: list[str] = []
+
+    def of_file(source: Any, cache_dir: Path) -> Any:
+        imported.append(source.file.name)
+        return import_(source, cache_dir)
+
+    import_ = loading._imported
+    monkeypatch.setattr(loading, "_imported", of_file)
+    BALL.export(tmp_path / "room.ply")
+    open3d.io.write_point_cloud(
+        str(tmp_path / "cloud.ply"), open3d.geometry.PointCloud(open3d.utility.Vector3dVector(V[:20]))
+    )
+    with pytest.raises(regnf.RegnfError) as caught:
+        ask(tmp_path / "room.ply", tmp_path / "cloud.ply", CUBE)
+    assert caught.value.reason in ("POINT_CLOUD_WITHOUT_NORMALS", "NO_FIELD")
+    assert "room.ply" not in imported

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
+import io
 import json
-from collections.abc import Callable
+import pickle
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 import regnf
@@ -183,3 +188,50 @@ def test_short_words_for_transforms_and_fields() -> None:
     assert repr(regnf.Sim3.identity()[None]) == "Sim3(1 transforms)"
     assert len(repr(regnf.open_field(CHAIR))) < 150
     assert "bounds" in repr(regnf.open_field(CHAIR))
+
+
+def members(value: Any, place: str = "result") -> Iterator[tuple[str, Any]]:
+    """All that can be reached from a value by public attributes, entries and items."""
+    yield place, value
+    parts: list[tuple[str, Any]] = []
+    if dataclasses.is_dataclass(value):
+        names = [name for name in dir(value) if not name.startswith("_")]
+        parts = [(f".{name}", getattr(value, name)) for name in names if not callable(getattr(value, name))]
+    elif isinstance(value, dict):
+        parts = [(f"[{name!r}]", one) for name, one in value.items()]
+    elif isinstance(value, list | tuple):
+        parts = [("[0]", one) for one in value[:1]]
+    for name, one in parts:
+        yield from members(one, place + name)
+
+
+@pytest.mark.filterwarnings("error")
+def test_numpy_takes_every_member_of_a_result(found: regnf.Registered) -> None:
+    arrays = {place: one for place, one in members(found) if hasattr(one, "__array__")}
+    assert {"result.covariance", "result.detection.center", "result.residuals['scene_points']"} <= arrays.keys()
+    assert {"result.T_scene_object.rotation", "result.trace[0].T_object_scene.scale"} <= arrays.keys()
+    arrays["matrix"] = found.T_scene_object.matrix()
+    arrays["inverse"] = found.T_scene_object.inverse().translation
+    for place, one in arrays.items():
+        assert np.array_equal(np.array(one), np.asarray(one)), place
+        assert np.array(one, copy=True).base is None or np.array(one).flags.owndata, place
+        assert np.array(one, dtype="f4").dtype == np.float32, place
+        if isinstance(one, torch.Tensor):
+            assert np.shares_memory(np.array(one, copy=False), np.asarray(one)), place
+
+
+@pytest.mark.filterwarnings("error")
+def test_results_can_be_copied_stored_and_put_into_json(found: regnf.Registered) -> None:
+    stream = io.BytesIO()
+    torch.save(found, stream)
+    stream.seek(0)
+    copies = (copy.deepcopy(found), pickle.loads(pickle.dumps(found)), torch.load(stream, weights_only=False))
+    for again in (*copies, dataclasses.replace(found, seed=1), copy.copy(found)):
+        assert torch.equal(again.covariance, found.covariance)
+        assert np.array_equal(np.array(again.covariance), np.array(found.covariance))
+        assert torch.equal(again.T_scene_object.matrix(), found.T_scene_object.matrix())
+    assert found != copies[0]
+    assert len({found, found, copies[0]}) == 2
+    for plain in (found.metrics, found.options, found.uncertainty, found.to_dict(), found.probability, found.scale):
+        assert json.loads(json.dumps(plain)) == plain
+    assert float(found.T_object_scene.scale) == found.scale

@@ -18,9 +18,10 @@ import pytest
 import torch
 
 import regnf_core
+from regnf_core import loading
 from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
-from regnf_core.importing.gate import gate
+from regnf_core.importing.gate import gate, report
 from regnf_core.importing.gate.gate import FIELD_NAME, ImportLimits, import_field
 from regnf_core.importing.gate.report import MIB, OF_THE_CIRCUMSTANCES, OF_THE_FILE
 from tests.core.importing.archives import assert_refused, saved, text, torch_zip
@@ -136,9 +137,35 @@ def test_a_late_import_says_how_long_it_had(upload: Path, tmp_path: Path) -> Non
 
 def test_a_persons_own_import_has_no_limit_on_time() -> None:
     """Neither by the clock, nor by the processor, nor by an estimate."""
-    limits = ImportLimits()
+    limits = ImportLimits.of_the_machine()
     assert (limits.longest_s, limits.refused_beyond_s) == (math.inf, math.inf)
     assert ImportLimits(wall_s=9, work_s=5).refused_beyond_s == 5
+
+
+@pytest.mark.parametrize(("machine", "memory"), [(64 << 30, 64 << 30), (2 << 30, 8 << 30)])
+def test_a_persons_own_import_may_have_the_memory_of_the_machine(
+    upload: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, machine: int, memory: int
+) -> None:
+    asked: list[ImportLimits] = []
+
+    def once(files: list[Path], out_dir: Path, request: bytes, limits: ImportLimits, started: float) -> None:
+        del files, out_dir, started
+        asked.append(limits)
+        assert json.loads(request)["limits"]["memory_bytes"] == limits.memory_bytes
+        raise FieldFormatError("seen")
+
+    known = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": machine // 4096}
+    monkeypatch.setattr(report.os, "sysconf", known.__getitem__)
+    monkeypatch.setattr(gate, "_import_once", once)
+    for call in (
+        lambda: import_field(upload, tmp_path / "out"),
+        lambda: loading.open_field(upload, cache_dir=tmp_path),
+    ):
+        with pytest.raises(FieldFormatError, match="seen"):
+            call()
+    (first, second) = asked
+    assert first == second
+    assert (first.memory_bytes, first.tensor_bytes, first.file_bytes) == (memory, memory // 2, memory // 2)
 
 
 NO_REASONS = frozenset(

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from regnf_core.errors import FieldFormatError
 from regnf_core.fields.build import open_field
 from regnf_core.fields.mesh import MeshField
 from regnf_core.importing.families import point_cloud
@@ -18,7 +19,7 @@ from regnf_core.importing.families.converted import ConvertedField
 from regnf_core.importing.families.mesh import convert_mesh
 from regnf_core.importing.gate.gate import import_field
 from regnf_core.importing.upload_description import UploadDescription
-from tests.core.importing.archives import assert_refused, saved
+from tests.core.importing.archives import saved
 
 DIAGONAL = 3**0.5
 
@@ -84,16 +85,120 @@ def test_where_no_points_are_there_is_no_surface() -> None:
     assert field.signed_distance(torch.tensor([[0.0, 0.0, 0.5]])).abs().item() < 0.003
 
 
+LINE = np.linspace(0.0, 1.0, 500)[:, None] * [1.0, 2.0, 3.0]
+HALF_ZERO = np.where(np.arange(4000)[:, None] % 2 == 0, directions(4000), 0.0)
+
+
 @pytest.mark.parametrize(
-    ("points", "normals", "reason"),
+    ("points", "normals", "reason", "says"),
     [
-        (directions(500), None, "POINT_CLOUD_WITHOUT_NORMALS"),
-        (directions(50), directions(50), "MESH_INVALID"),
-        (directions(500), np.zeros((500, 3)), "MESH_INVALID"),
-        (np.full((500, 3), np.nan), directions(500), "MESH_INVALID"),
-        (np.zeros((500, 3)), directions(500), "MESH_INVALID"),
-        (np.zeros((0, 3)), None, "MESH_INVALID"),
+        (directions(500), None, "POINT_CLOUD_WITHOUT_NORMALS", "needs normals"),
+        (directions(500), np.zeros((500, 3)), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are zero"),
+        (directions(500), np.full((500, 3), np.inf), "POINT_CLOUD_WITHOUT_NORMALS", "500 points whose normals are no"),
+        (directions(50), directions(50), "POINT_CLOUD_TOO_SMALL", "50 of 50 points"),
+        (np.full((500, 3), np.nan), directions(500), "POINT_CLOUD_TOO_SMALL", "500 points that are no finite numbers"),
+        (np.zeros((500, 3)), directions(500), "POINT_CLOUD_TOO_SMALL", "the 500 points lie at 1 places"),
+        (np.tile(directions(9), (100, 1)), np.tile(directions(9), (100, 1)), "POINT_CLOUD_TOO_SMALL", "at 9 places"),
+        (LINE, directions(500), "POINT_CLOUD_TOO_SMALL", "on one line"),
+        (1e-30 * directions(500), directions(500), "MESH_INVALID", "its diagonal is"),
+        (np.zeros((0, 3)), None, "MESH_INVALID", "no triangles"),
     ],
 )
-def test_clouds_of_no_surface(points: NDArray[np.float64], normals: NDArray[np.float64] | None, reason: str) -> None:
-    assert_refused(lambda: converted(ply(points, normals)), reason)
+def test_clouds_of_no_surface(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64] | None,
+    reason: str,
+    says: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Refused before the surface is made, which takes long."""
+    monkeypatch.setattr(point_cloud, "_poisson", lambda *_: pytest.fail("a surface was made of it"))
+    with pytest.raises(FieldFormatError, match=says) as caught:
+        converted(ply(points, normals))
+    assert caught.value.reason == reason
+
+
+def test_points_without_a_normal_are_left_out_and_counted() -> None:
+    found = converted(ply(directions(4000), HALF_ZERO))
+    assert "ignored: 2000 points whose normals are zero" in found.why
+
+
+def boxes(*sizes: tuple[float, float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """20,000 points on boxes beside each other, their normals, and the numbers of their sides."""
+    random, points, normals, sides = np.random.default_rng(0), [], [], []
+    areas = np.array([[size[1] * size[2], size[0] * size[2], size[0] * size[1]] for size in sizes])
+    for number, size in enumerate(sizes):
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                count = int(10_000 * areas[number, axis] / areas.sum())
+                place = (random.random((count, 3)) - 0.5) * size
+                place[:, axis] = sign * size[axis] / 2
+                points.append(place + np.array([2.0 * number, 0.0, 0.0]))
+                normals.append(np.tile(sign * np.eye(3)[axis], (count, 1)))
+                sides.append(np.full(count, 6 * number + 2 * axis + (sign > 0)))
+    return np.concatenate(points), np.concatenate(normals), np.concatenate(sides)
+
+
+BALL = directions(10_000)
+CROSS = boxes((1.0, 1.0, 0.02), (0.02, 0.9, 0.6))
+BOARDS = boxes((1.0, 1.0, 1.0), (1.0, 1.0, 0.02), (0.02, 1.0, 0.6))
+
+
+def turned(normals: NDArray[np.float64], which: NDArray[np.bool_]) -> NDArray[np.float64]:
+    return np.where(which[:, None], -normals, normals)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize(
+    ("points", "normals", "says"),
+    [
+        (BALL, turned(BALL, BALL[:, 2] > 0), "one patch meets another"),
+        (BALL, turned(BALL, np.prod(np.sign(BALL), axis=1) > 0), "one patch meets another"),
+        (BALL, turned(BALL, BALL[:, 0] > 0.8), "one patch meets another"),
+        (BALL, turned(BALL, np.random.default_rng(0).random(len(BALL)) < 0.5), "mixed at one place"),
+        (BOARDS[0], turned(BOARDS[1], BOARDS[2] % 4 == 1), "looks inward"),
+    ],
+)
+def test_clouds_whose_normals_are_turned_in_patches_are_refused(
+    points: NDArray[np.float64], normals: NDArray[np.float64], says: str, noise: float
+) -> None:
+    points = points + noise * np.random.default_rng(1).normal(size=points.shape)
+    with pytest.raises(FieldFormatError, match=says) as caught:
+        converted(ply(points, normals))
+    assert caught.value.reason == "POINT_CLOUD_NORMALS_DISAGREE"
+    assert "orient_normals" in (caught.value.hint or "")
+
+
+@pytest.mark.parametrize("spacings", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize(
+    "cloud",
+    [
+        (BALL, BALL),
+        (-BALL, BALL),
+        BOARDS[:2],
+        boxes((1.0, 1.0, 0.02))[:2],
+        (CROSS[0] - 2.0 * (CROSS[2] // 6)[:, None] * [1, 0, 0], CROSS[1]),
+    ],
+    ids=["ball", "hollow", "boards", "board", "boards that cross"],
+)
+@pytest.mark.parametrize("count", [1000, 9000])
+def test_noisy_clouds_of_thin_boards_and_edges_are_not_taken_for_turned(
+    cloud: tuple[NDArray[np.float64], NDArray[np.float64]], spacings: float, count: int
+) -> None:
+    random = np.random.default_rng(2)
+    chosen = random.permutation(len(cloud[0]))[:count]
+    points, normals = cloud[0][chosen], cloud[1][chosen]
+    apart = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
+    point_cloud._require_agreeing(points + spacings * apart * random.normal(size=points.shape), normals)
+
+
+def test_who_insists_is_given_the_surface_of_turned_normals() -> None:
+    half = turned(BALL, BALL[:, 2] > 0)[:3000]
+    found = convert_mesh("ply", memoryview(ply(BALL[:3000], half)), UploadDescription(accept_implausible=True))
+    assert found.family == "point_cloud"
+
+
+def test_a_refusal_s_own_hint_comes_out_of_the_gate(tmp_path: Path) -> None:
+    with pytest.raises(FieldFormatError) as caught:
+        import_field(saved(tmp_path, ply(1e-30 * BALL, BALL)), tmp_path / "out")
+    assert caught.value.hint == "Give it in another unit, or without stray points."
