@@ -62,6 +62,9 @@ class GuardedProtocol(H11Protocol):
             transport.close()
             return
         _set_options(transport.get_extra_info("socket"))
+        # A round of the loop reads once from each connection: a hundred that send 256 KiB each, the default size, would
+        # make everybody wait a quarter of a second.
+        transport.max_size = _BLOCK_BYTES  # type: ignore[attr-defined]
         transport.set_write_buffer_limits(high=0)  # so that what is not read at once is counted, and ends the writing
         super().connection_made(transport)
 
