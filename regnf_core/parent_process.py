@@ -1,4 +1,4 @@
-"""A process that does not outlive its parent."""
+"""A process that does not outlive its parent, and the memory that there is."""
 
 from __future__ import annotations
 
@@ -20,3 +20,8 @@ def die_with_parent(parent_pid: int) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent_pid:  # the parent died before this call
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def memory_of_the_machine() -> int:
+    """All of it, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

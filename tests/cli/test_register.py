@@ -29,6 +29,7 @@ def exact(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     fields = {"room.safetensors": room(truth), "chair.safetensors": chair()}
     for name in fields:
         (tmp_path / name).write_bytes(bytes(8) + b"{")
+    monkeypatch.setattr("regnf_core.loading.safe_field", lambda one: None)
     monkeypatch.setattr("regnf_core.loading.load_field", lambda one: LoadedField(fields[one.file.name], NO_NOTES))
     box = chair_box(truth)
     (tmp_path / "box.json").write_text(json.dumps({"center": box.center.tolist(), "size": box.size.tolist()}))
@@ -44,6 +45,7 @@ def symmetric(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[object]:
     fields = {"room.safetensors": table_room(truth), "table.safetensors": slab_table()}
     for name in fields:
         (tmp_path / name).write_bytes(bytes(8) + b"{")
+    monkeypatch.setattr("regnf_core.loading.safe_field", lambda one: None)
     monkeypatch.setattr("regnf_core.loading.load_field", lambda one: LoadedField(fields[one.file.name], NO_NOTES))
     (tmp_path / "box.json").write_text('{"min": [-0.48, -0.33, -0.03], "max": [0.48, 0.33, 0.49]}')
     return ["register", *(tmp_path / name for name in fields), "--detection", tmp_path / "box.json"]

@@ -60,7 +60,7 @@ def test_records_that_are_away_are_said_to_be_away(world: World, monkeypatch: py
         ("get_job", "GET", "/jobs/x"),
         ("list_jobs", "GET", "/jobs"),
         ("get_field", "GET", "/fields/" + "0" * 64),
-        ("create_job", "POST", "/register"),
+        ("create_jobs", "POST", "/register"),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(world.records, name, away)

@@ -129,7 +129,7 @@ SERVERS = [
     Case("no token", "UNAUTHENTICATED", 2, "UNAUTHENTICATED", "token", "REGNF_API_TOKEN", refusing(401, {"reason": "UNAUTHENTICATED", "detail": "Send a token."})),
     Case("no worker", "NO_WORKER", 3, "no live worker", "for 0 s", "regnf worker", without_worker("jobs")),
     Case("queue full", "QUEUE_FULL", 3, "QUEUE_FULL", "as many", "again later", refusing(503, {"reason": "QUEUE_FULL", "detail": "as many jobs as it takes"})),
-    Case("a field that was rejected", "FIELD_SHAPES", 2, "room.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, json.dumps({"state": "rejected" if method == "GET" and "wait" not in path else "ready", "error": {"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}}))),
+    Case("a field that was rejected", "FIELD_SHAPES", 2, "chair.safetensors: wrong shapes", "wrong shapes", "another", lambda method, path: (200, json.dumps({"state": "rejected" if method == "GET" and "wait" not in path else "ready", "error": {"reason": "FIELD_SHAPES", "detail": "wrong shapes", "hint": "Try another."}}))),
 ]  # fmt: skip
 
 

@@ -231,7 +231,7 @@ def test_what_is_typed_before_the_fields_are_listed_stays(visit: Visit, filled: 
 def test_two_clicks_open_one_dialog(visit: Visit, filled: str) -> None:
     page = visit.page
     page.goto(f"{filled}/jobs")
-    held = Held(page, "**/jobs/*/result")
+    held = Held(page, "**/jobs/*/request")
     page.get_by_role("button", name="Run again").dblclick()
     held.wait()
     expect(page.locator("dialog[open]")).to_have_count(1)

@@ -100,6 +100,15 @@ def test_a_job_that_crashes_its_process_is_lost_and_its_worker_goes_on(table: Be
     assert_next_job_runs(table)
 
 
+def test_what_a_killed_process_was_writing_goes_with_it(table: Bench) -> None:
+    table.start_worker()
+    table.submit("die_while_writing")
+    assert table.finished().status == "failed"
+    left = table.context.settings.blob_dir / ".tmp"
+    eventually(lambda: not list(left.iterdir()), "no unfinished file")
+    assert_next_job_runs(table)
+
+
 def test_a_job_that_ends_without_a_word_is_run_again_once(table: Bench) -> None:
     table.start_worker()
     table.submit("leave")

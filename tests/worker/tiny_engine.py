@@ -20,6 +20,7 @@ from redis.exceptions import RedisError
 from regnf_core.errors import NoSurfaceError
 from regnf_core.library_entries import EntryNotes
 from regnf_core.rendering.request import RenderRequest
+from regnf_state.blobs.local import LocalBlobStore
 from regnf_state.manifest import EDITED_FIELD
 from regnf_state.registration_request import RegistrationRequest
 from regnf_state.settings import Settings
@@ -119,6 +120,11 @@ class TinyEngine:
 
     def crash(self, report: Report) -> None:
         raise ZeroDivisionError("secret value 42")
+
+    def die_while_writing(self, report: Report) -> None:
+        writer = LocalBlobStore(Settings().blob_dir, existing=True).writer()
+        writer.write(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
 
     def exhaust(self, report: Report) -> None:
         raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 1 bytes")

@@ -248,6 +248,7 @@ class RegnfWorker(ResilientWorker):
         def settle() -> None:
             self._scratch.drop(folder)
             self._write_down(work, lambda: give_up_rest(self._context, work.argument))
+            self._sweep()
 
         until = time.monotonic() + self._context.settings.lost_after_s
         while not self._finishing.is_free(self.job_monitoring_interval):
@@ -283,6 +284,15 @@ class RegnfWorker(ResilientWorker):
         settle = self._settlers[work.kind]
 
         self._write_down(work, lambda: settle(self._context, work.argument, work.attempt, self.name, end))
+        if end.signal is not None:
+            self._sweep()
+
+    def _sweep(self) -> None:
+        """Delete what a killed process was writing. Local files are locked while they are written; those of an object
+        store are not, so housekeeping goes by their age."""
+        if self._context.settings.storage_url is None:
+            with suppress(OSError):
+                self._context.blobs.sweep(0.0)
 
     def _write_down(self, work: Work, settle: Callable[[], None]) -> None:
         def write_down() -> None:

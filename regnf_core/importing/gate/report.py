@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from dataclasses import dataclass
 from typing import Any
+
+from regnf_core.parent_process import memory_of_the_machine
 
 MIB = 1024 * 1024
 
@@ -32,7 +33,7 @@ class ImportLimits:
     def of_the_machine(cls) -> ImportLimits:
         """Those of a person's own file on the person's own machine: no time, and all of its memory, 8 GiB at least;
         tensors and files of half of it."""
-        memory = max(cls.memory_bytes, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+        memory = max(cls.memory_bytes, memory_of_the_machine())
         return cls(memory_bytes=memory, tensor_bytes=memory // 2, file_bytes=memory // 2)
 
     @property

@@ -154,8 +154,7 @@ def test_a_persons_own_import_may_have_the_memory_of_the_machine(
         assert json.loads(request)["limits"]["memory_bytes"] == limits.memory_bytes
         raise FieldFormatError("seen")
 
-    known = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": machine // 4096}
-    monkeypatch.setattr(report.os, "sysconf", known.__getitem__)
+    monkeypatch.setattr(report, "memory_of_the_machine", lambda: machine)
     monkeypatch.setattr(gate, "_import_once", once)
     for call in (
         lambda: import_field(upload, tmp_path / "out"),
