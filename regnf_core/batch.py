@@ -10,18 +10,17 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from regnf_core.errors import CancelledError, RegnfError
-from regnf_core.fields.base import SdfField
+from regnf_core.fields.observation import SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.options import RegistrationOptions
 from regnf_core.pairs import pairs_of
-from regnf_core.result import Phase, ProgressCallback, RegistrationResult
-from regnf_core.robust.devices import working_device
+from regnf_core.result import STARTS, Phase, ProgressCallback, RegistrationResult, Run
 from regnf_core.robust.fused.parts import Sizes
 from regnf_core.robust.fused.registering import SampledPair, register_together
-from regnf_core.robust.model.object_model import ObjectModel, model_object
+from regnf_core.robust.model import ObjectModel, model_object
 from regnf_core.robust.pipeline import WarmStart, cloud_region, register_robust
-from regnf_core.robust.scene.scene_view import SceneView, view_scene
-from regnf_core.run import STARTS, Run
+from regnf_core.robust.scene import SceneView, view_scene
+from regnf_core.robust.working_frame import working_device
 from regnf_core.surface.result_clouds import with_clouds
 
 _T = TypeVar("_T")

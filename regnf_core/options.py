@@ -13,8 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge, Gt, Le
 from pydantic import TypeAdapter, ValidationError
 
-from regnf_core.errors import InvalidOptionsError
-from regnf_core.hints import nearest_name
+from regnf_core.errors import InvalidOptionsError, nearest_name
 
 Preset = Literal["paper", "robust"]
 Axis = Literal["x", "y", "z"]

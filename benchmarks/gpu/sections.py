@@ -15,7 +15,7 @@ from benchmarks.gpu.pairs import Pair, batch_of, field_at, model_at
 from benchmarks.gpu.report import Section
 from regnf_core import RegistrationOptions, RegistrationResult, RegnfError, WarmStart
 from regnf_core.batch import BatchOutcome, ModeledObject, register_batch
-from regnf_core.registration import register
+from regnf_core.library import register
 
 MOST_APART = 1e-4
 """Diameters. Largest distance between the CPU's pose and the device's."""

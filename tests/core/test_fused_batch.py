@@ -14,8 +14,7 @@ from torch import Tensor
 from regnf_core import batch
 from regnf_core.batch import BatchOutcome, register_batch
 from regnf_core.errors import CancelledError, FieldFormatError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.observation import Observation, ObservedField
+from regnf_core.fields.observation import Observation, ObservedField, SdfField
 from regnf_core.geometry.box import OrientedBox
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions

@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from regnf_core.errors import InvalidInputError, RegnfError
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField
+from regnf_core.robust.constants.model import Stage
 from regnf_core.robust.fused.parts import Part, Sizes, parts_of
 from regnf_core.robust.fused.stacking import StackedSurfaces, kind_of
-from regnf_core.robust.refine.coarse_to_fine import Descent, refined, survivors
-from regnf_core.robust.refine.levenberg_marquardt import Settings
+from regnf_core.robust.refine.levenberg_marquardt import Descent, Settings, refined, survivors
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import DistanceModel, SurfacePair
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBounds
-from regnf_core.robust.stage import Stage
+from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBounds
 from regnf_core.robust.working_frame import WorkingField
 
 OnStep = Callable[[float], None]

@@ -10,8 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.robust.fused.parts import Part
 from regnf_core.robust.residuals import DistanceModel
 from regnf_core.robust.search.distance_grid import DistanceGrid, GridCells

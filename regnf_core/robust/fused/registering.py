@@ -8,30 +8,28 @@ from dataclasses import dataclass, field
 import torch
 
 from regnf_core.errors import CancelledError, RegnfError
-from regnf_core.fields.base import SdfField
-from regnf_core.fields.counting import CountingField
+from regnf_core.fields.observation import CountingField, SdfField
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.options import RegistrationOptions
-from regnf_core.result import Phase, RegistrationResult
+from regnf_core.result import STARTS, Phase, RegistrationResult, Run
 from regnf_core.robust.constants import REFINEMENT
 from regnf_core.robust.fused.lock_step import OnStep, all_coarse_to_fine
 from regnf_core.robust.fused.parts import Sizes
-from regnf_core.robust.model.object_model import ObjectModel
+from regnf_core.robust.model import ObjectModel
 from regnf_core.robust.pipeline import (
     Start,
     evaluate_with,
     last_descent,
     refinement_start,
+    result_of,
     search_start,
     starts_of,
 )
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.coarse_to_fine import Descent
+from regnf_core.robust.refine.levenberg_marquardt import Descent
 from regnf_core.robust.refine.pose_candidates import PoseCandidates
-from regnf_core.robust.report import result_of
-from regnf_core.robust.scene.scene_view import SceneView
+from regnf_core.robust.scene import SceneView
 from regnf_core.robust.verdict.evaluation import Evaluation
-from regnf_core.run import STARTS, Run
 
 
 @dataclass(frozen=True, eq=False)

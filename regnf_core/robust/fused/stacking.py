@@ -12,7 +12,7 @@ from regnf_core.robust.fused.models import PartModel, Stack, stack_of
 from regnf_core.robust.fused.parts import Part
 from regnf_core.robust.fused.unobserved import Stacked, of_part, stacked_tests
 from regnf_core.robust.residuals import SurfacePair
-from regnf_core.robust.samples import Samples
+from regnf_core.robust.working_frame import Samples
 
 
 def kind_of(pair: SurfacePair) -> str:

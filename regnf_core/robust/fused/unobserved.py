@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from regnf_core.robust.fused.parts import Part
-from regnf_core.robust.samples import UnobservedTest
-from regnf_core.robust.scene.occlusion_boundary import SingleView
-from regnf_core.robust.working_frame import VoxelStates, WorkingObservation
+from regnf_core.robust.scene import SingleView
+from regnf_core.robust.working_frame import UnobservedTest, VoxelStates, WorkingObservation
 
 Stacked = VoxelStates | SingleView
 """Of P pairs: with one more dimension in front."""

@@ -9,13 +9,11 @@ import pytest
 import torch
 
 from regnf_core.fields.hash_encoding import HashEncoding
-from regnf_core.fields.hash_planes import planes_of
-from regnf_core.fields.neus_facto import NeusFactoField, build_neus_facto
+from regnf_core.fields.neus_facto import NeusFactoField, NeusFactoPlanes, build_neus_facto, planes_of, prepared
 from regnf_core.fields.neus_facto_function import NeusFactoFunction
-from regnf_core.fields.neus_facto_planes import NeusFactoPlanes, prepared
 from regnf_core.schema.description import FieldDescription
 from regnf_core.schema.hash_grid_config import HashGridConfig
-from regnf_core.schema.parsing import parse_description
+from regnf_core.schema.safe_format import parse_description
 from tests.core.fields.small_field import GRID, description, tensors
 
 

@@ -9,15 +9,15 @@ import torch
 
 from regnf_core.geometry.sim3 import Sim3
 from regnf_core.robust.constants import SEARCH
+from regnf_core.robust.constants.model import Stage
 from regnf_core.robust.fused.lock_step import all_coarse_to_fine
 from regnf_core.robust.fused.parts import Sizes
-from regnf_core.robust.model.object_model import model_object
+from regnf_core.robust.model import model_object
 from regnf_core.robust.pipeline import search_start
 from regnf_core.robust.problem import RegistrationProblem, make_problem
-from regnf_core.robust.refine.coarse_to_fine import Descent, coarse_to_fine
-from regnf_core.robust.scene.scene_view import view_scene
-from regnf_core.robust.search.scale_bound import ANY_SCALE, ScaleBounds
-from regnf_core.robust.stage import Stage
+from regnf_core.robust.refine.levenberg_marquardt import Descent, coarse_to_fine
+from regnf_core.robust.scene import view_scene
+from regnf_core.robust.search.bounds import ANY_SCALE, ScaleBounds
 from tests.core.analytic import chair, chair_pose, room
 from tests.core.robust.shapes import ROBUST, detection
 
