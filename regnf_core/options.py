@@ -161,11 +161,6 @@ class RobustOptions:
     times the best score, and they are at most 20 times less likely. Increase it to list less exact symmetry equivalents
     too."""
 
-    batch_memory: Annotated[int, Ge(2**22), Le(2**40)] | None = None
-    """Memory in bytes for the work of ``register_batch`` on many pairs at once; the fields' own comes in addition.
-    Pairs that do not fit wait for the next group. null: 256 MiB on a GPU; one pair after the other on the CPU, where
-    that is faster."""
-
     def __post_init__(self) -> None:
         if self.min_scale is not None and self.max_scale is not None and self.min_scale > self.max_scale:
             raise ValueError(f"min_scale {self.min_scale:g} is larger than max_scale {self.max_scale:g}")

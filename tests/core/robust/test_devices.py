@@ -20,19 +20,15 @@ from regnf_core.geometry.sim3 import Sim3
 from regnf_core.library import register
 from regnf_core.options import RegistrationOptions
 from regnf_core.robust import working_frame
-from regnf_core.robust.constants.model import Stage
-from regnf_core.robust.fused.parts import parts_of
-from regnf_core.robust.fused.stacking import StackedSurfaces
 from regnf_core.robust.model import model_object
 from regnf_core.robust.problem import RegistrationProblem, make_problem
 from regnf_core.robust.refine import levenberg_marquardt
-from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize, refined
+from regnf_core.robust.refine.levenberg_marquardt import Settings, minimize
 from regnf_core.robust.refine.loss import adaptive_width, normal_equations
-from regnf_core.robust.refine.pose_candidates import PoseCandidates
 from regnf_core.robust.residuals import SurfacePair, residuals
 from regnf_core.robust.scene import SingleView, view_scene
 from regnf_core.robust.search import distance_grid
-from regnf_core.robust.search.bounds import ScaleBound, ScaleBounds
+from regnf_core.robust.search.bounds import ScaleBound
 from regnf_core.robust.verdict import evidence as features_module
 from regnf_core.robust.verdict.evidence import SPEAKS_FOR, gather_evidence, pose_features
 from regnf_core.robust.working_frame import Samples, WorkingField, WorkingFrame
@@ -127,27 +123,6 @@ def test_iterations_read_and_copy_nothing(neural: RegistrationProblem, max_offse
     assert len(reported) == 3
     assert found.T.scale.device == found.costs.device == ELSEWHERE
     assert border.copies == []
-
-
-@pytest.mark.parametrize("on_grids", [False, True])
-def test_iterations_of_several_pairs_read_and_copy_nothing(neural: RegistrationProblem, on_grids: bool) -> None:
-    pair, stage = observed(neural.fit), Stage(200, (0.03, 0.02), 0.02, keep=8, widest=0.04)
-    if on_grids:
-        pair = replace(pair, scene=neural.view.distance_grid, obj=neural.model.distance_grid)
-    few = [pair.subsample(limit, torch.Generator().manual_seed(0)) for limit in (150, 200)]
-    stacked = StackedSurfaces.of(few, stage.points)
-    parts = list(parts_of([20, 30], 32, ELSEWHERE))
-    candidates = PoseCandidates.start(poses(32), with_offsets=True)
-    assert len(parts) == 2
-    for part in parts:
-        there = stacked.of_part(part)
-        lengths = torch.ones(32, dtype=torch.float64, device=ELSEWHERE)
-        settings = Settings(stage.widest, ScaleBounds(lengths, lengths), lengths)
-        with Border() as border:
-            found = refined(there.pair, candidates, stage, settings, lambda: None)
-            broken = there.faulty()
-        assert found.scores.device == broken.device == ELSEWHERE
-        assert border.copies == []
 
 
 def test_evidence_and_features_stay_on_the_device(neural: RegistrationProblem, monkeypatch: pytest.MonkeyPatch) -> None:
