@@ -57,12 +57,6 @@ class PositionalEncoding:
         angles = self._angles(points)
         return torch.cat((angles.sin(), angles.cos()), dim=-1)
 
-    def encode_planes(self, points: Tensor) -> Tensor:
-        """Features (6 degree, N) at points (3, N), in the order of :meth:`encode`, to the last digit the same."""
-        lengths = self.directions(points) @ points if self.off_axis else points
-        angles = (lengths.unsqueeze(1) * self.frequencies(points).unsqueeze(-1)).flatten(0, 1)
-        return torch.cat((angles.sin(), angles.cos()))
-
     def pull_back(self, encoded: Tensor, gradient: Tensor) -> Tensor:
         """Gradient (N, 3) with respect to the points, from ``encoded`` and the gradient by it (both (N, 6 degree))."""
         sines, cosines = encoded.chunk(2, dim=-1)
@@ -71,18 +65,6 @@ class PositionalEncoding:
         by_axis = by_angle.reshape(*by_angle.shape[:-1], by_angle.shape[-1] // self.degree, self.degree)
         by_length = (by_axis * self.frequencies(encoded)).sum(dim=-1)
         return by_length @ self.directions(encoded) if self.off_axis else by_length
-
-    def pull_back_planes(self, encoded: Tensor, gradient: Tensor) -> Tensor:
-        """Gradient (3, N) with respect to the points, from ``encoded`` and the gradient by it (both (6 degree, N))."""
-        sines, cosines = encoded.chunk(2)
-        frequencies = self.frequencies(encoded).tolist()
-        by_sine, by_cosine = gradient.chunk(2)
-        by_angle = torch.addcmul(by_sine * cosines, by_cosine, sines, value=-1.0)
-        by_angle = by_angle.reshape(len(by_angle) // self.degree, self.degree, by_angle.shape[1])
-        by_length: Tensor = by_angle[:, 0] * frequencies[0]
-        for k in range(1, self.degree):
-            by_length.add_(by_angle[:, k], alpha=frequencies[k])
-        return self.directions(encoded).T @ by_length if self.off_axis else by_length
 
     def _angles(self, points: Tensor) -> Tensor:
         lengths = points @ self.directions(points).T if self.off_axis else points

@@ -20,8 +20,8 @@ from regnf_core.schema.hash_grid_config import HashGridConfig
 from tests.core.fields.native_builds import variants
 from tests.core.fields.reference import central_differences, field_slowly
 from tests.core.fields.small_field import GRID, tensors
-from tests.core.fields.test_neus_facto_planes import function as stored_function
-from tests.core.fields.test_neus_facto_planes import places as points_around
+from tests.core.fields.small_field import function as stored_function
+from tests.core.fields.small_field import places as points_around
 
 BOUNDS = torch.tensor([[-1.0] * 3, [1.0] * 3])
 NAMES = ("avx512", "avx2", "plain")
